@@ -1,0 +1,262 @@
+"""Configuration: one frozen dataclass a part, validated when built, with presets, and TOML in and out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tomli_w
+
+from slam.settings import from_mapping, require, to_mapping, unknown_name
+
+__all__ = [
+    "LIDAR_PRESETS",
+    "NOISE_PRESETS",
+    "ROBOT_PRESETS",
+    "EnvConfig",
+    "LidarConfig",
+    "NoiseConfig",
+    "RewardConfig",
+    "RobotConfig",
+    "from_toml",
+    "resolve",
+    "to_toml",
+]
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotConfig:
+    """Body, wheels and motors of a mecanum robot with X rollers (theory.md, "The robot itself").
+
+    The motor constants are those of a geared servo drive: a speed loop with a first-order lag, a torque limit
+    at the wheel, and the rotor's inertia as the wheel feels it through the gear.
+    """
+
+    length_m: float = 0.58
+    width_m: float = 0.38
+    mass_kg: float = 20.0
+    wheel_radius_m: float = 0.0475
+    wheelbase_m: float = 0.471
+    track_m: float = 0.300
+    max_speed_m_s: float = 0.8
+    max_turn_rate_rad_s: float = 1.5
+    motor_lag_s: float = 0.05
+    motor_torque_nm: float = 2.0
+    motor_gain: float = 2.0  # torque per speed error [N·m·s/rad]
+    wheel_inertia_kg_m2: float = 0.01
+    wheel_friction: float = 0.01  # viscous, torque per wheel speed [N·m·s/rad]
+    slip_speed_m_s: float = 0.015  # width of the regularised Coulomb law, s₀
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value >= 0, f"RobotConfig.{f.name} must be ≥ 0, got {value}")
+            if f.name not in ("wheel_friction", "motor_lag_s"):
+                require(value > 0, f"RobotConfig.{f.name} must be > 0, got {value}")
+
+    @property
+    def lever_m(self) -> float:
+        """Half the wheelbase plus half the track: the arm l of the mecanum kinematics [m]."""
+        return 0.5 * (self.wheelbase_m + self.track_m)
+
+    @property
+    def max_wheel_speed_rad_s(self) -> float:
+        """Wheel speed limit: what straight driving at full speed asks for [rad/s]."""
+        return self.max_speed_m_s / self.wheel_radius_m
+
+    @property
+    def inscribed_radius_m(self) -> float:
+        """Largest disc within the footprint [m]."""
+        return 0.5 * min(self.length_m, self.width_m)
+
+    @property
+    def circumscribed_radius_m(self) -> float:
+        """Smallest disc around the footprint [m]."""
+        return 0.5 * math.hypot(self.length_m, self.width_m)
+
+    @property
+    def inertia_kg_m2(self) -> float:
+        """Moment of inertia of the body about its centre: a uniform rectangle [kg·m²]."""
+        return self.mass_kg * (self.length_m**2 + self.width_m**2) / 12.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarConfig:
+    """A planar lidar mounted on the robot's centre line, at A ahead of the centre of mass C."""
+
+    beams: int = 360
+    field_of_view_deg: float = 360.0
+    range_min_m: float = 0.02
+    range_max_m: float = 8.0
+    offset_m: float = 0.2  # L, theory.md A
+
+    def __post_init__(self) -> None:
+        require(self.beams >= 8, f"LidarConfig.beams must be at least 8, got {self.beams}")
+        require(
+            0 < self.field_of_view_deg <= 360,
+            f"LidarConfig.field_of_view_deg must be in (0, 360], got {self.field_of_view_deg}",
+        )
+        require(
+            0 <= self.range_min_m < self.range_max_m <= 100,
+            "LidarConfig needs 0 ≤ range_min_m < range_max_m ≤ 100",
+        )
+        require(math.isfinite(self.offset_m), "LidarConfig.offset_m must be finite")
+
+    @property
+    def angle_increment(self) -> float:
+        """Angle between beams [rad]: a full circle has as many gaps as beams, a sector one fewer."""
+        fov = math.radians(self.field_of_view_deg)
+        return fov / self.beams if self.field_of_view_deg >= 360.0 else fov / (self.beams - 1)
+
+    @property
+    def angle_min(self) -> float:
+        """Bearing of the first beam [rad]."""
+        return -0.5 * math.radians(self.field_of_view_deg)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseConfig:
+    """Everything random about the robot's dealings with the world, as declared to the estimators."""
+
+    range_sigma_m: float = 0.01
+    dropout: float = 0.005  # probability that a beam is lost
+    encoder: float = 0.01  # 1σ of a wheel's measured increment, as a share of it
+    radius_error: float = 0.01  # largest relative error of each wheel's radius, drawn per episode
+    base_error: float = 0.01  # largest relative error of the lever l, drawn per episode
+    slip: float = 0.0  # mean share of the commanded motion that is lost at random
+    friction: float = 0.6  # μ of the floor
+    patch_friction: tuple[float, float] = (0.15, 0.3)  # μ of the slippery patches, drawn per patch
+    patch_share: float = 0.0  # share of the floor that slippery patches cover
+
+    def __post_init__(self) -> None:
+        for name in (
+            "range_sigma_m",
+            "dropout",
+            "encoder",
+            "radius_error",
+            "base_error",
+            "slip",
+            "patch_share",
+        ):
+            value = getattr(self, name)
+            require(
+                math.isfinite(value) and 0 <= value < 1, f"NoiseConfig.{name} must be in [0, 1), got {value}"
+            )
+        require(0 < self.friction <= 2, f"NoiseConfig.friction must be in (0, 2], got {self.friction}")
+        low, high = self.patch_friction
+        require(0 < low <= high <= 2, "NoiseConfig.patch_friction needs 0 < low ≤ high ≤ 2")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RewardConfig:
+    """Weights of the reward's terms."""
+
+    area: float = 0.1  # per m² newly mapped
+    pose_entropy: float = 0.01  # per nat of pose entropy lost
+    map_entropy: float = 0.0  # per bit-m² of map entropy lost
+    collision: float = -1.0  # per contact
+    effort: float = -0.002  # per second at full speed
+    time: float = -0.001  # per second
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            require(math.isfinite(getattr(self, f.name)), f"RewardConfig.{f.name} must be finite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnvConfig:
+    """An environment, whole. A string names a preset, generator or backend; ``*_config`` sets its details."""
+
+    rooms: str = "apartment"
+    rooms_config: Mapping[str, Any] = field(default_factory=dict)
+    slam: str = "ekf"
+    slam_config: Mapping[str, Any] = field(default_factory=dict)
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    lidar: LidarConfig = field(default_factory=LidarConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    reward: RewardConfig = field(default_factory=RewardConfig)
+    step_s: float = 0.1
+    physics_step_s: float = 0.02
+    grid_resolution_m: float = 0.05
+    coverage_target: float = 0.95
+    terminate_on_collision: bool = False
+    max_landmarks_observed: int = 32
+
+    def __post_init__(self) -> None:
+        require(
+            0 < self.physics_step_s <= self.step_s <= 1, "EnvConfig needs 0 < physics_step_s ≤ step_s ≤ 1"
+        )
+        substeps = self.step_s / self.physics_step_s
+        require(
+            abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s"
+        )
+        require(0.01 <= self.grid_resolution_m <= 1, "EnvConfig.grid_resolution_m must be in [0.01, 1]")
+        require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
+
+
+# Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and motors
+# are the youBot's, scaled to that body.
+ROBOT_PRESETS: dict[str, RobotConfig] = {
+    "youbot": RobotConfig(),
+    "cavity": RobotConfig(
+        length_m=0.24,
+        width_m=0.16,
+        mass_kg=2.5,
+        wheel_radius_m=0.03,
+        wheelbase_m=0.16,
+        track_m=0.13,
+        max_speed_m_s=0.5,
+        max_turn_rate_rad_s=math.radians(90.0),
+        motor_torque_nm=0.3,
+        motor_gain=0.1,
+        wheel_inertia_kg_m2=5e-4,
+        wheel_friction=5e-4,
+    ),
+}
+LIDAR_PRESETS: dict[str, LidarConfig] = {
+    "youbot": LidarConfig(),
+    "cavity": LidarConfig(beams=121, field_of_view_deg=120.0, offset_m=0.08),
+}
+NOISE_PRESETS: dict[str, NoiseConfig] = {
+    "nominal": NoiseConfig(),
+    "slippery": NoiseConfig(encoder=0.05, radius_error=0.03, base_error=0.03, slip=0.1, patch_share=0.25),
+    "cavity": NoiseConfig(slip=0.1),
+}
+
+
+def resolve(
+    cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str
+) -> T:
+    """Return a config from a preset's name, a mapping (laid over its ``preset`` key's), or a config."""
+    if isinstance(value, str):
+        if value not in presets:
+            raise unknown_name(what, value, presets)
+        return presets[value]
+    if isinstance(value, Mapping) and "preset" in value:
+        base = resolve(cls, str(value["preset"]), presets, what)
+        return from_mapping(cls, {k: v for k, v in value.items() if k != "preset"}, base=base)
+    return from_mapping(cls, value)
+
+
+def from_toml(path: str | Path) -> EnvConfig:
+    """Read an environment's configuration; raise ``ValueError`` with file and reason where it cannot be used."""
+    try:
+        with open(path, "rb") as file:
+            values = tomllib.load(file)
+        return from_mapping(EnvConfig, values)
+    except OSError as error:
+        raise ValueError(f"cannot read config {path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, ValueError, TypeError) as error:
+        raise ValueError(f"config {path}: {error}") from error
+
+
+def to_toml(config: EnvConfig) -> str:
+    """Return the effective configuration as TOML text that :func:`from_toml` reads back equal."""
+    return tomli_w.dumps(to_mapping(config))

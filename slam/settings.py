@@ -1,0 +1,82 @@
+"""Frozen dataclasses as configuration: built from mappings, unknown keys rejected with the valid ones named."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar, get_args, get_type_hints
+
+__all__ = ["from_mapping", "require", "to_mapping", "unknown_name"]
+
+T = TypeVar("T")
+
+
+def unknown_name(what: str, name: object, valid: Iterable[str]) -> ValueError:
+    """Return the error for a name that is not registered: one line that lists the valid ones."""
+    names = sorted(valid)
+    close = difflib.get_close_matches(str(name), names, n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    return ValueError(f"unknown {what} {name!r}{hint}; valid: {', '.join(names)}")
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise ``ValueError(message)`` unless the condition holds; for ``__post_init__``."""
+    if not condition:
+        raise ValueError(message)
+
+
+def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T | None = None) -> T:
+    """Build a config dataclass from a mapping, laid over ``base`` (or over the defaults).
+
+    An instance passes through, ``None`` gives the base. Nested dataclasses take nested mappings; lists become
+    tuples and integers floats where the field says so. Unknown keys raise ``ValueError``.
+    """
+    if isinstance(values, cls):
+        return values
+    if values is None:
+        return cls() if base is None else base
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{cls.__name__} takes a mapping or a {cls.__name__}, not {type(values).__name__}")
+    hints = get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for key, value in values.items():
+        if key not in names:
+            raise unknown_name(f"key of {cls.__name__}", key, names)
+        changes[key] = _coerce(cls, key, hints[key], value, getattr(base, key, None))
+    return cls(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
+
+
+def to_mapping(config: Any) -> dict[str, Any]:
+    """Return a config dataclass as plain nested dictionaries that TOML can hold (``None`` left out)."""
+    out: dict[str, Any] = {}
+    for f in dataclasses.fields(config):
+        value = getattr(config, f.name)
+        if value is None:
+            continue
+        if dataclasses.is_dataclass(value):
+            out[f.name] = to_mapping(value)
+        elif isinstance(value, Mapping):
+            out[f.name] = dict(value)
+        else:
+            out[f.name] = list(value) if isinstance(value, tuple) else value
+    return out
+
+
+def _coerce(cls: type[Any], key: str, hint: Any, value: Any, base: Any) -> Any:
+    options = get_args(hint) or (hint,)
+    for option in options:
+        if dataclasses.is_dataclass(option) and isinstance(option, type):
+            return from_mapping(option, value, base=base)
+    if isinstance(value, list):
+        value = tuple(value)
+    kinds = [o for o in options if isinstance(o, type)]
+    if isinstance(value, bool) and bool not in kinds and kinds:
+        raise ValueError(f"{cls.__name__}.{key} is a {kinds[0].__name__}, not a boolean")
+    if float in kinds and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    simple = {bool, int, float, str}
+    if kinds and set(kinds) <= simple | {type(None)} and not isinstance(value, tuple(kinds)):
+        raise ValueError(f"{cls.__name__}.{key} takes {kinds[0].__name__}, got {value!r}")
+    return value
