@@ -6,15 +6,6 @@ belief's frame and grows as scans need it: neither its size nor its origin tells
 
 from __future__ import annotations
 
-import math
-
-import cv2
-import numpy as np
-from numba import njit
-from numpy.typing import NDArray
-
-from slam.types import Scan
-
 __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "OccupancyGrid"]
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar, get_args, get_type_hints
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 __all__ = ["from_mapping", "require", "to_mapping", "unknown_name"]
 
@@ -65,7 +66,7 @@ def to_mapping(config: Any) -> dict[str, Any]:
 
 
 def _coerce(cls: type[Any], key: str, hint: Any, value: Any, base: Any) -> Any:
-    options = get_args(hint) or (hint,)
+    options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for option in options:
         if dataclasses.is_dataclass(option) and isinstance(option, type):
             return from_mapping(option, value, base=base)
