@@ -1,0 +1,1 @@
+"""Agents: who decides, on the belief alone, where the robot goes."""

@@ -201,8 +201,8 @@ class EnvConfig:
         require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
 
 
-# Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and motors
-# are the youBot's, scaled to that body.
+# Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and
+# motors are the youBot's, scaled to that body.
 ROBOT_PRESETS: dict[str, RobotConfig] = {
     "youbot": RobotConfig(),
     "cavity": RobotConfig(
@@ -246,7 +246,7 @@ def resolve(
 
 
 def from_toml(path: str | Path) -> EnvConfig:
-    """Read an environment's configuration; raise ``ValueError`` with file and reason where it cannot be used."""
+    """Read an environment's configuration; ``ValueError`` names the file and what is wrong with it."""
     try:
         with open(path, "rb") as file:
             values = tomllib.load(file)

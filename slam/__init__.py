@@ -1,0 +1,1 @@
+"""Estimators: what the robot believes, from odometry, scans and landmark observations."""

@@ -1,4 +1,4 @@
-"""Frozen dataclasses as configuration: built from mappings, unknown keys rejected with the valid ones named."""
+"""Frozen dataclasses as configuration: built from mappings, unknown keys rejected."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class Observations:
 
 @dataclass(frozen=True, slots=True)
 class Belief:
-    """What a backend believes now, in the frame of the pose it was reset to. Arrays are copies; the grid is live."""
+    """What a backend believes now, in the frame of its start. Arrays are copies; the grid is live."""
 
     pose: Array  # (3,) x [m], y [m], θ [rad]
     pose_cov: Array  # (3, 3)
