@@ -2,11 +2,439 @@
 
 Cells are log-odds in an ``int8`` (one unit is 0.05 nat). The grid lies on a lattice through the origin of the
 belief's frame and grows as scans need it: neither its size nor its origin tells anything about the true plan.
+
+A scan is drawn as what it is, a star-shaped polygon of free space (OpenCV fills it) with surfaces on its rim:
+cells inside lose odds once per scan, however many beams pass through them, and cells that a beam ended in, or
+that lie on a straight surface between two beams, gain.
 """
 
 from __future__ import annotations
 
+import math
+from typing import Self
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.types import Scan
+
 __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "OccupancyGrid"]
+
+Array = NDArray[np.float64]
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Cell classes, with the values of a ROS ``nav_msgs/OccupancyGrid``."""
+
+UNIT_NAT = 0.05  # log-odds of one unit of a cell
+HIT, MISS = 17, -8  # 0.85 and -0.4 nat: p = 0.70 and 0.40
+MAX_LOG_ODDS, MIN_LOG_ODDS = 70, -40  # p = 0.97 and 0.12
+OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
+
+_CHUNK = 32  # the grid's edges lie on multiples of this, so that every overview block is whole
+_OVERVIEW = 64  # the overview never has more than this many blocks a side
+_FIXED_POINT = 4  # fractional bits of the polygon's vertices
+_IN_FREE, _IN_SURFACE = 1, 2  # marks in the scan's own mask
+
+
+def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]:
+    """Return, for each byte of a cell: probability × 255, entropy [bit], class."""
+    units = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.float64)
+    p = 1.0 / (1.0 + np.exp(-UNIT_NAT * units))
+    entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p))
+    classes = np.full(256, UNKNOWN, np.int8)
+    classes[units >= OCCUPIED_FROM] = OCCUPIED
+    classes[units <= FREE_UP_TO] = FREE
+    return np.round(255 * p).astype(np.uint8), entropy.astype(np.float32), classes
+
+
+PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
+
+
+class OccupancyGrid:
+    """Log-odds occupancy over a lattice of square cells, with a block overview kept up to date.
+
+    Rows run along y and columns along x, row 0 at the lowest y. ``log_odds`` is 0 where a cell was never
+    observed, and nowhere else.
+
+    Attributes
+    ----------
+    resolution : float
+        Side of a cell [m].
+    log_odds : NDArray[np.int8]
+        ``(rows, cols)``, in units of 0.05 nat.
+    visited : NDArray[np.uint8]
+        ``(rows, cols)``, 1 where the robot's body has been.
+    known_cells : int
+        Number of cells ever observed.
+    entropy_bit : float
+        Entropy of the observed cells less one bit each: 0 at the start, falling as the map grows sure.
+    revision : int
+        Goes up when the whole map was redrawn, so that whoever follows ``take_changes`` starts over.
+    """
+
+    def __init__(self, resolution: float = 0.05) -> None:
+        if not (math.isfinite(resolution) and 0.0 < resolution <= 10.0):
+            raise ValueError(f"grid resolution must be in (0, 10] m, got {resolution}")
+        self.resolution = float(resolution)
+        self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0)
+        shape = (2 * _CHUNK, 2 * _CHUNK)
+        self.log_odds = np.zeros(shape, np.int8)
+        self.visited = np.zeros(shape, np.uint8)
+        self.known_cells = 0
+        self.entropy_bit = 0.0
+        self.revision = 0
+        self._mask = np.zeros((1, 1), np.uint8)
+        self._changes = np.zeros((1024, 4), np.int32)
+        self._change_count = 0
+        self._rays = np.zeros((0, 2))
+        self._rays_of: tuple[int, float, float] = (0, 0.0, 0.0)
+        self._build_overview()
+
+    @classmethod
+    def from_classes(
+        cls, classes: NDArray[np.int8], resolution: float, origin: tuple[float, float]
+    ) -> Self:
+        """Build a grid from ``(rows, cols)`` classes; ``origin`` is rounded to a multiple of the cell."""
+        grid = cls(resolution)
+        rows, cols = classes.shape
+        col, row = round(origin[0] / resolution), round(origin[1] / resolution)
+        grid._grow(row, col, row + rows, col + cols)
+        r, c = row - grid._row0, col - grid._col0
+        view = grid.log_odds[r : r + rows, c : c + cols]
+        view[classes == OCCUPIED] = MAX_LOG_ODDS
+        view[classes == FREE] = MIN_LOG_ODDS
+        grid.known_cells = int(np.count_nonzero(grid.log_odds))
+        grid._build_overview()
+        return grid
+
+    # ---- geometry ------------------------------------------------------------------------------------------
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.log_odds.shape[0], self.log_odds.shape[1]
+
+    @property
+    def lattice_origin(self) -> tuple[int, int]:
+        """Lattice index (row, column) of cell (0, 0); lattice cell (0, 0) touches the frame's origin."""
+        return self._row0, self._col0
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """Position (x, y) [m] of the lower-left corner of cell (0, 0)."""
+        return self._col0 * self.resolution, self._row0 * self.resolution
+
+    def to_cells(self, points: Array) -> NDArray[np.int64]:
+        """Return row and column ``(n, 2)`` of points ``(n, 2)`` [m]; they may lie outside the grid."""
+        cells = np.floor(np.asarray(points, dtype=np.float64) / self.resolution).astype(np.int64)
+        return cells[..., ::-1] - np.array([self._row0, self._col0])
+
+    def to_points(self, cells: NDArray[np.int64]) -> Array:
+        """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` given as row, column."""
+        lattice = np.asarray(cells)[..., ::-1] + np.array([self._col0, self._row0])
+        return np.asarray((lattice + 0.5) * self.resolution, dtype=np.float64)
+
+    # ---- reading -------------------------------------------------------------------------------------------
+
+    def classes(self) -> NDArray[np.int8]:
+        """Return ``(rows, cols)`` of UNKNOWN, FREE and OCCUPIED."""
+        return CLASS_OF[self.log_odds.view(np.uint8)]
+
+    def probability(self) -> NDArray[np.float32]:
+        """Return the occupancy probability ``(rows, cols)``, 0.5 where nothing was observed."""
+        return np.asarray(1.0 / (1.0 + np.exp(-UNIT_NAT * self.log_odds.astype(np.float32))), np.float32)
+
+    @property
+    def known_area_m2(self) -> float:
+        """Area of the cells ever observed [m²]."""
+        return self.known_cells * self.resolution**2
+
+    def take_changes(self) -> NDArray[np.int32]:
+        """Return the cells whose class changed since the last call, oldest first, and forget them.
+
+        Rows of ``(n, 4)``: lattice row, lattice column, class before, class now.
+        """
+        changes = self._changes[: self._change_count].copy()
+        self._change_count = 0
+        return changes
+
+    # ---- drawing -------------------------------------------------------------------------------------------
+
+    def clear(self) -> None:
+        """Forget every observation (but not where the robot has been), for a redraw from corrected poses."""
+        self.log_odds[:] = 0
+        self.known_cells = 0
+        self.entropy_bit = 0.0
+        self.revision += 1
+        self._change_count = 0
+        self._build_overview()
+
+    def mark_visited(self, x: float, y: float, radius: float) -> None:
+        """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
+        reach = int(math.ceil(radius / self.resolution)) + 1
+        row, col = math.floor(y / self.resolution), math.floor(x / self.resolution)
+        self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
+        _mark_disc(
+            self.visited,
+            self._overview_visited,
+            self.overview_block,
+            y / self.resolution - self._row0,
+            x / self.resolution - self._col0,
+            radius / self.resolution,
+        )
+
+    def integrate(self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16] | None = None) -> None:
+        """Draw one scan taken from ``sensor_pose`` ``(3,)`` in the grid's frame.
+
+        Parameters
+        ----------
+        sensor_pose : Array
+            Where the sensor was: x [m], y [m], θ [rad].
+        scan : Scan
+            The ranges; lost beams (``nan``) say nothing, free space beyond a beam without return (``inf``)
+            reaches to ``range_max``.
+        surface : NDArray[np.int16], optional
+            ``(beams,)``: the straight surface each beam ended on (see :mod:`slam.features`), negative for
+            none. Hits on one surface are joined, which closes walls seen at a flat angle.
+        """
+        n = len(scan.ranges)
+        reach = int(math.ceil(scan.range_max / self.resolution)) + 3
+        if self._mask.shape[0] < 2 * reach + 1:
+            self._mask = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+        rays = self._ray_table(n, scan.angle_min, scan.angle_increment)
+        x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
+        # The mask's centre cell is the sensor's.
+        mask_row = math.floor(y / self.resolution) - reach
+        mask_col = math.floor(x / self.resolution) - reach
+        full_circle = n * scan.angle_increment > 2 * math.pi - 1.5 * scan.angle_increment
+        polygon = np.empty((n + 1, 2), np.int32)
+        count, r0, c0, r1, c1 = _outline(
+            polygon, scan.ranges, rays, x, y, theta, self.resolution, scan.range_max, mask_row, mask_col,
+            full_circle,
+        )  # fmt: skip
+        if count < 3:
+            return
+        mask = self._mask[r0 : r1 + 1, c0 : c1 + 1]
+        offset = (-c0 << _FIXED_POINT, -r0 << _FIXED_POINT)  # in the fixed-point units of the vertices
+        cv2.fillPoly(mask, [polygon[:count]], _IN_FREE, cv2.LINE_8, _FIXED_POINT, offset)
+        _mark_surfaces(
+            self._mask, scan.ranges, rays, surface if surface is not None else _NO_SURFACE,
+            x, y, theta, self.resolution, mask_row, mask_col,
+        )  # fmt: skip
+        self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
+        if self._changes.shape[0] < self._change_count + mask.size:
+            grown = np.zeros((2 * (self._change_count + mask.size), 4), np.int32)
+            grown[: self._change_count] = self._changes[: self._change_count]
+            self._changes = grown
+        self._change_count, known, entropy = _fuse(
+            self.log_odds, mask, mask_row + r0 - self._row0, mask_col + c0 - self._col0,
+            self._overview_probability, self._overview_known, self.overview_block,
+            self._changes, self._change_count, self._row0, self._col0,
+        )  # fmt: skip
+        self.known_cells += known
+        self.entropy_bit += entropy
+
+    def _ray_table(self, n: int, angle_min: float, angle_increment: float) -> Array:
+        key = (n, angle_min, angle_increment)
+        if key != self._rays_of:
+            angles = angle_min + angle_increment * np.arange(n)
+            self._rays = np.column_stack([np.cos(angles), np.sin(angles)])
+            self._rays_of = key
+        return self._rays
+
+    def _grow(self, row0: int, col0: int, row1: int, col1: int) -> None:
+        """Make room for lattice cells [row0, row1) × [col0, col1), in chunks and with some to spare."""
+        rows, cols = self.shape
+        if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row0 + rows and col1 <= self._col0 + cols:
+            return
+        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row0 + rows, self._col0 + cols
+        spare = 2 * _CHUNK
+        if row0 < new_row0:
+            new_row0 = math.floor((row0 - spare) / _CHUNK) * _CHUNK
+        if col0 < new_col0:
+            new_col0 = math.floor((col0 - spare) / _CHUNK) * _CHUNK
+        if row1 > new_row1:
+            new_row1 = math.ceil((row1 + spare) / _CHUNK) * _CHUNK
+        if col1 > new_col1:
+            new_col1 = math.ceil((col1 + spare) / _CHUNK) * _CHUNK
+        r, c = self._row0 - new_row0, self._col0 - new_col0
+        shape = (new_row1 - new_row0, new_col1 - new_col0)
+        log_odds, visited = np.zeros(shape, np.int8), np.zeros(shape, np.uint8)
+        log_odds[r : r + rows, c : c + cols] = self.log_odds
+        visited[r : r + rows, c : c + cols] = self.visited
+        self.log_odds, self.visited = log_odds, visited
+        self._row0, self._col0 = new_row0, new_col0
+        self._build_overview()
+
+    # ---- overview ------------------------------------------------------------------------------------------
+
+    def _build_overview(self) -> None:
+        """Sum the cells up in blocks, the smallest power of two that leaves at most 64 a side."""
+        rows, cols = self.shape
+        block = 1
+        while max(rows, cols) > _OVERVIEW * block:
+            block *= 2
+        if block > _CHUNK:
+            # Beyond 2048 cells a side: the last block of a row may be short, which the padding stands for.
+            rows, cols = -(-rows // block) * block, -(-cols // block) * block
+        self.overview_block = block
+        known = np.zeros((rows, cols), np.int32)
+        probability, visited = known.copy(), known.copy()
+        r, c = self.shape
+        known[:r, :c] = self.log_odds != 0
+        probability[:r, :c] = np.where(known[:r, :c], PROBABILITY_BYTE[self.log_odds.view(np.uint8)], 0)
+        visited[:r, :c] = self.visited
+
+        def blocks(cells: NDArray[np.int32]) -> NDArray[np.int32]:
+            split = cells.reshape(rows // block, block, cols // block, block)
+            return np.ascontiguousarray(split.sum(axis=(1, 3), dtype=np.int32))
+
+        self._overview_known = blocks(known)
+        self._overview_probability = blocks(probability)
+        self._overview_visited = blocks(visited)
+
+    def overview(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Return per block: observed cells, the sum of their probability × 255, visited cells. Live arrays."""
+        return self._overview_known, self._overview_probability, self._overview_visited
+
+
+_NO_SURFACE = np.zeros(0, np.int16)
+
+
+@njit(cache=True, nogil=True)
+def _outline(
+    polygon: NDArray[np.int32], ranges: Array, rays: Array, x: float, y: float, theta: float, resolution: float,
+    range_max: float, mask_row: int, mask_col: int, full_circle: bool,
+) -> tuple[int, int, int, int, int]:  # fmt: skip
+    """Write the scan's free polygon in fixed-point mask cells; return its length and the box it needs."""
+    scale = float(1 << _FIXED_POINT)
+    c, s = math.cos(theta), math.sin(theta)
+    x0 = x / resolution - mask_col - 0.5  # OpenCV's pixel (0, 0) is centred on (0, 0)
+    y0 = y / resolution - mask_row - 0.5
+    low_x = high_x = x0
+    low_y = high_y = y0
+    count = 0
+    lost = 0
+    for i in range(ranges.shape[0]):
+        r = ranges[i]
+        if math.isnan(r):
+            # One or two lost beams are bridged by their neighbours; a run of them is not known to be free.
+            lost += 1
+            if lost != 3:
+                continue
+            reach = 0.0
+        else:
+            lost = 0
+            # The polygon's rim is drawn too and would eat into the surface: it ends half a cell short.
+            reach = (range_max if r > range_max else r) / resolution - 0.5
+            reach = max(reach, 0.0)
+        dx = (c * rays[i, 0] - s * rays[i, 1]) * reach
+        dy = (s * rays[i, 0] + c * rays[i, 1]) * reach
+        polygon[count, 0] = int(round((x0 + dx) * scale))
+        polygon[count, 1] = int(round((y0 + dy) * scale))
+        count += 1
+        low_x, high_x = min(low_x, x0 + dx), max(high_x, x0 + dx)
+        low_y, high_y = min(low_y, y0 + dy), max(high_y, y0 + dy)
+    if not full_circle:
+        polygon[count, 0] = int(round(x0 * scale))
+        polygon[count, 1] = int(round(y0 * scale))
+        count += 1
+    # Two cells of margin: half for the rounding, one and a half for the surfaces beyond the rim.
+    return (
+        count, max(int(low_y) - 2, 0), max(int(low_x) - 2, 0), int(high_y) + 3, int(high_x) + 3
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _mark_surfaces(
+    mask: NDArray[np.uint8], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
+    theta: float, resolution: float, mask_row: int, mask_col: int,
+) -> None:  # fmt: skip
+    """Mark the cells that beams ended in, and those between two hits on one straight surface."""
+    c, s = math.cos(theta), math.sin(theta)
+    x0, y0 = x / resolution - mask_col, y / resolution - mask_row
+    n = ranges.shape[0]
+    joined = surface.shape[0] == n
+    last_x = last_y = 0.0
+    last_surface = -1
+    for i in range(n):
+        r = ranges[i]
+        if not math.isfinite(r):
+            continue
+        # What stopped the beam lies behind the point it returned from: a quarter of a cell deeper.
+        reach = r / resolution + 0.25
+        px = x0 + (c * rays[i, 0] - s * rays[i, 1]) * reach
+        py = y0 + (s * rays[i, 0] + c * rays[i, 1]) * reach
+        mask[int(py), int(px)] = _IN_SURFACE
+        here = int(surface[i]) if joined else -1
+        if here >= 0 and here == last_surface:
+            dx, dy = px - last_x, py - last_y
+            steps = int(max(abs(dx), abs(dy)) * 1.5)
+            for k in range(1, steps + 1):
+                f = k / (steps + 1)
+                mask[int(last_y + f * dy), int(last_x + f * dx)] = _IN_SURFACE
+        last_x, last_y, last_surface = px, py, here
+
+
+@njit(cache=True, nogil=True)
+def _fuse(
+    log_odds: NDArray[np.int8], mask: NDArray[np.uint8], row0: int, col0: int,
+    overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], block: int,
+    changes: NDArray[np.int32], count: int, lattice_row: int, lattice_col: int,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Add a scan's mask to the grid and wipe it; return the change count and the known cells and entropy added."""
+    rows, cols = mask.shape
+    known = 0
+    entropy = 0.0
+    for i in range(rows):
+        marks = mask[i]
+        cells = log_odds[row0 + i, col0 : col0 + cols]
+        # First look whether the row changes at all: most of a known map is saturated, and this vectorises.
+        changed = 0
+        for j in range(cols):
+            m = marks[j]
+            v = cells[j]
+            changed |= ((m == _IN_FREE) & (v > MIN_LOG_ODDS)) | ((m == _IN_SURFACE) & (v < MAX_LOG_ODDS))
+        if changed != 0:
+            for j in range(cols):
+                m = marks[j]
+                if m == 0:
+                    continue
+                old = np.int64(cells[j])
+                new = min(old + HIT, MAX_LOG_ODDS) if m == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
+                if new == old:
+                    continue
+                if new == 0:
+                    new = -1  # zero means never observed
+                cells[j] = new
+                r, c = (row0 + i) // block, (col0 + j) // block
+                delta = np.int64(PROBABILITY_BYTE[new & 255])
+                entropy += ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255]
+                if old == 0:
+                    known += 1
+                    overview_known[r, c] += 1
+                else:
+                    delta -= np.int64(PROBABILITY_BYTE[old & 255])
+                overview_probability[r, c] += delta
+                if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
+                    changes[count, 0] = lattice_row + row0 + i
+                    changes[count, 1] = lattice_col + col0 + j
+                    changes[count, 2] = CLASS_OF[old & 255]
+                    changes[count, 3] = CLASS_OF[new & 255]
+                    count += 1
+        marks[:] = 0
+    return count, known, entropy
+
+
+@njit(cache=True, nogil=True)
+def _mark_disc(
+    visited: NDArray[np.uint8], overview: NDArray[np.int32], block: int, y: float, x: float, radius: float
+) -> None:
+    """Mark the cells whose centre lies within ``radius`` of (x, y), all in cells of the grid."""
+    for i in range(int(y - radius), int(y + radius) + 1):
+        for j in range(int(x - radius), int(x + radius) + 1):
+            if (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius and visited[i, j] == 0:
+                visited[i, j] = 1
+                overview[i // block, j // block] += 1
