@@ -1,1 +1,25 @@
-"""Estimators: what the robot believes, from odometry, scans and landmark observations."""
+"""Estimators: what the robot believes, from odometry, scans and landmark observations.
+
+Nothing here knows of a simulator: the same backends run on the logs of real robots. ::
+
+    backend = slam.make("ekf")
+    backend.reset(pose=(0, 0, 0))
+    backend.predict(Odometry(twist=(0.4, 0.0, 0.1), dt=0.1))
+    backend.update(Scan(ranges, angle_min=-np.pi, angle_increment=np.pi / 180, range_max=8.0))
+    backend.belief.pose
+"""
+
+from slam.registry import config_type, make, names
+from slam.types import CONCAVE, CONVEX, Belief, Observations, Odometry, Scan
+
+__all__ = [
+    "CONCAVE",
+    "CONVEX",
+    "Belief",
+    "Observations",
+    "Odometry",
+    "Scan",
+    "config_type",
+    "make",
+    "names",
+]

@@ -93,9 +93,7 @@ class OccupancyGrid:
         self._build_overview()
 
     @classmethod
-    def from_classes(
-        cls, classes: NDArray[np.int8], resolution: float, origin: tuple[float, float]
-    ) -> Self:
+    def from_classes(cls, classes: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> Self:
         """Build a grid from ``(rows, cols)`` classes; ``origin`` is rounded to a multiple of the cell."""
         grid = cls(resolution)
         rows, cols = classes.shape
@@ -173,7 +171,7 @@ class OccupancyGrid:
 
     def mark_visited(self, x: float, y: float, radius: float) -> None:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
-        reach = int(math.ceil(radius / self.resolution)) + 1
+        reach = math.ceil(radius / self.resolution) + 1
         row, col = math.floor(y / self.resolution), math.floor(x / self.resolution)
         self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
         _mark_disc(
@@ -200,7 +198,7 @@ class OccupancyGrid:
             none. Hits on one surface are joined, which closes walls seen at a flat angle.
         """
         n = len(scan.ranges)
-        reach = int(math.ceil(scan.range_max / self.resolution)) + 3
+        reach = math.ceil(scan.range_max / self.resolution) + 3
         if self._mask.shape[0] < 2 * reach + 1:
             self._mask = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
         rays = self._ray_table(n, scan.angle_min, scan.angle_increment)
@@ -332,14 +330,14 @@ def _outline(
             reach = max(reach, 0.0)
         dx = (c * rays[i, 0] - s * rays[i, 1]) * reach
         dy = (s * rays[i, 0] + c * rays[i, 1]) * reach
-        polygon[count, 0] = int(round((x0 + dx) * scale))
-        polygon[count, 1] = int(round((y0 + dy) * scale))
+        polygon[count, 0] = round((x0 + dx) * scale)
+        polygon[count, 1] = round((y0 + dy) * scale)
         count += 1
         low_x, high_x = min(low_x, x0 + dx), max(high_x, x0 + dx)
         low_y, high_y = min(low_y, y0 + dy), max(high_y, y0 + dy)
     if not full_circle:
-        polygon[count, 0] = int(round(x0 * scale))
-        polygon[count, 1] = int(round(y0 * scale))
+        polygon[count, 0] = round(x0 * scale)
+        polygon[count, 1] = round(y0 * scale)
         count += 1
     # Two cells of margin: half for the rounding, one and a half for the surfaces beyond the rim.
     return (
@@ -402,21 +400,21 @@ def _fuse(
                 m = marks[j]
                 if m == 0:
                     continue
-                old = np.int64(cells[j])
-                new = min(old + HIT, MAX_LOG_ODDS) if m == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
+                old = int(cells[j])
+                new: int = min(old + HIT, MAX_LOG_ODDS) if m == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
                 if new == old:
                     continue
                 if new == 0:
                     new = -1  # zero means never observed
                 cells[j] = new
                 r, c = (row0 + i) // block, (col0 + j) // block
-                delta = np.int64(PROBABILITY_BYTE[new & 255])
+                delta = int(PROBABILITY_BYTE[new & 255])
                 entropy += ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255]
                 if old == 0:
                     known += 1
                     overview_known[r, c] += 1
                 else:
-                    delta -= np.int64(PROBABILITY_BYTE[old & 255])
+                    delta -= int(PROBABILITY_BYTE[old & 255])
                 overview_probability[r, c] += delta
                 if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
                     changes[count, 0] = lattice_row + row0 + i

@@ -1,0 +1,137 @@
+"""What every estimator is to the outside: ``predict`` → ``update`` → ``belief``, and a grid drawn on the way."""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.features import FeatureConfig, FeatureExtractor
+from slam.geometry import compose
+from slam.key_scans import KeyScanConfig, KeyScans
+from slam.motion import OdometryNoise
+from slam.occupancy import OccupancyGrid
+from slam.settings import require
+from slam.types import Belief, Observations, Odometry, Scan
+
+__all__ = ["Backend", "BackendConfig"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackendConfig:
+    """What every backend needs to know of the robot, and of the map it shall draw."""
+
+    lidar_offset_m: float = 0.2  # L: how far ahead of the body's centre the sensor sits (theory.md A)
+    body_radius_m: float = 0.25  # of the disc that is marked as visited
+    grid_resolution_m: float = 0.05
+    odometry: OdometryNoise = field(default_factory=OdometryNoise)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    key_scans: KeyScanConfig = field(default_factory=KeyScanConfig)
+    start_sigma_m: float = 1e-4  # of the start pose where none is given: never exactly zero
+    start_sigma_rad: float = 1e-4
+
+    def __post_init__(self) -> None:
+        require(math.isfinite(self.lidar_offset_m), "BackendConfig.lidar_offset_m must be finite")
+        require(self.start_sigma_m > 0 and self.start_sigma_rad > 0, "BackendConfig.start_sigma_* must be > 0")
+
+
+class Backend(abc.ABC):
+    """An estimator: feed it odometry and scans (or landmark observations), read its belief.
+
+    Subclasses estimate; this class draws the grid from the estimated poses.
+    """
+
+    takes_pose = False
+    """Whether the backend must be given the pose (``truth``); no estimator does."""
+
+    def __init__(self, config: BackendConfig) -> None:
+        self.config = config
+        self.extractor = FeatureExtractor(config.features)
+        self.grid = OccupancyGrid(config.grid_resolution_m)
+        self.key_scans = KeyScans(config.key_scans)
+
+    def reset(
+        self, pose: Array | tuple[float, float, float] = (0.0, 0.0, 0.0), *,
+        pose_cov: Array | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
+        """Start over at ``pose`` ``(3,)`` with covariance ``(3, 3)``, map and landmarks empty.
+
+        ``seed`` matters to backends that draw samples.
+        """
+        start = np.array(pose, dtype=np.float64)
+        if start.shape != (3,) or not np.all(np.isfinite(start)):
+            raise ValueError(f"a pose is three finite numbers x, y, θ; got {pose!r}")
+        if pose_cov is None:
+            c = self.config
+            pose_cov = np.diag([c.start_sigma_m**2, c.start_sigma_m**2, c.start_sigma_rad**2])
+        cov = np.array(pose_cov, dtype=np.float64)
+        if cov.shape != (3, 3) or not np.all(np.isfinite(cov)):
+            raise ValueError("a pose covariance is a finite (3, 3) matrix")
+        self.grid = OccupancyGrid(self.config.grid_resolution_m)
+        self.key_scans = KeyScans(self.config.key_scans)
+        self._start(start, cov, seed)
+
+    @abc.abstractmethod
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        """Set the estimator to its initial state."""
+
+    @abc.abstractmethod
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured."""
+
+    @abc.abstractmethod
+    def update(self, scan: Scan) -> None:
+        """Correct by a scan, and draw it into the grid."""
+
+    @abc.abstractmethod
+    def observe(self, observations: Observations) -> None:
+        """Correct by landmark observations without a scan."""
+
+    @property
+    @abc.abstractmethod
+    def pose(self) -> Array:
+        """Pose mean ``(3,)``: x [m], y [m], θ [rad]. A copy."""
+
+    @property
+    @abc.abstractmethod
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``. A copy."""
+
+    @property
+    @abc.abstractmethod
+    def belief(self) -> Belief:
+        """Everything believed now."""
+
+    @property
+    @abc.abstractmethod
+    def landmark_count(self) -> int:
+        """Number of landmarks in the map."""
+
+    @abc.abstractmethod
+    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+        """Return per landmark how often it was seen ``(n,)`` and its direction [rad] (nan: unknown)."""
+
+    @abc.abstractmethod
+    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+        """Write the nearest landmarks in the robot frame, nearest first.
+
+        Rows of ``(k, 6)``: x, y [m], σxx, σxy, σyy [m²] of the landmark's own covariance, 1; zeros where
+        there are fewer.
+        """
+
+    def sensor_pose(self) -> Array:
+        """Return where the sensor is believed to be ``(3,)``."""
+        return compose(self.pose, np.array([self.config.lidar_offset_m, 0.0, 0.0]))
+
+    def _draw(self, scan: Scan, ids: NDArray[np.int64], points: Array) -> None:
+        """Draw a scan from the believed pose; ``ids`` and ``points`` are the landmarks seen with it."""
+        pose = self.pose
+        sensor = self.sensor_pose()
+        self.grid.integrate(sensor, scan, self.extractor.surface)
+        self.grid.mark_visited(float(pose[0]), float(pose[1]), self.config.body_radius_m)
+        self.key_scans.offer(sensor, scan, self.extractor.surface, ids, points)

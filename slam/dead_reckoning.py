@@ -1,0 +1,67 @@
+"""Backends that map without estimating the pose: ``odometry`` (dead reckoning) and ``truth`` (pose given).
+
+They stand beside the estimators so that what SLAM brings is seen. Given the pose, landmarks are independent of
+each other, so each has its own two-dimensional Kalman filter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.ekf import EkfSlam
+from slam.types import Odometry
+
+__all__ = ["OdometrySlam", "TruthSlam"]
+
+Array = NDArray[np.float64]
+
+
+class OdometrySlam(EkfSlam):
+    """Dead reckoning: the pose is what the wheels say, with the covariance that follows from V."""
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        super()._start(pose, pose_cov, seed)
+        self._robot_cov = np.array(pose_cov)
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured; the covariance grows beside the map's, never into it."""
+        self._p[:3, :3] = np.triu(self._robot_cov)
+        super().predict(odometry)
+        upper = self._p[:3, :3]
+        self._robot_cov = upper + np.triu(upper, 1).T
+        self._pin()
+
+    def _pin(self) -> None:
+        # Landmarks are mapped as though the pose were known: (almost) no variance, no correlation.
+        self._p[:3, : self._n] = 0.0
+        self._p[:3, :3] = np.eye(3) * 1e-18
+
+    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
+        self._pin()
+        pose = self._x[:3].copy()
+        super()._correct(z, match)
+        self._x[:3] = pose
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``."""
+        return self._robot_cov.copy()
+
+
+class TruthSlam(OdometrySlam):
+    """Mapping with the true pose given: the bound on what an estimator can reach."""
+
+    takes_pose = True
+
+    def give_pose(self, pose: Array) -> None:
+        """Set the pose ``(3,)``; to be called between ``predict`` and ``update``."""
+        if not np.all(np.isfinite(pose)):
+            raise ValueError("a given pose must be finite")
+        self._x[:3] = pose
+        self._robot_cov = np.eye(3) * 1e-12
+
+    def predict(self, odometry: Odometry) -> None:
+        """Do nothing: the pose is given."""
+        del odometry
+        self._pin()

@@ -1,0 +1,396 @@
+"""Scan → straight surfaces and the corners where they meet, each with a covariance from its fit.
+
+Split and merge (iterative end-point fit) over the scan's points in order of bearing; every piece is fitted by
+total least squares. A corner is where two fitted surfaces meet *and the scan runs through without a break*:
+the rim of an occlusion is no landmark, since it moves with the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.settings import require
+from slam.types import CONCAVE, CONVEX, Scan
+
+__all__ = ["Corners", "FeatureConfig", "FeatureExtractor", "Lines"]
+
+Array = NDArray[np.float64]
+
+_MAX_LINES = 128
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeatureConfig:
+    """What counts as a straight surface and as a corner."""
+
+    range_sigma_m: float = 0.01  # of one beam, along it
+    split_sigmas: float = 4.0  # a piece is split where it departs from its chord by more than this
+    split_floor_m: float = 0.02  # … and by more than this
+    min_points: int = 6
+    min_length_m: float = 0.25
+    grazing_deg: float = 8.0  # flattest incidence at which neighbouring points still belong together
+    min_angle_deg: float = 30.0  # between the surfaces that make a corner
+    max_gap_m: float = 0.12  # from the corner to the nearest point of either surface
+    sigma_floor_m: float = 0.002  # of a corner, along each axis: what the model of straight walls leaves out
+
+    def __post_init__(self) -> None:
+        require(self.range_sigma_m >= 0, "FeatureConfig.range_sigma_m must be ≥ 0")
+        require(self.min_points >= 4, "FeatureConfig.min_points must be at least 4")
+        require(0 < self.grazing_deg < 45, "FeatureConfig.grazing_deg must be in (0, 45)")
+        require(5 <= self.min_angle_deg <= 85, "FeatureConfig.min_angle_deg must be in [5, 85]")
+        require(self.sigma_floor_m > 0, "FeatureConfig.sigma_floor_m must be > 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Corners:
+    """Corner points of one scan, in the sensor frame."""
+
+    range_bearing: Array  # (m, 2) range [m], bearing [rad]
+    cov: Array  # (m, 2, 2) [m², m·rad, rad²]
+    kind: NDArray[np.int8]  # (m,) CONVEX or CONCAVE
+    direction: Array  # (m,) bearing of the bisector that points into free space [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Straight surfaces of one scan, in the sensor frame, in order of bearing."""
+
+    hesse: Array  # (k, 2) α [rad], r [m]: the points with x cos α + y sin α = r, r ≥ 0
+    ends: Array  # (k, 4) x1, y1, x2, y2: feet of the first and last point on the line [m]
+    points: NDArray[np.int64]  # (k,) number of points fitted
+
+
+class FeatureExtractor:
+    """Extracts corners and lines from scans; holds the buffers, so that no scan allocates in the kernel.
+
+    After :meth:`extract`, ``surface`` ``(beams,)`` holds for each beam the index of the line that it ended on,
+    or -1.
+    """
+
+    def __init__(self, config: FeatureConfig | None = None) -> None:
+        self.config = config or FeatureConfig()
+        self.surface = np.zeros(0, np.int16)
+        self._angles = np.zeros(0)
+        self._scan_of: tuple[int, float, float] = (0, 0.0, 0.0)
+        self._lines = np.zeros((_MAX_LINES, 14))
+        self._corners = np.zeros((_MAX_LINES, 8))
+        self._line_count = 0
+        self._corner_count = 0
+        c = self.config
+        self._limits = np.array([
+            c.range_sigma_m, c.split_sigmas, c.split_floor_m, c.min_points, c.min_length_m,
+            math.radians(c.grazing_deg), math.sin(math.radians(c.min_angle_deg)), c.max_gap_m,
+            c.sigma_floor_m,
+        ])  # fmt: skip
+
+    def extract(self, scan: Scan) -> NDArray[np.float64]:
+        """Return the corners as rows of ``(m, 8)`` (a view, until the next call).
+
+        Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and a spare.
+        :meth:`corners` and :meth:`lines` give the same as named arrays.
+        """
+        n = len(scan.ranges)
+        key = (n, scan.angle_min, scan.angle_increment)
+        if key != self._scan_of:
+            angles = scan.angle_min + scan.angle_increment * np.arange(n)
+            self._angles = np.column_stack([np.cos(angles), np.sin(angles)])
+            self._xy = np.zeros((n, 2))
+            self._beam = np.zeros(n, np.int64)
+            self._stack = np.zeros((n + 2, 2), np.int64)
+            self._pieces = np.zeros((n + 2, 3), np.int64)
+            self.surface = np.zeros(n, np.int16)
+            self._scan_of = key
+        self._line_count, self._corner_count = _extract(
+            scan.ranges, self._angles, scan.angle_increment, scan.range_min, self._limits, self._xy, self._beam,
+            self._stack, self._pieces, self.surface, self._lines, self._corners,
+        )  # fmt: skip
+        return self._corners[: self._corner_count]
+
+    def corners(self) -> Corners:
+        """Return the corners of the last scan as named arrays."""
+        rows = self._corners[: self._corner_count].copy()
+        cov = np.empty((len(rows), 2, 2))
+        cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0], cov[:, 1, 1] = (
+            rows[:, 2],
+            rows[:, 3],
+            rows[:, 3],
+            rows[:, 4],
+        )
+        return Corners(rows[:, :2], cov, rows[:, 5].astype(np.int8), rows[:, 6])
+
+    def lines(self) -> Lines:
+        """Return the straight surfaces of the last scan as named arrays."""
+        rows = self._lines[: self._line_count]
+        nx, ny, r = rows[:, 0], rows[:, 1], rows[:, 2]
+        hesse = np.column_stack([np.arctan2(ny, nx), r])
+        # A point of the line at distance t along its direction from the centroid.
+        centre, t0, t1 = rows[:, 3:5], rows[:, 8:9], rows[:, 9:10]
+        along = np.column_stack([-ny, nx])
+        ends = np.hstack([centre + t0 * along, centre + t1 * along])
+        return Lines(hesse, ends, rows[:, 10].astype(np.int64))
+
+
+@njit(cache=True, nogil=True)
+def _extract(
+    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, xy: Array,
+    beam: NDArray[np.int64], stack: NDArray[np.int64], pieces: NDArray[np.int64], surface: NDArray[np.int16],
+    lines: Array, corners: Array,
+) -> tuple[int, int]:  # fmt: skip
+    surface[:] = -1
+    n = _points_in_order(ranges, rays, increment, range_min, limits, xy, beam)
+    pieces_count = _split(xy, beam, n, ranges, increment, limits, stack, pieces)
+    line_count = 0
+    last_line = -1  # the surface that the scan has run on from without a break, else -1
+    last_end = 0  # … and its last point
+    corner_count = 0
+    for k in range(pieces_count):
+        first, last = pieces[k, 0], pieces[k, 1]
+        if pieces[k, 2] == 0:
+            last_line = -1
+        if line_count == _MAX_LINES or not _fit(xy, first, last, limits, lines[line_count]):
+            continue
+        for i in range(first, last + 1):
+            surface[beam[i]] = line_count
+        # Noise near a corner may leave a sliver between its two surfaces; its points must lie on either.
+        if last_line >= 0 and _all_on(xy, last_end, first, lines[last_line], lines[line_count], limits):
+            corner_count += _meet(lines[last_line], lines[line_count], increment, limits, corners[corner_count])
+        last_line, last_end = line_count, last
+        line_count += 1
+    return line_count, corner_count
+
+
+@njit(cache=True, nogil=True)
+def _breaks(r0: float, r1: float, angle: float, limits: Array) -> bool:
+    """Tell whether two neighbouring points, ``angle`` apart, cannot lie on one surface.
+
+    The adaptive breakpoint of Borges and Aldon (2004): a surface at the flattest incidence that is still
+    accepted would take the next range no farther than this.
+    """
+    near, far = min(r0, r1), max(r0, r1)
+    grazing = limits[5]
+    if angle >= grazing:
+        return True
+    limit = near * math.sin(angle) / math.sin(grazing - angle) + 4.0 * limits[0]
+    gap_squared = near * near + far * far - 2.0 * near * far * math.cos(angle)
+    return gap_squared > limit * limit
+
+
+@njit(cache=True, nogil=True)
+def _points_in_order(
+    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, xy: Array,
+    beam: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π."""
+    n = ranges.shape[0]
+    start = 0
+    if n * increment > 2.0 * math.pi - 1.5 * increment:
+        for i in range(n):
+            r0, r1 = ranges[i - 1], ranges[i]
+            if not (r0 < np.inf and r1 < np.inf):
+                start = i
+                if r0 == np.inf or r1 == np.inf:
+                    break
+            elif _breaks(r0, r1, increment, limits):
+                start = i
+                break
+    count = 0
+    for k in range(n):
+        i = start + k
+        if i >= n:
+            i -= n
+        r = ranges[i]
+        if r >= range_min and r < np.inf:
+            xy[count, 0] = r * rays[i, 0]
+            xy[count, 1] = r * rays[i, 1]
+            beam[count] = i
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _split(
+    xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, increment: float, limits: Array,
+    stack: NDArray[np.int64], pieces: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number."""
+    threshold = max(limits[1] * limits[0], limits[2])
+    beams = ranges.shape[0]
+    count = 0
+    begin = 0
+    while begin < n:
+        end = begin
+        while end + 1 < n:
+            step = beam[end + 1] - beam[end]
+            if step < 0:
+                step += beams
+            if step > 4 or _breaks(ranges[beam[end]], ranges[beam[end + 1]], step * increment, limits):
+                break
+            end += 1
+        depth = 0
+        stack[0, 0], stack[0, 1] = begin, end
+        depth = 1
+        goes_on = 0
+        while depth > 0:
+            depth -= 1
+            first, last = stack[depth, 0], stack[depth, 1]
+            middle = _farthest(xy, first, last, threshold)
+            if middle > 0:
+                # Depth first, left part on top: the pieces come out in order.
+                stack[depth, 0], stack[depth, 1] = middle, last
+                stack[depth + 1, 0], stack[depth + 1, 1] = first, middle
+                depth += 2
+                continue
+            if goes_on == 1 and _one_line(xy, pieces[count - 1, 0], first, last, threshold):
+                pieces[count - 1, 1] = last
+            else:
+                pieces[count, 0], pieces[count, 1], pieces[count, 2] = first, last, goes_on
+                count += 1
+            goes_on = 1
+        begin = end + 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
+    """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
+    x0, y0 = xy[first, 0], xy[first, 1]
+    dx, dy = xy[last, 0] - x0, xy[last, 1] - y0
+    length = math.sqrt(dx * dx + dy * dy)
+    best, where = threshold * length, -1
+    for i in range(first + 1, last):
+        d = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
+        if d > best:
+            best, where = d, i
+    return where
+
+
+@njit(cache=True, nogil=True)
+def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -> bool:
+    """Tell whether two pieces that share ``middle`` are one after all (the merge of split and merge)."""
+    if last - first < 3 or middle - first < 2 or last - middle < 2:
+        return False
+    return _farthest(xy, first, last, 0.75 * threshold) < 0
+
+
+@njit(cache=True, nogil=True)
+def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
+    """Fit a line to a piece by total least squares; tell whether it is a surface.
+
+    ``line``: normal (2), distance r, centroid (2), then the variance of the offset at the centroid, of the
+    slope, and their covariance, the extent along the line from the centroid (2), and the number of points.
+    """
+    # The end points are shared with what comes before and after, and may lie on that: the fit leaves them out.
+    a, b = first + 1, last - 1
+    n = b - a + 1
+    if n + 2 < limits[3] or n < 3:
+        return False
+    mx = my = 0.0
+    for i in range(a, b + 1):
+        mx += xy[i, 0]
+        my += xy[i, 1]
+    mx /= n
+    my /= n
+    sxx = sxy = syy = 0.0
+    for i in range(a, b + 1):
+        dx, dy = xy[i, 0] - mx, xy[i, 1] - my
+        sxx += dx * dx
+        sxy += dx * dy
+        syy += dy * dy
+    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)  # of the line itself
+    tx, ty = math.cos(angle), math.sin(angle)
+    nx, ny = -ty, tx
+    r = nx * mx + ny * my
+    if r < 0.0:
+        nx, ny, r = -nx, -ny, -r
+        tx, ty = -tx, -ty
+    # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
+    sigma = limits[0]
+    var_offset = var_slope = cov = spread = residual = 0.0
+    for i in range(a, b + 1):
+        x, y = xy[i, 0], xy[i, 1]
+        t = tx * (x - mx) + ty * (y - my)
+        d = nx * x + ny * y
+        across = sigma * d / math.sqrt(x * x + y * y)
+        variance = across * across
+        var_offset += variance
+        var_slope += t * t * variance
+        cov += t * variance
+        spread += t * t
+        residual += (d - r) * (d - r)
+    if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[2])) ** 2:
+        return False
+    line[0], line[1], line[2], line[3], line[4] = nx, ny, r, mx, my
+    line[5] = var_offset / (n * n)
+    line[6] = var_slope / (spread * spread)
+    line[7] = cov / (n * spread)
+    # Along (-ny, nx), which is (tx, ty) up to sign.
+    ax, ay = -ny, nx
+    t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
+    t1 = ax * (xy[last, 0] - mx) + ay * (xy[last, 1] - my)
+    line[8], line[9], line[10] = t0, t1, n
+    if ax * tx + ay * ty < 0.0:
+        line[7] = -line[7]
+    return abs(t1 - t0) >= limits[4]
+
+
+@njit(cache=True, nogil=True)
+def _all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
+    """Tell whether every point from ``first`` to ``last`` lies on one of two lines."""
+    near = max(limits[1] * limits[0], limits[2])
+    for i in range(first, last + 1):
+        off_one = abs(one[0] * xy[i, 0] + one[1] * xy[i, 1] - one[2])
+        off_two = abs(two[0] * xy[i, 0] + two[1] * xy[i, 1] - two[2])
+        if min(off_one, off_two) > near:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array) -> int:
+    """Write the corner of two surfaces that follow each other in the scan; return 1 if there is one."""
+    cross = one[0] * two[1] - one[1] * two[0]
+    if abs(cross) < limits[6]:
+        return 0
+    x = (one[2] * two[1] - two[2] * one[1]) / cross
+    y = (two[2] * one[0] - one[2] * two[0]) / cross
+    s1 = -one[1] * (x - one[3]) + one[0] * (y - one[4])
+    s2 = -two[1] * (x - two[3]) + two[0] * (y - two[4])
+    # The corner must lie where one surface ends and the other begins, up to the beams' own spacing.
+    rho = math.sqrt(x * x + y * y)
+    gap = limits[7] + 4.0 * rho * increment
+    if abs(s1 - one[9]) > gap or abs(s2 - two[8]) > gap:
+        return 0
+    # Each line's offset at the corner: n·p = r there, with this variance.
+    v1 = one[5] + 2.0 * s1 * one[7] + s1 * s1 * one[6]
+    v2 = two[5] + 2.0 * s2 * two[7] + s2 * s2 * two[6]
+    # p = N⁻¹ (r1, r2)  ⇒  cov p = N⁻¹ diag(v1, v2) N⁻ᵀ
+    a, b = two[1] / cross, -one[1] / cross
+    c, d = -two[0] / cross, one[0] / cross
+    floor = limits[8] ** 2
+    cxx = a * a * v1 + b * b * v2 + floor
+    cxy = a * c * v1 + b * d * v2
+    cyy = c * c * v1 + d * d * v2 + floor
+    ux, uy = x / rho, y / rho
+    # To polar: rows (ux, uy) and (-uy, ux)/ρ.
+    corner[0], corner[1] = rho, math.atan2(y, x)
+    corner[2] = ux * ux * cxx + 2.0 * ux * uy * cxy + uy * uy * cyy
+    corner[3] = (-ux * uy * cxx + (ux * ux - uy * uy) * cxy + ux * uy * cyy) / rho
+    corner[4] = (uy * uy * cxx - 2.0 * ux * uy * cxy + ux * ux * cyy) / (rho * rho)
+    # Unit vectors from the corner along both surfaces.
+    f = math.copysign(1.0, -s1)
+    g = math.copysign(1.0, -s2)
+    ax, ay = -one[1] * f, one[0] * f
+    bx, by = -two[1] * g, two[0] * g
+    # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
+    # one that stands out into it.
+    left = (-ax) * by - (-ay) * bx > 0.0
+    corner[5] = CONCAVE if left else CONVEX
+    sign = 1.0 if left else -1.0
+    corner[6] = math.atan2(sign * (ay + by), sign * (ax + bx))
+    corner[7] = 0.0
+    return 1

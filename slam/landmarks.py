@@ -1,0 +1,229 @@
+"""The book of landmarks: tentative → confirmed → dropped.
+
+A corner seen once may be noise or a passing shape; only one that was seen again at the same place, of the same
+kind, enters the estimator's state. One that the scan keeps looking *through* was never there, or is gone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.association import UNMATCHED
+from slam.geometry import wrap_scalar
+from slam.settings import require
+from slam.types import Scan
+
+__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy"]
+
+Array = NDArray[np.float64]
+
+KIND = 5  # column of an observation row (see FeatureExtractor.extract); its direction is in the next
+
+# Columns of ``marks``, one row a landmark.
+_KIND, _DIRECTION, _SEEN, _MISSED = range(4)
+# Columns of the tentative ones.
+_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE = range(6)
+_TENTATIVE = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkPolicy:
+    """When a corner becomes a landmark, and when it ceases to be one."""
+
+    confirm_after: int = 3  # sightings
+    forget_after: int = 20  # updates without a sighting, while tentative
+    tentative_gate_m: float = 0.15  # two sightings farther apart are two corners
+    new_distance_m: float = 0.2  # a new corner is at least this far from a landmark of its kind
+    drop_after: int = 15  # contradictions more than sightings
+    clear_margin_m: float = 0.3  # a beam that goes this far beyond a landmark contradicts it
+
+    def __post_init__(self) -> None:
+        require(self.confirm_after >= 1, "LandmarkPolicy.confirm_after must be at least 1")
+        require(self.drop_after >= 1, "LandmarkPolicy.drop_after must be at least 1")
+
+
+class LandmarkBook:
+    """What is known of each landmark beside its position, which the estimator keeps."""
+
+    def __init__(self, policy: LandmarkPolicy) -> None:
+        self.policy = policy
+        self.count = 0
+        self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
+        self._next_id = 0
+        self._ids = np.zeros(32, np.int64)
+        self._marks = np.zeros((32, 4))
+        self._tentative = np.zeros((_TENTATIVE, 6))
+        self._tentative_count = np.zeros(1, np.int64)
+        self._new = np.zeros(256, np.int64)
+
+    @property
+    def marks(self) -> Array:
+        """Kind and direction, sightings and contradictions ``(n, 4)``. A view."""
+        return self._marks[: self.count]
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Ids ``(n,)``; an id is never used twice. A view."""
+        return self._ids[: self.count]
+
+    def kinds(self) -> NDArray[np.int8]:
+        """Return CONVEX, CONCAVE or 0 (unknown) per landmark ``(n,)``."""
+        return self.marks[:, _KIND].astype(np.int8)
+
+    def directions(self) -> Array:
+        """Return the direction per landmark ``(n,)`` [rad], nan where the kind is unknown."""
+        return np.where(self.marks[:, _KIND] == 0, np.nan, self.marks[:, _DIRECTION])
+
+    def times_seen(self) -> NDArray[np.int64]:
+        """Return the number of sightings per landmark ``(n,)``."""
+        return self.marks[:, _SEEN].astype(np.int64)
+
+    def row(self, landmark_id: int) -> int:
+        """Return the row of a landmark, or -1."""
+        if 0 <= landmark_id < len(self.row_of_id):
+            return int(self.row_of_id[landmark_id])
+        return -1
+
+    def add(self, kind: float, direction: float, known_id: int | None) -> None:
+        """Append a landmark; without a known id it gets the next one."""
+        new_id = self._next_id if known_id is None else known_id
+        if new_id < 0:
+            raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
+        if self.count == len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        while new_id >= len(self.row_of_id):
+            self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
+        self._ids[self.count] = new_id
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0)
+        self.row_of_id[new_id] = self.count
+        self._next_id = max(self._next_id, new_id + 1)
+        self.count += 1
+
+    def drop(self, row: int) -> None:
+        """Take a landmark out; those after it move up."""
+        n = self.count
+        self.row_of_id[self._ids[row]] = -1
+        self._ids[row : n - 1] = self._ids[row + 1 : n]
+        self._marks[row : n - 1] = self._marks[row + 1 : n]
+        self.count = n - 1
+        self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
+
+    def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Count sightings; return which observations are new landmarks by now.
+
+        ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their landmarks.
+        """
+        p = self.policy
+        if len(self._new) < len(z):
+            self._new = np.zeros(len(z), np.int64)
+        count = _review(
+            x, offset, z, match, self.marks, self._tentative, self._tentative_count,
+            p.tentative_gate_m, p.confirm_after, p.forget_after, self._new,
+        )  # fmt: skip
+        return self._new[:count]
+
+    def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
+        """Return the rows to drop, highest first: landmarks that beams keep passing through."""
+        worst = _look_through(
+            x,
+            offset,
+            scan.ranges,
+            scan.angle_min,
+            scan.angle_increment,
+            self.marks,
+            self.policy.clear_margin_m,
+        )
+        if worst <= self.policy.drop_after:
+            return []
+        surplus = self.marks[:, _MISSED] - self.marks[:, _SEEN]
+        return [int(i) for i in np.flatnonzero(surplus > self.policy.drop_after)[::-1]]
+
+
+@njit(cache=True, nogil=True)
+def _review(
+    x: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, tentative: Array,
+    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, forget_after: int,
+    new: NDArray[np.int64],
+) -> int:  # fmt: skip
+    c, s = math.cos(x[2]), math.sin(x[2])
+    n = tentative_count[0]
+    found = 0
+    for i in range(n):
+        tentative[i, _AGE] += 1.0
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            marks[match[k], _SEEN] += 1.0
+            continue
+        if match[k] != UNMATCHED:
+            continue
+        bearing = x[2] + z[k, 1]
+        px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
+        py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
+        turn = wrap_scalar(x[2] + z[k, 6])
+        nearest, best = -1, gate * gate
+        for i in range(n):
+            d2 = (tentative[i, _X] - px) ** 2 + (tentative[i, _Y] - py) ** 2
+            same = tentative[i, _T_KIND] == z[k, 5] and abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
+            if same and d2 < best:
+                nearest, best = i, d2
+        if nearest < 0:
+            if n == tentative.shape[0]:
+                continue
+            nearest = n
+            n += 1
+            tentative[nearest, _COUNT] = 0.0
+            tentative[nearest, _T_KIND] = z[k, 5]
+        t = tentative[nearest]
+        t[_X], t[_Y], t[_T_DIRECTION] = px, py, turn
+        t[_COUNT] += 1.0
+        t[_AGE] = 0.0
+        if t[_COUNT] >= confirm_after:
+            new[found] = k
+            found += 1
+            t[_AGE] = forget_after + 1.0
+    kept = 0
+    for i in range(n):
+        if tentative[i, _AGE] <= forget_after:
+            if kept != i:
+                tentative[kept] = tentative[i]
+            kept += 1
+    tentative_count[0] = kept
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _look_through(
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, marks: Array, margin: float
+) -> float:
+    """Count a contradiction for each landmark that three neighbouring beams pass; return the largest surplus."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    sx, sy = x[0] + offset * c, x[1] + offset * s
+    beams = ranges.shape[0]
+    full = beams * increment > 2.0 * math.pi - 1.5 * increment
+    worst = -1e9
+    for i in range(marks.shape[0]):
+        dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
+        d2 = dx * dx + dy * dy
+        # Farther away, an uncertain heading moves the beams past a corner that is there.
+        if d2 > 25.0:
+            continue
+        rho = math.sqrt(d2)
+        b = round(wrap_scalar(math.atan2(dy, dx) - x[2] - angle_min) / increment)
+        if b < 0:
+            b += round(2.0 * math.pi / increment)
+        passed = True
+        for q in range(b - 1, b + 2):
+            j = q % beams if full else q
+            if j < 0 or j >= beams or not ranges[j] > rho + margin:
+                passed = False
+                break
+        if passed:
+            marks[i, _MISSED] += 1.0
+            worst = max(worst, marks[i, _MISSED] - marks[i, _SEEN])
+    return worst

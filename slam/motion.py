@@ -1,0 +1,113 @@
+"""The motion of the robot between two scans: twist model, Jacobians and odometry noise (theory.md A, predict)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.geometry import wrap_scalar
+from slam.settings import require
+
+__all__ = ["OdometryNoise", "jacobians", "move", "predict_robot"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OdometryNoise:
+    """V, the covariance of the measured twist, diagonal: each σ is a floor plus a share of the wheels' speed.
+
+    The wheels' speed is √(vx² + vy² + (lω)²). The defaults are the simulated youBot's under nominal noise,
+    found by experiment on training seeds; they are larger than the encoders' white noise alone, since wheel
+    radius errors stay the same from step to step and wheels slip.
+    """
+
+    lever_m: float = 0.3855  # l: half the wheelbase plus half the track
+    speed_floor_m_s: float = 0.002
+    speed_share: float = 0.012
+    turn_floor_rad_s: float = 0.003
+    turn_share_rad_m: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
+            require(getattr(self, name) >= 0, f"OdometryNoise.{name} must be ≥ 0")
+        require(self.lever_m > 0, "OdometryNoise.lever_m must be > 0")
+
+    def variances(self, vx: float, vy: float, omega: float) -> tuple[float, float]:
+        """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²]."""
+        speed = math.sqrt(vx * vx + vy * vy + (self.lever_m * omega) ** 2)
+        return (
+            (self.speed_floor_m_s + self.speed_share * speed) ** 2,
+            (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2,
+        )
+
+
+def move(pose: Array, twist: Array, dt: float) -> Array:
+    """Return the pose ``(3,)`` after a body twist ``(3,)`` held for ``dt`` [s]: f(X, u) of theory.md A.
+
+    The heading half way through the step is used, which agrees with the exact SE(2) exponential to third
+    order in ω dt, where the paper's own formula agrees to first.
+    """
+    out = np.array(pose, dtype=np.float64)
+    _move(out, float(twist[0]), float(twist[1]), float(twist[2]), dt)
+    return out
+
+
+def jacobians(pose: Array, twist: Array, dt: float) -> tuple[Array, Array]:
+    """Return Fx ``(3, 3)`` and Fu ``(3, 3)``, the Jacobians of :func:`move` by pose and by twist."""
+    vx, vy, omega = (float(v) for v in twist)
+    middle = float(pose[2]) + 0.5 * omega * dt
+    c, s = math.cos(middle), math.sin(middle)
+    dx_dtheta = -(vx * s + vy * c) * dt
+    dy_dtheta = (vx * c - vy * s) * dt
+    fx = np.array([[1.0, 0.0, dx_dtheta], [0.0, 1.0, dy_dtheta], [0.0, 0.0, 1.0]])
+    half = 0.5 * dt
+    fu = np.array([[c * dt, -s * dt, dx_dtheta * half], [s * dt, c * dt, dy_dtheta * half], [0.0, 0.0, dt]])
+    return fx, fu
+
+
+@njit(cache=True, nogil=True)
+def _move(pose: Array, vx: float, vy: float, omega: float, dt: float) -> None:
+    middle = pose[2] + 0.5 * omega * dt
+    c, s = math.cos(middle), math.sin(middle)
+    pose[0] += (vx * c - vy * s) * dt
+    pose[1] += (vx * s + vy * c) * dt
+    pose[2] = wrap_scalar(pose[2] + omega * dt)
+
+
+@njit(cache=True, nogil=True)
+def predict_robot(
+    x: Array, p: Array, n: int, vx: float, vy: float, omega: float, dt: float, var_v: float, var_w: float
+) -> None:
+    """Move the robot part of a joint Gaussian: x[:3], and the first three rows of p's upper triangle.
+
+    P_rr ← Fx P_rr Fxᵀ + Fu V Fuᵀ, P_rm ← Fx P_rm (theory.md A, predict); ``n`` is the size of the state.
+    """
+    middle = x[2] + 0.5 * omega * dt
+    c, s = math.cos(middle), math.sin(middle)
+    a = -(vx * s + vy * c) * dt
+    b = (vx * c - vy * s) * dt
+    _move(x, vx, vy, omega, dt)
+    # Fx P: rows 0 and 1 gain a multiple of row 2. Its part left of the diagonal is column 2's upper part.
+    p02, p12, p22 = p[0, 2], p[1, 2], p[2, 2]
+    for j in range(3, n):
+        p[0, j] += a * p[2, j]
+        p[1, j] += b * p[2, j]
+    p[0, 0] += 2.0 * a * p02 + a * a * p22
+    p[0, 1] += a * p12 + b * p02 + a * b * p22
+    p[1, 1] += 2.0 * b * p12 + b * b * p22
+    p[0, 2] += a * p22
+    p[1, 2] += b * p22
+    # Fu V Fuᵀ: the linear part is a rotation of an isotropic covariance; the turn acts through the half step.
+    half = 0.5 * dt
+    qv = var_v * dt * dt
+    p[0, 0] += qv + a * a * half * half * var_w
+    p[0, 1] += a * b * half * half * var_w
+    p[1, 1] += qv + b * b * half * half * var_w
+    p[0, 2] += a * half * dt * var_w
+    p[1, 2] += b * half * dt * var_w
+    p[2, 2] += dt * dt * var_w

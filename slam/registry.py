@@ -1,0 +1,40 @@
+"""Names → backends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from slam.backend import Backend, BackendConfig
+from slam.dead_reckoning import OdometrySlam, TruthSlam
+from slam.ekf import EkfConfig, EkfSlam
+from slam.settings import from_mapping, unknown_name
+
+__all__ = ["config_type", "make", "names"]
+
+_BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
+    "odometry": (OdometrySlam, EkfConfig),
+    "truth": (TruthSlam, EkfConfig),
+    "ekf": (EkfSlam, EkfConfig),
+}
+
+
+def names() -> tuple[str, ...]:
+    """Return the names that :func:`make` knows."""
+    return tuple(_BACKENDS)
+
+
+def config_type(name: str) -> type[BackendConfig]:
+    """Return the config dataclass of a backend; ``ValueError`` lists the valid names."""
+    if name not in _BACKENDS:
+        raise unknown_name("SLAM backend", name, _BACKENDS)
+    return _BACKENDS[name][1]
+
+
+def make(name: str, *, config: Mapping[str, Any] | BackendConfig | None = None) -> Backend:
+    """Make a backend by name, with a config dataclass or a mapping laid over its defaults.
+
+    Raises ``ValueError`` that lists what is valid where the name or a key is unknown.
+    """
+    settings = from_mapping(config_type(name), config)
+    return _BACKENDS[name][0](settings)
