@@ -1,1 +1,59 @@
 """Agents: who decides, on the belief alone, where the robot goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from slam.settings import unknown_name
+
+if TYPE_CHECKING:
+    from agents.base import Agent
+    from mecanum_env.config import LidarConfig, RobotConfig
+
+__all__ = ["make", "names"]
+
+# Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
+_REGISTRY = {
+    "random": "agents.random:RandomAgent",
+    "nearest-frontier": "agents.frontier:NearestFrontier",
+}
+
+
+def names() -> tuple[str, ...]:
+    """Return the names that :func:`make` takes, sorted."""
+    return tuple(sorted(_REGISTRY))
+
+
+def make(
+    name: str,
+    *,
+    config: Any = None,
+    robot: RobotConfig | Mapping[str, Any] | str | None = None,
+    lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+    step_s: float = 0.1,
+) -> Agent:
+    """Return a new agent by name; call its ``reset(belief, seed)`` before its first step.
+
+    Parameters
+    ----------
+    name : str
+        One of :func:`names`.
+    config : dataclass or mapping, optional
+        The agent's own configuration, ``agents.<module>.<Agent>Config``.
+    robot, lidar : config, mapping or preset name, optional
+        The body it drives and the sensor it looks with; the youBot's by default.
+    step_s : float
+        Time between two calls of ``act`` [s].
+
+    Raises
+    ------
+    ValueError
+        For a name or key that is not known; the message lists the valid ones.
+    """
+    if name not in _REGISTRY:
+        raise unknown_name("agent", name, _REGISTRY)
+    module, _, attribute = _REGISTRY[name].partition(":")
+    agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)
+    return agent

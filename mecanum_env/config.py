@@ -146,9 +146,7 @@ class NoiseConfig:
             "patch_share",
         ):
             value = getattr(self, name)
-            require(
-                math.isfinite(value) and 0 <= value < 1, f"NoiseConfig.{name} must be in [0, 1), got {value}"
-            )
+            require(math.isfinite(value) and 0 <= value < 1, f"NoiseConfig.{name} must be in [0, 1), got {value}")
         require(0 < self.friction <= 2, f"NoiseConfig.friction must be in (0, 2], got {self.friction}")
         low, high = self.patch_friction
         require(0 < low <= high <= 2, "NoiseConfig.patch_friction needs 0 < low ≤ high ≤ 2")
@@ -175,6 +173,7 @@ class EnvConfig:
     """An environment, whole. A string names a preset, generator or backend; ``*_config`` sets its details."""
 
     rooms: str = "apartment"
+    floor_plan: str | None = None  # a file to read instead of generating rooms
     rooms_config: Mapping[str, Any] = field(default_factory=dict)
     slam: str = "ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
@@ -186,17 +185,14 @@ class EnvConfig:
     physics_step_s: float = 0.02
     grid_resolution_m: float = 0.05
     coverage_target: float = 0.95
+    time_limit_s: float = 300.0  # what ``progress`` counts against where the environment has no step limit
     terminate_on_collision: bool = False
     max_landmarks_observed: int = 32
 
     def __post_init__(self) -> None:
-        require(
-            0 < self.physics_step_s <= self.step_s <= 1, "EnvConfig needs 0 < physics_step_s ≤ step_s ≤ 1"
-        )
+        require(0 < self.physics_step_s <= self.step_s <= 1, "EnvConfig needs 0 < physics_step_s ≤ step_s ≤ 1")
         substeps = self.step_s / self.physics_step_s
-        require(
-            abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s"
-        )
+        require(abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s")
         require(0.01 <= self.grid_resolution_m <= 1, "EnvConfig.grid_resolution_m must be in [0.01, 1]")
         require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
 
@@ -231,9 +227,7 @@ NOISE_PRESETS: dict[str, NoiseConfig] = {
 }
 
 
-def resolve(
-    cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str
-) -> T:
+def resolve(cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str) -> T:
     """Return a config from a preset's name, a mapping (laid over its ``preset`` key's), or a config."""
     if isinstance(value, str):
         if value not in presets:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FloorPlan", "FloorPlanError"]
+from mecanum_env.rooms.corners import find_corners
+
+__all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
 
 Array = NDArray[np.float64]
 
@@ -17,12 +22,32 @@ class FloorPlanError(ValueError):
     """A plan that cannot be used: no free space, a start inside a wall, a damaged file."""
 
 
+def clearance_of(free: NDArray[np.bool_], resolution: float) -> NDArray[np.float32]:
+    """Return the distance [m] from each free cell's centre to the nearest edge of a non-free cell.
+
+    What lies outside the raster counts as not free. The value is exact in front of walls along the cells and at
+    most 0.21 cells too large diagonally before a corner; it is 0 in cells that are not free.
+    """
+    padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.uint8)
+    padded[1:-1, 1:-1] = free
+    cells = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    # The transform measures from centre to centre; the surface is the edge, half a cell nearer.
+    return np.asarray(np.maximum(cells - 0.5, 0.0) * resolution, np.float32)
+
+
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
     """Walls, obstacles, free space and a start, in the world frame [m].
 
     The walls are the *surfaces* of whatever is solid: a wall of a building is two of them, some 10 to 20 cm
-    apart. What lies behind a surface is never seen and never reached.
+    apart. What lies behind a surface is never seen and never reached. The generators and importers direct every
+    wall so that free space lies on its left.
+
+    Raises
+    ------
+    FloorPlanError
+        If an array is misshapen or not finite, nothing is free, or the start is not in free space, at least
+        ``start_clearance_m`` from every surface.
     """
 
     name: str
@@ -33,6 +58,49 @@ class FloorPlan:
     resolution: float  # [m] of a cell of ``free``
     origin: tuple[float, float]  # world position of the lower-left corner of cell (0, 0)
     start: tuple[float, float, float]  # x, y, θ: a pose in which the robot touches nothing
+    start_clearance_m: float = 0.0  # [m] that the start keeps from every surface
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "walls", _array(self, "walls", self.walls, 4))
+        polygons = tuple(_array(self, "polygons", polygon, 2) for polygon in self.polygons)
+        object.__setattr__(self, "polygons", polygons)
+        object.__setattr__(self, "circles", _array(self, "circles", self.circles, 3))
+        object.__setattr__(self, "free", np.ascontiguousarray(self.free, dtype=np.bool_))
+        self._check_shapes()
+        self._check_start()
+
+    def _check_shapes(self) -> None:
+        if any(len(polygon) < 3 for polygon in self.polygons):
+            raise FloorPlanError(f"plan {self.name}: a polygon needs at least 3 vertices")
+        if self.circles.size and not np.all(self.circles[:, 2] > 0):
+            raise FloorPlanError(f"plan {self.name}: every circle needs a radius > 0")
+        if not (np.isfinite(self.resolution) and self.resolution > 0):
+            raise FloorPlanError(f"plan {self.name}: resolution must be > 0 m, got {self.resolution}")
+        if len(self.origin) != 2 or not np.all(np.isfinite(self.origin)):
+            raise FloorPlanError(f"plan {self.name}: origin must be two finite coordinates [m]")
+        if self.free.ndim != 2 or not self.free.any():
+            raise FloorPlanError(
+                f"plan {self.name} has no free space: check the thresholds, or whether it needs inverting"
+            )
+
+    def _check_start(self) -> None:
+        if len(self.start) != 3 or not np.all(np.isfinite(self.start)):
+            raise FloorPlanError(f"plan {self.name}: start must be three finite numbers x, y, θ")
+        x, y = self.start[:2]
+        point = np.array([[x, y]])
+        if not self.is_free(point)[0]:
+            x0, y0, x1, y1 = self.bounds
+            raise FloorPlanError(
+                f"plan {self.name}: start ({x:.2f}, {y:.2f}) is not in free space; choose a free point within "
+                f"x {x0:.2f} to {x1:.2f}, y {y0:.2f} to {y1:.2f}"
+            )
+        if self.start_clearance_m > 0:
+            distance = float(self.distance_to_surfaces(point)[0])
+            if distance < self.start_clearance_m:
+                raise FloorPlanError(
+                    f"plan {self.name}: start ({x:.2f}, {y:.2f}) is only {distance:.2f} m from a surface; choose "
+                    f"one at least {self.start_clearance_m:.2f} m away"
+                )
 
     @cached_property
     def segments(self) -> Array:
@@ -42,5 +110,106 @@ class FloorPlan:
 
     @cached_property
     def corners(self) -> Array:
-        """True corner points ``(n, 2)``: where two surfaces that are not in line share an end point."""
-        raise NotImplementedError
+        """True corner points ``(n, 2)`` [m]: where free space bends by more than 5°.
+
+        They are end points of surfaces. One that is hidden (a cupboard's back corner in a room's corner) or
+        where the surface goes on straight (two cupboards side by side) is no corner.
+        """
+        return self._corners_and_kinds[0]
+
+    @cached_property
+    def corner_kinds(self) -> NDArray[np.int8]:
+        """``(n,)`` CONVEX, CONCAVE, or 0 for a corner of thin walls, which is both; see :mod:`slam.types`."""
+        return self._corners_and_kinds[1]
+
+    @cached_property
+    def _corners_and_kinds(self) -> tuple[Array, NDArray[np.int8]]:
+        return find_corners(self.walls, self.polygons, self.free, self.resolution, self.origin)
+
+    @cached_property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Least box around all surfaces: x_min, y_min, x_max, y_max [m] (the raster's where there is none)."""
+        ends = [self.segments[:, :2], self.segments[:, 2:]]
+        if self.circles.size:
+            centre, radius = self.circles[:, :2], self.circles[:, 2:]
+            ends += [centre - radius, centre + radius]
+        points = np.vstack(ends)
+        if not points.size:
+            rows, cols = self.free.shape
+            points = np.array([(0.0, 0.0), (cols, rows)]) * self.resolution + np.asarray(self.origin)
+        (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
+        return float(x0), float(y0), float(x1), float(y1)
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Area of free space [m²]."""
+        return float(np.count_nonzero(self.free)) * self.resolution**2
+
+    def is_free(self, points: Array) -> NDArray[np.bool_]:
+        """Return for points ``(n, 2)`` [m] whether each lies in a free cell ``(n,)``; outside the raster: no."""
+        lattice = (np.asarray(points, np.float64).reshape(-1, 2) - self.origin) / self.resolution
+        rows, cols = self.free.shape
+        # Compared as floats: a far-away or NaN point must not wrap round in the conversion to integers.
+        inside = np.all((lattice >= 0) & (lattice < (cols, rows)), axis=1)
+        cells = np.floor(np.where(inside[:, None], lattice, 0.0)).astype(np.int64)
+        return np.asarray(inside & self.free[cells[:, 1], cells[:, 0]], np.bool_)
+
+    def clearance(self) -> NDArray[np.float32]:
+        """Return for each cell ``(rows, cols)`` the distance [m] to the nearest non-free cell (a fresh array).
+
+        See :func:`clearance_of`.
+        """
+        return clearance_of(self.free, self.resolution)
+
+    def distance_to_surfaces(self, points: Array) -> Array:
+        """Return the exact distance [m] ``(n,)`` from points ``(n, 2)`` to the nearest wall or obstacle."""
+        points = np.asarray(points, np.float64).reshape(-1, 2)
+        best = np.full(len(points), np.inf)
+        start, along = self.segments[:, :2], self.segments[:, 2:] - self.segments[:, :2]
+        squared = np.maximum(np.einsum("ij,ij->i", along, along), 1e-18)
+        for i, point in enumerate(points):
+            offset = point - start
+            share = np.clip(np.einsum("ij,ij->i", offset, along) / squared, 0.0, 1.0)
+            gap = offset - share[:, None] * along
+            best[i] = min(best[i], np.sqrt(np.einsum("ij,ij->i", gap, gap).min(initial=np.inf)))
+            rims = np.hypot(*(point - self.circles[:, :2]).T) - self.circles[:, 2]
+            best[i] = min(best[i], np.maximum(rims, 0.0).min(initial=np.inf))
+        return best
+
+    def reachable(self, radius_m: float) -> NDArray[np.bool_]:
+        """Return the cells ``(rows, cols)`` that the centre of a disc can be driven to from the start.
+
+        The start's own cell counts as passable, even where the disc would touch something there.
+        """
+        passable = clearance_of(self.free, self.resolution) >= radius_m
+        col, row = (
+            int((v - o) // self.resolution) for v, o in zip(self.start[:2], self.origin, strict=True)
+        )
+        passable[row, col] = True
+        _, labels = cv2.connectedComponents(passable.astype(np.uint8), connectivity=4)
+        return np.asarray(labels == labels[row, col], np.bool_)
+
+    def with_start(self, start: Sequence[float], *, clearance_m: float = 0.0) -> FloorPlan:
+        """Return the same plan with another start pose (x, y, θ), checked like the first.
+
+        Raises
+        ------
+        FloorPlanError
+            If the pose is not finite, not free, or nearer than ``clearance_m`` [m] to a surface.
+        """
+        try:
+            pose = tuple(float(v) for v in start)
+        except (TypeError, ValueError) as error:
+            raise FloorPlanError(f"plan {self.name}: start must be three numbers x, y, θ") from error
+        return dataclasses.replace(self, start=pose, start_clearance_m=clearance_m)  # type: ignore[arg-type]
+
+
+def _array(plan: FloorPlan, what: str, values: Array, columns: int) -> Array:
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.size == 0:
+        array = array.reshape(0, columns)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise FloorPlanError(f"plan {plan.name}: {what} must have shape (n, {columns}), got {array.shape}")
+    if not np.all(np.isfinite(array)):
+        raise FloorPlanError(f"plan {plan.name}: {what} must be finite; remove the NaN or infinite coordinates")
+    return array

@@ -1,0 +1,100 @@
+"""What every agent is: it chooses a goal from the belief, and acts to get there."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, resolve
+from slam.settings import require
+from slam.types import Belief
+
+__all__ = ["Agent", "Goal"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """Where to drive, and the way there, in the belief's frame."""
+
+    pose: Array  # (3,) x [m], y [m], θ [rad]
+    path: Array  # (n, 2) [m], n ≥ 1: from the robot's position when it was planned to the goal's
+
+
+class Agent(ABC):
+    """A strategy of exploration. It sees the belief and the observation, never the truth.
+
+    Parameters
+    ----------
+    config : dataclass or mapping, optional
+        The strategy's own configuration.
+    robot, lidar : config, mapping or preset name, optional
+        The body it drives and the sensor it looks with; the youBot's by default.
+    step_s : float
+        Time between two calls of :meth:`act` [s].
+    """
+
+    def __init__(
+        self,
+        config: Any = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        require(math.isfinite(step_s) and 0 < step_s <= 1, f"step_s must be in (0, 1] s, got {step_s}")
+        self._robot = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot preset")
+        self._lidar = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar preset")
+        self._step_s = float(step_s)
+        self._goal: Goal | None = None
+        self._frontiers: Array = np.zeros((0, 2))
+        self._status = "idle"
+
+    @property
+    def goal(self) -> Goal | None:
+        """The goal it is driving to, if any."""
+        return self._goal
+
+    @property
+    def frontiers(self) -> Array:
+        """Frontier points ``(n, 2)`` [m] of the last choice, in the belief's frame."""
+        return self._frontiers.copy()
+
+    @property
+    def status(self) -> str:
+        """A word for what it is doing: ``driving``, ``recovering``, ``covered``, ``stuck`` …"""
+        return self._status
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Forget everything and start an episode; the same seed and beliefs give the same actions."""
+        self._goal = None
+        self._frontiers = np.zeros((0, 2))
+        self._status = "idle"
+
+    @abstractmethod
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return where to go next, or ``None`` when nothing is left to explore."""
+
+    @abstractmethod
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the action ``(3,)`` in [-1, 1]: the body twist vx, vy, ω as fractions of the robot's limits.
+
+        Parameters
+        ----------
+        observation : mapping or None
+            The environment's observation. Where it holds ``scan`` (range / maximum range, 1 where nothing
+            returned), an agent may use it to brake for what the map does not show yet.
+        belief : Belief
+            What the robot believes now.
+        """
+
+    def _to_action(self, twist: Array) -> NDArray[np.float32]:
+        limits = (self._robot.max_speed_m_s, self._robot.max_speed_m_s, self._robot.max_turn_rate_rad_s)
+        return np.clip(np.asarray(twist) / limits, -1.0, 1.0).astype(np.float32)

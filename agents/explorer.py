@@ -1,0 +1,287 @@
+"""What all map-driven agents share: look at frontiers, drive there, notice what does not work out.
+
+A strategy is one method, :meth:`Explorer.pick`: which of the reachable view points comes next.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents import cost_map as cost_maps
+from agents.base import Agent, Goal
+from agents.control import ControlConfig, PathFollower
+from agents.cost_map import CostMap, PlannerConfig
+from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask, view_points
+from agents.planning import TravelCosts, shortest_path, travel_costs
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam import geometry
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatienceConfig:
+    """When to choose anew, when to give up, and for how long."""
+
+    replan_s: float = 1.0
+    min_replan_s: float = 0.3  # between two choices, whatever happens
+    settle_s: float = 0.3  # how long to look from a view point before it counts as looked from
+    looks: int = 3  # at one piece of frontier, each from nearer, before it is let be
+    nearer: float = 0.4  # share of the view range left at each further look
+    stuck_s: float = 4.0  # without moving or turning: recover
+    recover_s: float = 1.5
+    avoid_s: float = 20.0  # how long a goal that did not work out is put last; doubled each time
+    attempts: int = 3  # at one goal that does not work out
+    slowest_m_s: float = 0.15  # a goal gets 10 s and the time its path takes at this speed
+    same_m: float = 0.6  # frontier pieces nearer than this to one dealt with before are the same
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value > 0, f"PatienceConfig.{f.name} must be > 0, got {value}")
+        require(self.nearer < 1, f"PatienceConfig.nearer must be < 1, got {self.nearer}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorerConfig:
+    """The parts of a map-driven agent."""
+
+    frontiers: FrontierConfig = field(default_factory=FrontierConfig)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    patience: PatienceConfig = field(default_factory=PatienceConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What a strategy picks from: pieces of frontier and, for each, the place to look at it from."""
+
+    cost_map: CostMap
+    travel: TravelCosts
+    frontiers: Frontiers
+    cells: NDArray[np.int64]  # (m, 2) row, column of the view points
+    costs: Array  # (m,) travel cost [weighted m], inf where out of reach or given up
+    current: int | None  # the piece it is driving to now, if it is still there
+
+
+@dataclass(slots=True)
+class _Trouble:
+    """A piece of frontier that was looked at in vain, or could not be driven to."""
+
+    point: Array  # (2,) [m]
+    looks: int = 0
+    failures: int = 0
+    avoid_until_s: float = 0.0
+
+
+class Explorer(Agent):
+    """Drives from view point to view point until no frontier is left that it can reach."""
+
+    Config: ClassVar[type[ExplorerConfig]] = ExplorerConfig
+
+    def __init__(
+        self,
+        config: ExplorerConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
+        self.config = from_mapping(self.Config, config)
+        self._follower = PathFollower(
+            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
+        self._forget()
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; the strategy draws nothing at random unless it says so."""
+        super().reset(belief, seed)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._follower.reset()
+        self._time = 0.0
+        self._chosen_at = -math.inf
+        self._target: Array | None = None  # the frontier point behind the goal
+        self._deadline = math.inf
+        self._arrived_for = 0.0
+        self._recover_until = -math.inf
+        self._anchor = np.zeros(3)
+        self._anchored_at = 0.0
+        self._troubles: list[_Trouble] = []
+
+    # ---- choosing ------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return the index of the candidate to go to; at least one has a finite cost."""
+
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
+        candidates = self._candidates(belief)
+        self._frontiers = candidates.frontiers.points
+        if not np.isfinite(candidates.costs).any():
+            self._target = None
+            self._status = "stuck" if any(t.failures for t in self._troubles) else "covered"
+            return None
+        index = self.pick(candidates, belief)
+        target = candidates.frontiers.targets[index]
+        cell = (int(candidates.cells[index, 0]), int(candidates.cells[index, 1]))
+        path = shortest_path(
+            candidates.cost_map,
+            candidates.travel,
+            cell,
+            start=belief.pose,
+            spacing_m=self.config.planner.path_spacing_m,
+        )
+        look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
+        heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
+        if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
+            cost = float(candidates.costs[index])
+            self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
+            self._arrived_for = 0.0
+        self._target = target
+        self._status = "driving"
+        return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
+
+    def _candidates(self, belief: Belief) -> Candidates:
+        config = self.config
+        cost_map = cost_maps.build(belief, config.planner, self._robot)
+        travel = travel_costs(cost_map)
+        frontiers = find(cost_map, config.frontiers)
+        troubles = [self._trouble(point) for point in frontiers.targets]
+        looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
+        views = view_points(
+            cost_map,
+            travel,
+            frontiers,
+            config.frontiers,
+            range_m=self._lidar.range_max_m,
+            shares=config.patience.nearer**looks,
+        )
+        costs = views.costs.copy()
+        failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
+        costs[(looks >= config.patience.looks) | (failures >= config.patience.attempts)] = np.inf
+        # What did not work out lately comes last, but comes before giving up.
+        avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
+        if np.isfinite(costs[~avoided]).any():
+            costs[avoided] = np.inf
+        return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
+
+    def _current(self, frontiers: Frontiers, costs: Array) -> int | None:
+        if self._target is None or not len(costs):
+            return None
+        away = np.hypot(*(frontiers.targets - self._target).T)
+        away[~np.isfinite(costs)] = np.inf
+        nearest = int(np.argmin(away))
+        return nearest if away[nearest] <= self.config.patience.same_m else None
+
+    def _trouble(self, point: Array) -> _Trouble | None:
+        near = [
+            (float(np.hypot(*(t.point - point))), i)
+            for i, t in enumerate(self._troubles)
+            if np.hypot(*(t.point - point)) <= 0.6 * self.config.patience.same_m
+        ]
+        return self._troubles[min(near)[1]] if near else None
+
+    def _note(self, point: Array) -> _Trouble:
+        trouble = self._trouble(point)
+        if trouble is None:
+            trouble = _Trouble(point.copy())
+            self._troubles.append(trouble)
+        return trouble
+
+    # ---- driving -------------------------------------------------------------------------------------------
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action on the way to the goal, choosing a goal when one is due."""
+        if self._due(belief):
+            self._goal = self.choose(belief)
+            self._chosen_at = self._time
+            if self._goal is not None:
+                # Who sees all round need not turn to look.
+                all_round = self._lidar.field_of_view_deg >= 360.0
+                self._follower.set_path(self._goal.path, None if all_round else float(self._goal.pose[2]))
+        self._time += self._step_s
+        if self._goal is None:
+            self._follower.reset()
+            self._anchored_at = self._time
+            return np.zeros(3, dtype=np.float32)
+        if self._time < self._recover_until:
+            self._status = "recovering"
+            twist = self._back_off(observation, belief)
+        else:
+            self._status = "driving"
+            twist = self._follower.follow(observation, belief)
+        self._watch(belief)
+        return self._to_action(twist)
+
+    def _due(self, belief: Belief) -> bool:
+        patience = self.config.patience
+        waited = self._time - self._chosen_at + 1e-9
+        if waited >= patience.replan_s or self._chosen_at == -math.inf:
+            return True
+        if waited < patience.min_replan_s or self._goal is None:
+            return False
+        return self._follower.blocked or self._target is None or not self._is_frontier(belief, self._target)
+
+    def _is_frontier(self, belief: Belief, point: Array) -> bool:
+        """Whether any real stretch of frontier is left around the point, on the fine grid."""
+        grid = belief.grid
+        span = math.ceil(0.35 / grid.resolution)
+        row, col = grid.to_cells(np.asarray(point)[None])[0]
+        classes = cost_maps.belief_classes(belief)
+        low_r, low_c = max(int(row) - span - 1, 0), max(int(col) - span - 1, 0)
+        window = np.ascontiguousarray(classes[low_r : int(row) + span + 2, low_c : int(col) + span + 2])
+        if window.shape[0] < 3 or window.shape[1] < 3:
+            return True
+        # The rim of the window is cut off: there the mask takes the outside for unknown.
+        count = int(np.count_nonzero(frontier_mask(window)[1:-1, 1:-1]))
+        return count * grid.resolution >= 0.5 * self.config.frontiers.min_extent_m
+
+    def _watch(self, belief: Belief) -> None:
+        """Count looks taken, and notice when nothing moves or a goal takes too long."""
+        patience, now = self.config.patience, self._time
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        assert self._target is not None
+        self._arrived_for = self._arrived_for + self._step_s if self._follower.arrived else 0.0
+        if self._arrived_for >= patience.settle_s - 1e-9:
+            self._note(self._target).looks += 1
+            self._chosen_at = -math.inf
+            self._arrived_for = 0.0
+            self._anchored_at = now
+            return
+        moved = float(np.hypot(*(pose[:2] - self._anchor[:2])))
+        turned = abs(geometry.wrap_scalar(pose[2] - self._anchor[2]))
+        if moved > 0.15 or turned > 0.4 or self._follower.arrived:
+            self._anchor, self._anchored_at = pose.copy(), now
+        stuck = now - self._anchored_at > patience.stuck_s
+        if (stuck or now > self._deadline) and now >= self._recover_until:
+            trouble = self._note(self._target)
+            trouble.avoid_until_s = now + patience.avoid_s * 2.0**trouble.failures
+            trouble.failures += 1
+            self._anchored_at = now
+            self._deadline = math.inf
+            self._target = None
+            self._recover_until = now + patience.recover_s if stuck else -math.inf
+            self._chosen_at = -math.inf
+
+    def _back_off(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Move to where there is more room, turning a little: what stood in the way is then seen anew."""
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        angles = np.arange(16) * (math.pi / 8.0)
+        away = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        room = self._follower.room(belief, pose[:2] + 0.3 * away)
+        return self._follower.drive(0.15 * away[int(np.argmax(room))], 0.4, observation, belief)

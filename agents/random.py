@@ -1,0 +1,74 @@
+"""Smooth random driving: the baseline that any strategy must beat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Agent, Goal
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam import geometry
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["RandomAgent", "RandomConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RandomConfig:
+    """An Ornstein-Uhlenbeck walk of the action."""
+
+    correlation_s: float = 1.5  # time in which the action forgets itself by a factor e
+    spread: float = 0.5  # standard deviation of each component of the action
+    preview_s: float = 1.0  # how far ahead the goal lies that it shows
+
+    def __post_init__(self) -> None:
+        for name in ("correlation_s", "spread", "preview_s"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, f"RandomConfig.{name} must be > 0, got {value}")
+
+
+class RandomAgent(Agent):
+    """Drives at random, smoothly, and never holds a place for explored."""
+
+    def __init__(
+        self,
+        config: RandomConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
+        self.config = from_mapping(RandomConfig, config)
+        self._rng = np.random.default_rng(0)
+        self._action = np.zeros(3)
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode with the walk that ``seed`` gives."""
+        super().reset(belief, seed)
+        self._rng = np.random.default_rng(seed)
+        self._action = self._rng.normal(0.0, self.config.spread, 3)
+        self._status = "driving"
+
+    def choose(self, belief: Belief) -> Goal:
+        """Return the pose that the present action leads to; it draws nothing."""
+        limits = (self._robot.max_speed_m_s, self._robot.max_speed_m_s, self._robot.max_turn_rate_rad_s)
+        twist = np.clip(self._action, -1.0, 1.0) * limits
+        times = np.linspace(0.0, self.config.preview_s, 6)
+        poses = [geometry.compose(belief.pose, geometry.exp(twist * t)) for t in times]
+        return Goal(pose=poses[-1], path=np.array([p[:2] for p in poses]))
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action of the walk; neither observation nor belief has a say."""
+        keep = math.exp(-self._step_s / self.config.correlation_s)
+        # The exact discretisation: whatever the step, the spread of the walk stays the same.
+        noise = self.config.spread * math.sqrt(1.0 - keep * keep)
+        self._action = keep * self._action + self._rng.normal(0.0, noise, 3)
+        self._goal = self.choose(belief)
+        return np.clip(self._action, -1.0, 1.0).astype(np.float32)

@@ -1,0 +1,35 @@
+"""The world: a mecanum robot, its sensors, rooms to explore, and the Gymnasium environments over them.
+
+Importing this package registers the environments (with string entry points, so that nothing heavy is loaded)::
+
+    import gymnasium as gym
+    import mecanum_env
+
+    env = gym.make("mecanum_env/Explore-v0", rooms="apartment", slam="ekf")
+
+In a process that has not imported it, ``gym.make("mecanum_env:mecanum_env/Explore-v0")`` does.
+"""
+
+from __future__ import annotations
+
+import gymnasium
+
+__all__ = ["register_envs"]
+
+MAX_EPISODE_STEPS = 3000
+
+
+def register_envs() -> None:
+    """Register the environments with Gymnasium; calling it again changes nothing."""
+    for name, action in (("Explore", "twist"), ("ExploreWheels", "wheels")):
+        env_id = f"mecanum_env/{name}-v0"
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                env_id,
+                entry_point="mecanum_env.env:ExploreEnv",
+                kwargs={"action": action},
+                max_episode_steps=MAX_EPISODE_STEPS,
+            )
+
+
+register_envs()

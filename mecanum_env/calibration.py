@@ -1,0 +1,61 @@
+"""What the estimators are told of the simulated robot: V from its declared noise, and where its lidar sits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
+from slam.motion import OdometryNoise
+
+__all__ = ["backend_settings", "odometry_noise"]
+
+# A wheel's radius error stays for the whole episode, while the filter takes the odometry's error for white. Over
+# the second or so that it takes the landmarks to correct a drift, ten steps' errors add up instead of averaging.
+_PERSISTENCE = 10.0
+
+
+def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
+    """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
+
+    Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, the
+    mean of the slip, uniform within their bounds). Four wheels average into vx and vy with weight 1/4 each,
+    and into ω with 1/(4l).
+    """
+    white = noise.encoder**2 + noise.slip**2 / 3.0
+    lasting = _PERSISTENCE * (noise.radius_error**2 / 3.0)
+    per_wheel = math.sqrt((white + lasting) / 4.0)
+    # The mean share that slip takes away is a bias along the motion; base errors are one in the turn rate.
+    bias_v = noise.slip * math.sqrt(_PERSISTENCE)
+    bias_w = math.hypot(bias_v, noise.base_error * math.sqrt(_PERSISTENCE / 3.0))
+    return OdometryNoise(
+        lever_m=robot.lever_m,
+        speed_share=math.hypot(per_wheel, bias_v),
+        turn_share_rad_m=math.hypot(per_wheel, bias_w) / robot.lever_m,
+    )
+
+
+def backend_settings(config: EnvConfig) -> dict[str, Any]:
+    """Return a backend's settings as the environment's parts imply them, ``slam_config`` laid over them."""
+    noise = odometry_noise(config.robot, config.noise)
+    settings: dict[str, Any] = {
+        "lidar_offset_m": config.lidar.offset_m,
+        "body_radius_m": 0.5 * (config.robot.inscribed_radius_m + config.robot.circumscribed_radius_m),
+        "grid_resolution_m": config.grid_resolution_m,
+        "odometry": {
+            "lever_m": noise.lever_m,
+            "speed_share": noise.speed_share,
+            "turn_share_rad_m": noise.turn_share_rad_m,
+        },
+        "features": {"range_sigma_m": config.noise.range_sigma_m},
+    }
+    return _overlay(settings, config.slam_config)
+
+
+def _overlay(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        inner = out.get(key)
+        out[key] = _overlay(inner, value) if isinstance(inner, dict) and isinstance(value, Mapping) else value
+    return out

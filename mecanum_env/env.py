@@ -1,0 +1,367 @@
+"""The exploration environments. ``ExploreEnv`` is only wiring: act, step the world, sense, believe, observe."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+import slam
+from mecanum_env import rooms as room_registry
+from mecanum_env.calibration import backend_settings
+from mecanum_env.config import (
+    LIDAR_PRESETS,
+    NOISE_PRESETS,
+    ROBOT_PRESETS,
+    EnvConfig,
+    LidarConfig,
+    NoiseConfig,
+    RewardConfig,
+    RobotConfig,
+    from_toml,
+    resolve,
+)
+from mecanum_env.episode import EpisodeRecord
+from mecanum_env.ground_truth import Coverage, GroundTruth
+from mecanum_env.observation import Observation, observation_space, observe
+from mecanum_env.reward import StepOutcome, reward_terms
+from mecanum_env.robot import action_to_wheels, twist_action_to_wheels
+from mecanum_env.rooms import FloorPlan
+from mecanum_env.sensors import Lidar, WheelEncoders
+from mecanum_env.world import World
+from slam.backend import Backend
+from slam.dead_reckoning import TruthSlam
+from slam.geometry import wrap_scalar
+from slam.metrics import nees_pose
+from slam.settings import from_mapping, unknown_name
+from slam.types import Belief, Odometry, Scan
+
+__all__ = ["ExploreEnv", "Truth", "make_config"]
+
+Array = NDArray[np.float64]
+Settings = str | Mapping[str, Any]
+
+ACTIONS = {"twist": 3, "wheels": 4}
+
+
+@dataclasses.dataclass(frozen=True)
+class Truth:
+    """What is really so: for metrics and drawing only."""
+
+    ground: GroundTruth
+    world: World
+    record: EpisodeRecord
+    scan: Scan
+
+    @property
+    def plan(self) -> FloorPlan:
+        """The floor plan, in the world frame."""
+        return self.ground.plan
+
+    @property
+    def pose(self) -> Array:
+        """True pose ``(3,)`` in the start frame, which is the belief's."""
+        return self.ground.in_start_frame(self.world.pose)
+
+
+def make_config(
+    *,
+    config: EnvConfig | str | Path | Mapping[str, Any] | None = None,
+    rooms: Settings | None = None,
+    slam: Settings | None = None,
+    robot: Settings | RobotConfig | None = None,
+    lidar: Settings | LidarConfig | None = None,
+    noise: Settings | NoiseConfig | None = None,
+    reward: Mapping[str, Any] | RewardConfig | None = None,
+    floor_plan: str | Path | None = None,
+) -> EnvConfig:
+    """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
+
+    A string names a preset, generator or backend; a mapping configures it (``{"preset": "youbot", …}``,
+    ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
+    Unknown names and keys raise ``ValueError`` that lists the valid ones.
+    """
+    base = from_toml(config) if isinstance(config, str | Path) else from_mapping(EnvConfig, config)
+    changes: dict[str, Any] = {}
+    if isinstance(robot, str) and robot in ROBOT_PRESETS:
+        lidar = robot if lidar is None and robot in LIDAR_PRESETS else lidar
+        noise = robot if noise is None and robot in NOISE_PRESETS else noise
+    for name, given in (("rooms", rooms), ("slam", slam)):
+        if isinstance(given, Mapping):
+            options = dict(given)
+            changes[name] = str(options.pop("name", getattr(base, name)))
+            changes[f"{name}_config"] = options
+        elif given is not None:
+            changes[name] = given
+            if given != getattr(base, name):
+                changes[f"{name}_config"] = {}
+    if robot is not None:
+        changes["robot"] = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
+    if lidar is not None:
+        changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
+    if noise is not None:
+        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
+    if reward is not None:
+        changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
+    if floor_plan is not None:
+        changes["floor_plan"] = str(floor_plan)
+    made = dataclasses.replace(base, **changes)
+    if made.rooms not in room_registry.names():
+        raise unknown_name("rooms", made.rooms, room_registry.names())
+    slam_config_type(made.slam)
+    return made
+
+
+def slam_config_type(name: str) -> Any:
+    """Return a backend's config type; ``ValueError`` lists the valid names."""
+    return slam.config_type(name)
+
+
+class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """A mecanum robot in rooms it has never seen; see the documentation of ``mecanum_env/Explore-v0``.
+
+    Parameters
+    ----------
+    action : str
+        ``"twist"``: body twist as fractions of the limits; ``"wheels"``: wheel speeds FL, FR, RL, RR.
+    config, rooms, slam, robot, lidar, noise, reward, floor_plan
+        See :func:`make_config`.
+    render_mode : str, optional
+        ``"rgb_array"``: truth beside belief.
+
+    Notes
+    -----
+    ``reset(seed=…, options=…)`` takes the options ``floor_plan`` (a :class:`FloorPlan` or a file),
+    ``start_pose`` (x, y, θ in the plan's frame) and ``room_seed`` (the room of another seed). One seed gives
+    the same episode, bit for bit; its room and its noise depend on neither agent nor backend.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        *,
+        action: str = "twist",
+        render_mode: str | None = None,
+        config: EnvConfig | str | Path | Mapping[str, Any] | None = None,
+        rooms: Settings | None = None,
+        slam: Settings | None = None,
+        robot: Settings | RobotConfig | None = None,
+        lidar: Settings | LidarConfig | None = None,
+        noise: Settings | NoiseConfig | None = None,
+        reward: Mapping[str, Any] | RewardConfig | None = None,
+        floor_plan: str | Path | FloorPlan | None = None,
+    ) -> None:
+        if action not in ACTIONS:
+            raise unknown_name("action", action, ACTIONS)
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
+        self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
+        self.config = make_config(
+            config=config, rooms=rooms, slam=slam, robot=robot, lidar=lidar, noise=noise, reward=reward,
+            floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan,
+        )  # fmt: skip
+        self.render_mode = render_mode
+        self._action = action
+        self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS[action],), np.float32)
+        self.observation_space = observation_space(self.config)
+        self.backend = make_backend(self.config)
+        self.lidar = Lidar(self.config.lidar, self.config.noise)
+        self._ready = False
+
+    # ---- Gymnasium -----------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode: draw the room, place the robot, take the first scan."""
+        super().reset(seed=seed)
+        options = dict(options or {})
+        for key in options:
+            if key not in ("floor_plan", "start_pose", "room_seed"):
+                raise unknown_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
+        # One generator per purpose, so that nothing an agent or a backend does changes another's draws.
+        episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
+        world_seed, sensor_seed = np.random.SeedSequence(episode_seed).spawn(2)
+        world_rng = np.random.Generator(np.random.PCG64(world_seed))
+        self._sensor_rng = np.random.Generator(np.random.PCG64(sensor_seed))
+        room_seed = options.get("room_seed")
+        plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
+        config = self.config
+        self._encoders = WheelEncoders(config.robot, config.noise, world_rng)
+        world = World(
+            plan, config.robot, config.noise, world_rng,
+            radii=self._encoders.true_radii, lever=self._encoders.true_lever,
+        )  # fmt: skip
+        start = np.array(plan.start, dtype=np.float64)
+        ground = GroundTruth(
+            plan, start, robot=config.robot, lidar=config.lidar, resolution=config.grid_resolution_m
+        )
+        self._coverage = Coverage(ground)
+        self.backend.reset((0.0, 0.0, 0.0), seed=episode_seed)
+        scan = self.lidar.scan(plan.segments, plan.circles, world.pose, self._sensor_rng)
+        self.truth = Truth(ground, world, EpisodeRecord(), scan)
+        self.scan = scan
+        self._steps = 0
+        self._step_limit = self._find_step_limit()
+        self._odometry = Odometry((0.0, 0.0, 0.0), config.step_s)
+        self._ready = True
+        self._give_truth()
+        self.backend.update(scan)
+        self._remember()
+        info = self._info(self._coverage.update(self.backend.grid), np.zeros(3))
+        return self._observe(), info
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Act for one control step; see :mod:`mecanum_env.reward` for the reward."""
+        if not self._ready:
+            raise RuntimeError("call reset() before step()")
+        config, world = self.config, self.truth.world
+        wheels = self._wheel_targets(action)
+        collisions = world.collisions
+        world.step(wheels, config.step_s, config.physics_step_s)
+        self._odometry = self._encoders.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
+        plan = self.truth.plan
+        self.scan = self.lidar.scan(plan.segments, plan.circles, world.pose, self._sensor_rng)
+        self.truth = dataclasses.replace(self.truth, scan=self.scan)
+        self.backend.predict(self._odometry)
+        self._give_truth()
+        self.backend.update(self.scan)
+        self._steps += 1
+
+        coverage = self._coverage.update(self.backend.grid)
+        terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
+        self._remember()
+        info = self._info(coverage, np.asarray(self.truth.pose))
+        info["reward_terms"] = terms
+        success = coverage >= config.coverage_target
+        terminated = success or (config.terminate_on_collision and world.collisions > 0)
+        if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
+            info["is_success"] = bool(success)
+            info["episode_metrics"] = self.episode_metrics()
+        return self._observe(), float(sum(terms.values())), bool(terminated), False, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Return truth beside belief as an RGB image ``(h, w, 3)``."""
+        if self.render_mode is None:
+            gymnasium.logger.warn('render() needs render_mode="rgb_array" in gym.make')
+            return None
+        from mecanum_env.render import render_frame
+
+        return render_frame(self)
+
+    # ---- what others may read ------------------------------------------------------------------------------
+
+    @property
+    def belief(self) -> Belief:
+        """What the robot knows; agents may use it."""
+        return self.backend.belief
+
+    @property
+    def odometry(self) -> Odometry:
+        """The wheels' account of the last step."""
+        return self._odometry
+
+    def episode_metrics(self) -> dict[str, float | int | None]:
+        """Return the metrics of the episode so far (see :class:`mecanum_env.episode.EpisodeRecord`)."""
+        return self.truth.record.metrics(self.truth.ground, self.backend.belief)
+
+    # ---- parts of a step -----------------------------------------------------------------------------------
+
+    def _make_plan(self, options: dict[str, Any], room_seed: int) -> FloorPlan:
+        start = options.get("start_pose")
+        given = options.get("floor_plan", self._plan)
+        if given is None:
+            given = self.config.floor_plan
+        if isinstance(given, FloorPlan):
+            plan = given
+        elif given is not None:
+            return room_registry.load(given, start=start, seed=room_seed)
+        else:
+            plan = room_registry.make(self.config.rooms, seed=room_seed, config=self.config.rooms_config)
+        if start is not None:
+            pose = tuple(float(v) for v in start)
+            plan = dataclasses.replace(plan, start=pose, start_clearance_m=self.config.robot.inscribed_radius_m)
+        return plan
+
+    def _wheel_targets(self, action: NDArray[np.float32]) -> Array:
+        a = np.asarray(action, dtype=np.float64)
+        size = ACTIONS[self._action]
+        if a.shape != (size,) or not math.isfinite(float(a.sum())):
+            raise ValueError(f"an action is {size} finite numbers in [-1, 1], got {action!r}")
+        a = np.clip(a, -1.0, 1.0)
+        if self._action == "wheels":
+            return action_to_wheels(self.config.robot, a)
+        return twist_action_to_wheels(self.config.robot, a)
+
+    def _give_truth(self) -> None:
+        if isinstance(self.backend, TruthSlam):
+            self.backend.give_pose(self.truth.pose)
+
+    def _remember(self) -> None:
+        """Keep what the next step's reward compares with."""
+        grid = self.backend.grid
+        self._before = (grid.known_cells, grid.entropy_bit, _entropy(self.backend.pose_cov))
+
+    def _outcome(self, collisions: int) -> StepOutcome:
+        grid, config = self.backend.grid, self.config
+        known, map_entropy, pose_entropy = self._before
+        cell = grid.resolution**2
+        vx, vy, omega = (float(v) for v in self._odometry.twist)
+        robot = config.robot
+        speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
+        return StepOutcome(
+            area_m2=(grid.known_cells - known) * cell,
+            pose_entropy_loss_nat=pose_entropy - _entropy(self.backend.pose_cov),
+            map_entropy_loss_bit_m2=(map_entropy - grid.entropy_bit) * cell,
+            collisions=collisions,
+            effort=min(speed, 1.0),
+            dt=config.step_s,
+        )
+
+    def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
+        estimate, cov = self.backend.pose, self.backend.pose_cov
+        nees = float(nees_pose(estimate, cov, true_pose))
+        record, world = self.truth.record, self.truth.world
+        time_s = self._steps * self.config.step_s
+        record.append(time_s, true_pose, estimate, coverage, nees)
+        record.collisions = world.collisions
+        return {
+            "coverage": coverage,
+            "collisions": world.collisions,
+            "path_length_m": record.path_length_m,
+            "time_s": time_s,
+            "true_pose": true_pose,
+            "position_error_m": math.hypot(true_pose[0] - estimate[0], true_pose[1] - estimate[1]),
+            "heading_error_rad": abs(wrap_scalar(true_pose[2] - estimate[2])),
+            "nees": nees,
+        }
+
+    def _observe(self) -> Observation:
+        limit = self._step_limit or self.config.time_limit_s / self.config.step_s
+        return observe(
+            self.config, self.backend, self.scan, twist=self._odometry.twist, time_used=self._steps / limit
+        )
+
+    def _find_step_limit(self) -> int | None:
+        return self.spec.max_episode_steps if self.spec is not None else None
+
+
+def make_backend(config: EnvConfig) -> Backend:
+    """Return the backend that an environment's configuration asks for, told of its robot and noise."""
+    return slam.make(config.slam, config=backend_settings(config))
+
+
+def _entropy(cov: Array) -> float:
+    """Return the pose's differential entropy up to a constant: ½ log |Σ| [nat]."""
+    a, b, c = cov[0, 0], cov[0, 1], cov[0, 2]
+    d, e, f = cov[1, 1], cov[1, 2], cov[2, 2]
+    det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    return 0.5 * math.log(max(float(det), 1e-60))

@@ -1,0 +1,119 @@
+"""The record of one episode: what happened, and what it amounts to (contract.md, "Command line")."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.ground_truth import GroundTruth, occupied, on_lattice
+from slam import metrics
+
+if TYPE_CHECKING:
+    from slam.types import Belief
+
+__all__ = ["EpisodeRecord"]
+
+Array = NDArray[np.float64]
+
+WALL_TOLERANCE_M = 0.1
+"""A mapped wall stands rightly where a true one is no farther than this."""
+
+# Columns of the record.
+_TRUE, _ESTIMATE, _TIME, _COVERAGE, _NEES = slice(0, 3), slice(3, 6), 6, 7, 8
+
+
+class EpisodeRecord:
+    """Poses (true and believed, in the start frame), coverage and NEES of every step."""
+
+    def __init__(self) -> None:
+        self._rows = np.empty((1024, 9))
+        self._count = 0
+        self.path_length_m = 0.0
+        self.collisions = 0
+
+    def append(self, time_s: float, true_pose: Array, estimate: Array, coverage: float, nees: float) -> None:
+        """Add one step; the first row is the start itself."""
+        if self._count == len(self._rows):
+            self._rows = np.vstack([self._rows, np.empty_like(self._rows)])
+        row = self._rows[self._count]
+        row[_TRUE], row[_ESTIMATE] = true_pose, estimate
+        row[_TIME], row[_COVERAGE], row[_NEES] = time_s, coverage, nees
+        if self._count:
+            before = self._rows[self._count - 1]
+            self.path_length_m += float(np.hypot(true_pose[0] - before[0], true_pose[1] - before[1]))
+        self._count += 1
+
+    @property
+    def times(self) -> Array:
+        """Simulated time of each row ``(n,)`` [s]."""
+        return self._rows[: self._count, _TIME].copy()
+
+    @property
+    def true_poses(self) -> Array:
+        """True poses ``(n, 3)`` in the start frame."""
+        return self._rows[: self._count, _TRUE].copy()
+
+    @property
+    def estimates(self) -> Array:
+        """Believed poses ``(n, 3)`` in the start frame."""
+        return self._rows[: self._count, _ESTIMATE].copy()
+
+    @property
+    def coverage(self) -> Array:
+        """Coverage after each row ``(n,)``."""
+        return self._rows[: self._count, _COVERAGE].copy()
+
+    @property
+    def nees(self) -> Array:
+        """Pose NEES of each row ``(n,)``, ideally 3 on average."""
+        return self._rows[: self._count, _NEES].copy()
+
+    def metrics(self, truth: GroundTruth, belief: Belief) -> dict[str, float | int | None]:
+        """Return ``episode_metrics``: plain numbers, deterministic, ``None`` where not reached or not defined."""
+        rows = self._rows[: self._count]
+        times, coverage = rows[:, _TIME], rows[:, _COVERAGE]
+        score = score_map(truth, belief)
+        corners = metrics.corner_deviation(belief.landmarks, truth.corners)
+        end = rows[-1]
+        heading = metrics.heading_errors(end[None, _TRUE], end[None, _ESTIMATE])
+        # The start is known by definition: NEES counts from the first step on.
+        nees = rows[1:, _NEES]
+        nees = nees[np.isfinite(nees)]
+        return {
+            "coverage": float(coverage[-1]),
+            "time_s": round(float(times[-1]), 6),
+            "steps": self._count - 1,
+            "path_length_m": self.path_length_m,
+            "collisions": self.collisions,
+            "time_to_50_s": metrics.time_to(coverage, times, level=0.5),
+            "time_to_90_s": metrics.time_to(coverage, times, level=0.9),
+            "time_to_95_s": metrics.time_to(coverage, times, level=0.95),
+            "map_iou": score.iou,
+            "map_precision": score.precision,
+            "map_recall": score.recall,
+            "corner_mean_m": _number(corners.mean),
+            "corner_max_m": _number(corners.max),
+            "ate_rmse_m": metrics.ate(rows[:, _TRUE], rows[:, _ESTIMATE]),
+            "final_position_error_m": float(np.hypot(end[0] - end[3], end[1] - end[4])),
+            "final_heading_error_rad": abs(float(heading[0])),
+            "anees": float(nees.mean() / 3.0) if len(nees) else None,
+            "landmarks": len(belief.landmarks),
+        }
+
+
+def score_map(truth: GroundTruth, belief: Belief) -> metrics.MapScore:
+    """Compare the belief's walls with the true ones, within :data:`WALL_TOLERANCE_M`.
+
+    What the belief has beyond the true plan's extent counts as wrong as far as ten metres out.
+    """
+    margin = round(10.0 / truth.resolution)
+    true_walls = on_lattice(truth.walls, truth.lattice_origin, truth, margin)
+    return metrics.compare_walls(
+        occupied(belief.grid, truth, margin), true_walls, tolerance_cells=WALL_TOLERANCE_M / truth.resolution
+    )
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

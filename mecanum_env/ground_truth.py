@@ -1,0 +1,171 @@
+"""The truth of an episode, for metrics and drawing only: nothing of it reaches an observation or an agent."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.raycast import cast_rays
+from mecanum_env.rooms.floor_plan import FloorPlan
+from slam.geometry import compose, inverse, transform_points
+from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.types import Scan
+
+__all__ = ["Coverage", "GroundTruth"]
+
+Array = NDArray[np.float64]
+
+_VIEW_SPACING_M = 0.5  # between the places that visibility is computed from
+_VIEW_BEAMS = 720
+
+
+class GroundTruth:
+    """A floor plan as the start frame has it: what can be mapped, and what a perfect map would be.
+
+    Parameters
+    ----------
+    plan : FloorPlan
+        In the world frame.
+    start : Array
+        Start pose ``(3,)`` in the world frame; the belief's frame is this pose's.
+    resolution : float
+        Of the rasters [m]; they lie on the same lattice as the belief's grid.
+
+    Attributes
+    ----------
+    mappable : NDArray[np.bool_]
+        Free cells that the lidar can see from the places the robot can reach, on the lattice.
+    walls : NDArray[np.bool_]
+        Cells with a surface in them, next to a mappable cell.
+    lattice_origin : tuple[int, int]
+        Lattice row and column of either raster's cell (0, 0).
+    """
+
+    def __init__(
+        self, plan: FloorPlan, start: Array, *, robot: RobotConfig, lidar: LidarConfig, resolution: float
+    ) -> None:
+        self.plan = plan
+        self.start = np.asarray(start, dtype=np.float64)
+        self.resolution = resolution
+        seen = self._view_from_everywhere(robot, lidar)
+        self.lattice_origin = seen.lattice_origin
+        rows, cols = np.indices(seen.shape)
+        centres = seen.to_points(np.column_stack([rows.ravel(), cols.ravel()]))
+        free = plan.is_free(transform_points(self.start, centres)).reshape(seen.shape)
+        self.mappable = np.asarray((seen.classes() == FREE) & free)
+        self.mappable_cells = max(int(np.count_nonzero(self.mappable)), 1)
+        near = cv2.dilate(self.mappable.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        self.walls = self._surfaces(seen) & near
+
+    @property
+    def corners(self) -> Array:
+        """True corners ``(n, 2)`` [m] in the start frame."""
+        return transform_points(inverse(self.start), self.plan.corners)
+
+    def in_start_frame(self, pose_world: Array) -> Array:
+        """Return a world pose ``(3,)`` in the start frame."""
+        return compose(inverse(self.start), pose_world)
+
+    def _view_from_everywhere(self, robot: RobotConfig, lidar: LidarConfig) -> OccupancyGrid:
+        """Map the plan without noise from all over the places that the robot's body can reach."""
+        plan = self.plan
+        reachable = (plan.clearance() >= robot.inscribed_radius_m).astype(np.uint8)
+        _, labels = cv2.connectedComponents(reachable, connectivity=4)
+        col = int((self.start[0] - plan.origin[0]) / plan.resolution)
+        row = int((self.start[1] - plan.origin[1]) / plan.resolution)
+        label = labels[min(max(row, 0), labels.shape[0] - 1), min(max(col, 0), labels.shape[1] - 1)]
+        stride = max(round(_VIEW_SPACING_M / plan.resolution), 1)
+        here = (labels == label) if label > 0 else (labels < 0)
+        cells = np.argwhere(here[stride // 2 :: stride, stride // 2 :: stride]) * stride + stride // 2
+        views = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
+        views = np.vstack([views, self.start[:2]])
+        grid = OccupancyGrid(self.resolution)
+        increment = 2.0 * math.pi / _VIEW_BEAMS
+        to_start = inverse(self.start)
+        ranges = np.empty(_VIEW_BEAMS)
+        for x, y in views:
+            pose = np.array([x, y, self.start[2]])
+            cast_rays(plan.segments, plan.circles, x, y, pose[2], -math.pi, increment, lidar.range_max_m, ranges)
+            scan = Scan(ranges, angle_min=-math.pi, angle_increment=increment, range_max=lidar.range_max_m)
+            grid.integrate(compose(to_start, pose), scan)
+            grid.take_changes()
+        return grid
+
+    def _surfaces(self, grid: OccupancyGrid) -> NDArray[np.bool_]:
+        """Rasterise every surface on the lattice of ``grid``."""
+        raster = np.zeros(grid.shape, np.uint8)
+        to_start = inverse(self.start)
+        ends = transform_points(to_start, self.plan.segments.reshape(-1, 2))
+        scale = 16.0
+        pixels = (
+            ends / self.resolution - np.array([self.lattice_origin[1], self.lattice_origin[0]]) - 0.5
+        ) * scale
+        for a, b in np.round(pixels).astype(np.int32).reshape(-1, 2, 2):
+            cv2.line(raster, a.tolist(), b.tolist(), 1, 1, cv2.LINE_8, 4)
+        centres = transform_points(to_start, self.plan.circles[:, :2]) / self.resolution
+        centres = (centres - np.array([self.lattice_origin[1], self.lattice_origin[0]]) - 0.5) * scale
+        for (x, y), radius in zip(np.round(centres).astype(int).tolist(), self.plan.circles[:, 2], strict=True):
+            cv2.circle(raster, (x, y), round(radius / self.resolution * scale), 1, 1, cv2.LINE_8, 4)
+        return raster > 0
+
+
+class Coverage:
+    """Share of the mappable cells that a belief's grid rightly has as free, kept up from its changes."""
+
+    def __init__(self, truth: GroundTruth) -> None:
+        self._truth = truth
+        self._revision = -1
+        self._right = 0
+
+    def update(self, grid: OccupancyGrid) -> float:
+        """Return the coverage in [0, 1] after the grid's latest changes."""
+        row0, col0 = self._truth.lattice_origin
+        changes = grid.take_changes()
+        if grid.revision != self._revision:
+            self._revision = grid.revision
+            self._right = int(np.count_nonzero(self._overlap(grid)))
+        else:
+            self._right += _count_right(changes, self._truth.mappable, row0, col0)
+        return self._right / self._truth.mappable_cells
+
+    def _overlap(self, grid: OccupancyGrid) -> NDArray[np.bool_]:
+        free = on_lattice(grid.classes() == FREE, grid.lattice_origin, self._truth)
+        return free & self._truth.mappable
+
+
+def on_lattice(
+    raster: NDArray[np.bool_], origin: tuple[int, int], truth: GroundTruth, margin: int = 0
+) -> NDArray[np.bool_]:
+    """Return a raster of the belief's lattice cut or padded to the truth's, with a margin of cells around it."""
+    rows, cols = truth.mappable.shape
+    out = np.zeros((rows + 2 * margin, cols + 2 * margin), bool)
+    r = origin[0] - truth.lattice_origin[0] + margin
+    c = origin[1] - truth.lattice_origin[1] + margin
+    r0, c0 = max(r, 0), max(c, 0)
+    r1, c1 = min(r + raster.shape[0], out.shape[0]), min(c + raster.shape[1], out.shape[1])
+    if r0 < r1 and c0 < c1:
+        out[r0:r1, c0:c1] = raster[r0 - r : r1 - r, c0 - c : c1 - c]
+    return out
+
+
+def occupied(grid: OccupancyGrid, truth: GroundTruth, margin: int) -> NDArray[np.bool_]:
+    """Return the belief's occupied cells on the truth's lattice with a margin."""
+    return on_lattice(grid.classes() == OCCUPIED, grid.lattice_origin, truth, margin)
+
+
+@njit(cache=True, nogil=True)
+def _count_right(changes: NDArray[np.int32], mappable: NDArray[np.bool_], row0: int, col0: int) -> int:
+    total = 0
+    for k in range(changes.shape[0]):
+        r, c = changes[k, 0] - row0, changes[k, 1] - col0
+        if 0 <= r < mappable.shape[0] and 0 <= c < mappable.shape[1] and mappable[r, c]:
+            if changes[k, 3] == FREE:
+                total += 1
+            if changes[k, 2] == FREE:
+                total -= 1
+    return total

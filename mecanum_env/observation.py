@@ -1,0 +1,197 @@
+"""Observations: pure functions of the belief (contract.md, "Observation"). Every call returns fresh arrays."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from gymnasium import spaces
+from numba import njit
+from numpy.typing import NDArray
+
+from mecanum_env.config import EnvConfig
+from slam.backend import Backend
+from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
+from slam.types import Scan
+
+__all__ = ["LOCAL_CELL_M", "MAP_SIZE", "map_frame", "observation_space", "observe"]
+
+Array = NDArray[np.float64]
+Observation = dict[str, NDArray[np.uint8] | NDArray[np.float32]]
+
+MAP_SIZE = 64
+"""Pixels a side of either map channel."""
+LOCAL_CELL_M = 0.1
+"""Side of a pixel of ``map_local`` [m]."""
+UNKNOWN_BYTE = 128
+_TWIST_LIMIT = 2.0
+
+
+def observation_space(config: EnvConfig) -> spaces.Dict:
+    """Return the space that :func:`observe` fills."""
+    infinite = np.inf
+    return spaces.Dict(
+        {
+            "map_local": spaces.Box(0, 255, (3, MAP_SIZE, MAP_SIZE), np.uint8),
+            "map_global": spaces.Box(0, 255, (3, MAP_SIZE, MAP_SIZE), np.uint8),
+            "scan": spaces.Box(0.0, 1.0, (config.lidar.beams,), np.float32),
+            "pose": spaces.Box(-1.0, 1.0, (4,), np.float32),
+            "pose_cov": spaces.Box(-infinite, infinite, (6,), np.float32),
+            "landmarks": spaces.Box(-infinite, infinite, (config.max_landmarks_observed, 6), np.float32),
+            "twist": spaces.Box(-_TWIST_LIMIT, _TWIST_LIMIT, (3,), np.float32),
+            "progress": spaces.Box(0.0, 1.0, (2,), np.float32),
+        }
+    )
+
+
+def map_frame(grid: OccupancyGrid) -> tuple[float, float, float]:
+    """Return the centre (x, y) [m] of ``map_global`` in the belief's frame, and its half extent [m]."""
+    known, _, _ = grid.overview()
+    x0, y0 = grid.origin
+    pixel = grid.overview_block * grid.resolution
+    top, left = (MAP_SIZE - known.shape[0]) // 2, (MAP_SIZE - known.shape[1]) // 2
+    half_size = MAP_SIZE // 2
+    return x0 + (half_size - left) * pixel, y0 + (half_size - top) * pixel, half_size * pixel
+
+
+def observe(
+    config: EnvConfig, backend: Backend, scan: Scan, *, twist: Array | tuple[float, float, float], time_used: float
+) -> Observation:
+    """Return what the agent sees, all of it from sensors and belief.
+
+    Parameters
+    ----------
+    twist : Array
+        Odometry twist ``(3,)``: m/s, m/s, rad/s.
+    time_used : float
+        Fraction of the episode's time used.
+    """
+    grid = backend.grid
+    pose, pose_cov = backend.pose, backend.pose_cov
+    centre_x, centre_y, half = map_frame(grid)
+    x, y, theta = float(pose[0]), float(pose[1]), float(pose[2])
+    map_local = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    map_global = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    scan_out = np.empty(len(scan.ranges), np.float32)
+    numbers = np.empty(15, np.float32)
+    landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
+    row0, col0 = grid.lattice_origin
+    known, probability, visited = grid.overview()
+    _fill_local(map_local, grid.log_odds, grid.visited, row0, col0, grid.resolution, x, y, theta)
+    _fill_global(
+        map_global, known, probability, visited, grid.overview_block, (x - centre_x) / half, (y - centre_y) / half
+    )
+    robot = config.robot
+    _fill_numbers(
+        numbers, scan_out, scan.ranges, scan.range_max, pose, pose_cov, centre_x, centre_y, half,
+        float(twist[0]) / robot.max_speed_m_s, float(twist[1]) / robot.max_speed_m_s,
+        float(twist[2]) / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2 / (4.0 * half * half),
+    )  # fmt: skip
+    backend.near_landmarks(landmarks)
+    return {
+        "map_local": map_local,
+        "map_global": map_global,
+        "scan": scan_out,
+        "pose": numbers[:4].copy(),
+        "pose_cov": numbers[4:10].copy(),
+        "landmarks": landmarks,
+        "twist": numbers[10:13].copy(),
+        "progress": numbers[13:15].copy(),
+    }
+
+
+@njit(cache=True, nogil=True)
+def _fill_numbers(
+    out: NDArray[np.float32], scan_out: NDArray[np.float32], ranges: Array, range_max: float, pose: Array,
+    cov: Array, centre_x: float, centre_y: float, half: float, vx: float, vy: float, omega: float,
+    time_used: float, known: float,
+) -> None:  # fmt: skip
+    for i in range(ranges.shape[0]):
+        # A lost beam says as little as one that nothing returned: 1.
+        r = ranges[i] / range_max
+        scan_out[i] = r if r < 1.0 else 1.0
+    out[0] = min(max((pose[0] - centre_x) / half, -1.0), 1.0)
+    out[1] = min(max((pose[1] - centre_y) / half, -1.0), 1.0)
+    out[2], out[3] = math.cos(pose[2]), math.sin(pose[2])
+    k = 4
+    for i in range(3):
+        for j in range(i, 3):
+            out[k] = cov[i, j]
+            k += 1
+    out[10] = min(max(vx, -_TWIST_LIMIT), _TWIST_LIMIT)
+    out[11] = min(max(vy, -_TWIST_LIMIT), _TWIST_LIMIT)
+    out[12] = min(max(omega, -_TWIST_LIMIT), _TWIST_LIMIT)
+    out[13] = min(max(time_used, 0.0), 1.0)
+    out[14] = min(max(known, 0.0), 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _fill_local(
+    out: NDArray[np.uint8], log_odds: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int,
+    resolution: float, x: float, y: float, theta: float,
+) -> None:  # fmt: skip
+    """Fill the robot-centred map: row 0 is farthest ahead, column 0 farthest to the left.
+
+    A pixel takes the most occupied of four points in it, so that a wall one cell thick never slips through.
+    """
+    size = out.shape[1]
+    step = LOCAL_CELL_M / resolution
+    c, s = math.cos(theta) * step, math.sin(theta) * step
+    x0, y0 = x / resolution - col0, y / resolution - row0
+    half = 0.5 * size
+    rows, cols = log_odds.shape
+    probability, observed, trail = out[0], out[1], out[2]
+    for i in range(size):
+        ahead = half - i - 0.5
+        for j in range(size):
+            left = half - j - 0.5
+            px = x0 + c * ahead - s * left
+            py = y0 + s * ahead + c * left
+            best = -128
+            seen = 0
+            been = 0
+            for q in range(4):
+                da = 0.25 if q & 1 else -0.25
+                dl = 0.25 if q & 2 else -0.25
+                col = math.floor(px + c * da - s * dl)
+                row = math.floor(py + s * da + c * dl)
+                if 0 <= row < rows and 0 <= col < cols:
+                    v = log_odds[row, col]
+                    if v != 0:
+                        seen = 255
+                        best = max(best, v)
+                    been |= visited[row, col]
+            probability[i, j] = PROBABILITY_BYTE[best & 255] if seen else UNKNOWN_BYTE
+            observed[i, j] = seen
+            trail[i, j] = 255 * been
+
+
+@njit(cache=True, nogil=True)
+def _fill_global(
+    out: NDArray[np.uint8], known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32],
+    block: int, x: float, y: float,
+) -> None:  # fmt: skip
+    """Fill the whole map in the start frame: row 0 at the highest y, the overview in the middle."""
+    size = out.shape[1]
+    rows, cols = known.shape
+    top, left = (size - rows) // 2, (size - cols) // 2
+    area = block * block
+    out[0] = UNKNOWN_BYTE
+    out[1] = 0
+    out[2] = 0
+    for r in range(rows):
+        i = size - 1 - (top + r)
+        for c in range(cols):
+            n = known[r, c]
+            if n > 0:
+                j = left + c
+                out[0, i, j] = probability[r, c] // n
+                out[1, i, j] = 255 * n // area
+                # The trail stays below 128, above it is the robot itself.
+                out[2, i, j] = 127 * visited[r, c] // area
+    i = size - 1 - math.floor((y + 1.0) * 0.5 * size)
+    j = math.floor((x + 1.0) * 0.5 * size)
+    for di in range(-1, 2):
+        for dj in range(-1, 2):
+            if 0 <= i + di < size and 0 <= j + dj < size:
+                out[2, i + di, j + dj] = 255

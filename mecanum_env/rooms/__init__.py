@@ -1,0 +1,26 @@
+"""Rooms to explore: generators by name, and plans read from files.
+
+``make("apartment", seed=3)`` draws a plan, ``load("floor.yaml")`` reads one; both give a :class:`FloorPlan`.
+"""
+
+from __future__ import annotations
+
+from mecanum_env.rooms.apartment import ApartmentConfig, apartment
+from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
+from mecanum_env.rooms.importers import load
+from mecanum_env.rooms.rectangular import RectangularConfig, rectangular
+from mecanum_env.rooms.registry import make, names, register
+
+__all__ = [
+    "ApartmentConfig",
+    "FloorPlan",
+    "FloorPlanError",
+    "RectangularConfig",
+    "load",
+    "make",
+    "names",
+    "register",
+]
+
+register("rectangular", rectangular, RectangularConfig)
+register("apartment", apartment, ApartmentConfig)

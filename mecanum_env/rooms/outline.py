@@ -1,0 +1,300 @@
+"""From a raster of free cells to straight surfaces, none of them further than half a cell from a cell's edge.
+
+First the exact outline is walked along the edges between free and other cells; then its stairs, and only they,
+are replaced by straight pieces. A stair is a run of one-cell jogs, the way in which a raster shows a slanting or
+a curved wall. A piece goes from one jog to another, as far as every corner of the outline between them stays within the bound;
+as it begins and ends on the outline, it does not leave it either.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+__all__ = ["outline_segments", "trace"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_TOLERANCE = 0.5 - 1e-9  # [cells]
+_PLACES = 5  # where along a jog pieces may meet
+
+# Headings along the lattice: 0 east, 1 north, 2 west, 3 south, as steps in column (x) and row (y).
+_DX = np.array([1, 0, -1, 0], np.int64)
+_DY = np.array([0, 1, 0, -1], np.int64)
+
+
+def outline_segments(free: Mask, *, simplify: bool = True) -> Array:
+    """Return the surfaces ``(n, 4)`` around free space, in cells, free space on the left of each.
+
+    A point (x, y) is x cells right of and y cells above the lower-left corner of cell (0, 0). What lies outside
+    the raster is solid. Every surface is within half a cell of the edges between free and solid cells, and every
+    such edge within half a cell of a surface; with ``simplify=False`` they are those edges themselves.
+    Free cells that touch at a corner alone are parted there, so a wall one cell thick stays closed on a slant.
+    """
+    corners, first = trace(np.ascontiguousarray(free, dtype=np.bool_))
+    if simplify:
+        corners, first = _straighten(corners, first)
+    if not len(corners):
+        return np.zeros((0, 4))
+    following = np.arange(1, len(corners) + 1)
+    following[first[1:] - 1] = first[:-1]
+    return np.hstack([corners, corners[following]])
+
+
+def trace(free: Mask) -> tuple[Array, NDArray[np.int64]]:
+    """Return the corners ``(n, 2)`` of the exact outline [cells], and where each closed loop of them begins.
+
+    Loop i has the corners ``first[i]`` to ``first[i + 1]``; it has free space on its left.
+    """
+    padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.bool_)
+    padded[1:-1, 1:-1] = free
+    corners, first = _walk(padded, _count_corners(padded))
+    return corners - 1.0, first
+
+
+@njit(cache=True, nogil=True)
+def _count_corners(free: Mask) -> int:
+    """Corners of the outline: one or three free cells around a point make one, a diagonal pair two."""
+    total = 0
+    for r in range(1, free.shape[0]):
+        for c in range(1, free.shape[1]):
+            a, b, d, e = free[r - 1, c - 1], free[r - 1, c], free[r, c - 1], free[r, c]
+            count = int(a) + int(b) + int(d) + int(e)
+            if count == 1 or count == 3:
+                total += 1
+            elif count == 2 and a == e:
+                total += 2
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _walk(free: Mask, corner_count: int) -> tuple[Array, NDArray[np.int64]]:
+    """Walk every loop of the outline of a raster whose border is solid, in lattice coordinates."""
+    rows, cols = free.shape
+    corners = np.empty((corner_count, 2), np.float64)
+    first = np.empty(corner_count // 4 + 2, np.int64)
+    seen = np.zeros((rows, cols), np.bool_)  # eastward edges below a free cell
+    n, loops = 0, 0
+    for row in range(1, rows):
+        for col in range(1, cols):
+            if seen[row, col] or not free[row, col] or free[row - 1, col]:
+                continue
+            # The first edge not yet walked, row by row, is the first of its run: a corner.
+            first[loops] = n
+            loops += 1
+            x, y, heading = col, row, 0
+            turned = True
+            while True:
+                if turned:
+                    corners[n, 0], corners[n, 1] = x, y
+                    n += 1
+                if heading == 0:
+                    seen[y, x] = True
+                x += _DX[heading]
+                y += _DY[heading]
+                heading_before = heading
+                heading = _next_heading(free, x, y, heading)
+                turned = heading != heading_before
+                if x == col and y == row and heading == 0:
+                    break
+    first[loops] = n
+    return corners[:n], first[: loops + 1]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _next_heading(free: Mask, x: int, y: int, heading: int) -> int:
+    """Heading after lattice point (x, y), free space staying on the left and solid on the right."""
+    # The cells before the point, left and right of the heading.
+    if heading == 0:
+        left, right = free[y, x], free[y - 1, x]
+    elif heading == 1:
+        left, right = free[y, x - 1], free[y, x]
+    elif heading == 2:
+        left, right = free[y - 1, x - 1], free[y, x - 1]
+    else:
+        left, right = free[y - 1, x], free[y - 1, x - 1]
+    if not left:
+        return (heading + 1) % 4  # also where two free cells touch at this corner alone
+    return (heading + 3) % 4 if right else heading
+
+
+@njit(cache=True, nogil=True)
+def _straighten(corners: Array, first: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+    """Replace the stairs of loops of corners by straight pieces."""
+    out = np.empty_like(corners)
+    out_first = np.empty_like(first)
+    longest = 0
+    for loop in range(first.shape[0] - 1):
+        longest = max(longest, first[loop + 1] - first[loop])
+    path = np.empty((2 * longest + 1, 2), np.float64)
+    role = np.empty(2 * longest + 1, np.int64)
+    stair = np.empty(longest, np.bool_)
+    n = 0
+    for loop in range(first.shape[0] - 1):
+        out_first[loop] = n
+        n = _straighten_loop(corners[first[loop] : first[loop + 1]], out, n, path, role, stair)
+    out_first[-1] = n
+    return out[:n], out_first
+
+
+@njit(cache=True, nogil=True)
+def _straighten_loop(
+    loop: Array, out: Array, n: int, path: Array, role: NDArray[np.int64], stair: NDArray[np.bool_]
+) -> int:
+    """Append the straightened loop to ``out`` from row ``n`` on; return the row after it."""
+    size = loop.shape[0]
+    for i in range(size):
+        # Stairs have jogs to the same side one run apart.
+        stair[i] = _is_jog(loop, i) and (_same_jog(loop, i, i + 2) or _same_jog(loop, i, i - 2))
+    count = _stations(loop, stair, path, role)
+    start = 0
+    while start < count and role[start] != 2:
+        start += 1
+    if start == count:
+        # A loop of stairs alone, such as a disc: begin at any station.
+        start = 0
+        while start < count and role[start] == 0:
+            start += 1
+    begin, at = n, start
+    x, y = path[start]
+    while at < start + count:
+        out[n, 0], out[n, 1] = x, y
+        n += 1
+        at, x, y = _farthest(path, role, count, at, start + count, x, y)
+    if n - begin < 3:
+        # Straightened to nothing; keep the exact outline of so small a thing.
+        n = begin
+        for i in range(size):
+            out[n] = loop[i]
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _stations(loop: Array, stair: NDArray[np.bool_], path: Array, role: NDArray[np.int64]) -> int:
+    """List the loop's corners and the middles of its stairs' jogs, in order, each with its role.
+
+    Roles: 0 a stair's corner, which pieces must pass near; 1 the middle of a jog, where they may meet; 2 any
+    other corner, where they must meet.
+    """
+    size, count = loop.shape[0], 0
+    for i in range(size):
+        path[count] = loop[i]
+        role[count] = 0 if stair[i] or stair[(i - 1) % size] else 2
+        count += 1
+        if stair[i]:
+            following = loop[(i + 1) % size]
+            path[count, 0] = 0.5 * (loop[i, 0] + following[0])
+            path[count, 1] = 0.5 * (loop[i, 1] + following[1])
+            role[count] = 1
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _farthest(
+    path: Array, role: NDArray[np.int64], count: int, at: int, end: int, x: float, y: float
+) -> tuple[int, float, float]:
+    """Return the farthest station that a straight piece from (x, y) can go to within the bound, and where in it.
+
+    A jog may be met anywhere along it but at its ends; of the places that will do, the one is taken that leaves
+    the smallest error.
+    """
+    # The next station, met in its middle, is within the bound from wherever a piece may end.
+    best = at + 1
+    while best < end and role[best % count] == 0:
+        best += 1
+    best_x, best_y = path[best % count]
+    if role[best % count] == 2 or best >= end:
+        return best, best_x, best_y
+    for candidate in range(best, end + 1):
+        what = role[candidate % count]
+        if what == 0:
+            continue
+        # The loop must close where it began, so the last station is met in its middle.
+        fixed = what == 2 or candidate == end
+        least = 2.0
+        for place in range(_PLACES):
+            share = 0.5 if fixed else (place + 0.5) / _PLACES
+            to_x, to_y = path[candidate % count]
+            if not fixed:
+                before, after = path[(candidate - 1) % count], path[(candidate + 1) % count]
+                to_x = before[0] + share * (after[0] - before[0])
+                to_y = before[1] + share * (after[1] - before[1])
+            error = _deviation(path, role, count, at, candidate, x, y, to_x, to_y)
+            if error < least and (fixed or _goes_on(path, role, count, candidate, to_x, to_y)):
+                least = error
+                if error <= _TOLERANCE:
+                    best, best_x, best_y = candidate, to_x, to_y
+            if fixed:
+                break
+        if least > _TOLERANCE and candidate > best or what == 2:
+            break
+    return best, best_x, best_y
+
+
+@njit(cache=True, nogil=True)
+def _goes_on(path: Array, role: NDArray[np.int64], count: int, at: int, x: float, y: float) -> bool:
+    """Whether a piece from (x, y) in a jog to the middle of the next station is within the bound."""
+    following = at + 1
+    while role[following % count] == 0:
+        following += 1
+    to_x, to_y = path[following % count]
+    return _deviation(path, role, count, at, following, x, y, to_x, to_y) <= _TOLERANCE
+
+
+@njit(cache=True, nogil=True)
+def _deviation(
+    path: Array,
+    role: NDArray[np.int64],
+    count: int,
+    at: int,
+    end: int,
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+) -> float:
+    """Return the largest distance of a corner between two stations from the straight piece, 2 if far too much."""
+    ux, uy = bx - ax, by - ay
+    squared = ux * ux + uy * uy
+    worst = 0.0 if squared > 0.0 else 2.0
+    for i in range(at + 1, end):
+        if worst > 1.0:
+            return 2.0
+        if role[i % count] == 0:
+            px, py = path[i % count, 0] - ax, path[i % count, 1] - ay
+            share = min(1.0, max(0.0, (px * ux + py * uy) / squared))
+            worst = max(worst, math.hypot(px - share * ux, py - share * uy))
+    return worst
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _run(loop: Array, i: int) -> tuple[float, float]:
+    """Step from corner i to the next."""
+    size = loop.shape[0]
+    a, b = loop[i % size], loop[(i + 1) % size]
+    return b[0] - a[0], b[1] - a[1]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _is_jog(loop: Array, i: int) -> bool:
+    """Whether run i is one cell long and the outline goes on behind it in the direction it came in."""
+    x, y = _run(loop, i)
+    if abs(x) + abs(y) != 1.0:
+        return False
+    before, after = _run(loop, i - 1), _run(loop, i + 1)
+    return before[0] * after[0] + before[1] * after[1] > 0.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _same_jog(loop: Array, i: int, j: int) -> bool:
+    """Whether run j is a jog in the direction of run i."""
+    if not _is_jog(loop, j):
+        return False
+    a, b = _run(loop, i), _run(loop, j)
+    return a[0] == b[0] and a[1] == b[1]

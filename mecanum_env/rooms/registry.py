@@ -1,0 +1,65 @@
+"""Room generators by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, TypeVar
+
+from mecanum_env.rooms.floor_plan import FloorPlan
+from slam.settings import from_mapping, unknown_name
+
+__all__ = ["Generator", "make", "names", "register"]
+
+C = TypeVar("C", contravariant=True)
+
+
+class Generator(Protocol[C]):
+    """Draws the plan of a seed; the same seed and config give the same plan, bit for bit."""
+
+    def __call__(self, config: C, /, *, seed: int) -> FloorPlan:
+        """Return the plan."""
+
+
+_GENERATORS: dict[str, tuple[Generator[Any], type[Any]]] = {}
+
+
+def register(name: str, generator: Generator[C], config_type: type[C]) -> None:
+    """Make a generator known under a name, with the frozen dataclass that configures it.
+
+    Raises
+    ------
+    ValueError
+        If another generator has the name.
+    """
+    known = _GENERATORS.get(name)
+    if known is not None and known != (generator, config_type):
+        raise ValueError(f"rooms {name!r} is registered already; choose another name")
+    _GENERATORS[name] = (generator, config_type)
+
+
+def names() -> tuple[str, ...]:
+    """Return the registered names, in order."""
+    return tuple(sorted(_GENERATORS))
+
+
+def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None) -> FloorPlan:
+    """Return the plan that a generator draws for a seed.
+
+    Parameters
+    ----------
+    name
+        One of :func:`names`.
+    seed
+        Integer ≥ 0.
+    config
+        The generator's config dataclass, or a mapping of its fields; None for the defaults.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name or key, a value out of its limits, or a seed that is no integer ≥ 0.
+    """
+    if name not in _GENERATORS:
+        raise unknown_name("rooms", name, names())
+    generator, config_type = _GENERATORS[name]
+    return generator(from_mapping(config_type, config), seed=seed)
