@@ -34,7 +34,7 @@ class FeatureConfig:
     min_points: int = 6
     min_length_m: float = 0.25
     grazing_deg: float = 8.0  # flattest incidence at which neighbouring points still belong together
-    min_angle_deg: float = 30.0  # between the surfaces that make a corner
+    min_angle_deg: float = 55.0  # between the surfaces of a corner; pieces of a round column meet at less
     max_gap_m: float = 0.12  # from the corner to the nearest point of either surface
     sigma_floor_m: float = 0.002  # of a corner, along each axis: what the model of straight walls leaves out
 
@@ -328,6 +328,8 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     line[5] = var_offset / (n * n)
     line[6] = var_slope / (spread * spread)
     line[7] = cov / (n * spread)
+    if _is_curved(xy, a, b, line, sigma):
+        return False
     # Along (-ny, nx), which is (tx, ty) up to sign.
     ax, ay = -ny, nx
     t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
@@ -336,6 +338,34 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     if ax * tx + ay * ty < 0.0:
         line[7] = -line[7]
     return abs(t1 - t0) >= limits[4]
+
+
+@njit(cache=True, nogil=True)
+def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
+    """Tell whether points bulge away from their line by more than noise would have them do.
+
+    Pieces of a round table are short enough to pass for straight ones, and would meet in corners that wander
+    with the robot. The bulge is the coefficient of u² − mean(u²), u the position along the line.
+    """
+    nx, ny, r, mx, my = line[0], line[1], line[2], line[3], line[4]
+    n = b - a + 1
+    mean = 0.0
+    for i in range(a, b + 1):
+        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
+        mean += t * t
+    mean /= n
+    bulge = norm = largest = 0.0
+    for i in range(a, b + 1):
+        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
+        q = t * t - mean
+        bulge += q * (nx * xy[i, 0] + ny * xy[i, 1] - r)
+        norm += q * q
+        largest = max(largest, t * t)
+    if norm <= 0.0:
+        return False
+    coefficient, deviation = bulge / norm, sigma / math.sqrt(norm)
+    # As a sagitta: what the curve departs by between the middle and the ends.
+    return abs(coefficient) > 3.0 * deviation and abs(coefficient) * largest > 0.5 * sigma
 
 
 @njit(cache=True, nogil=True)

@@ -23,9 +23,9 @@ def room_scan(
     """Scan the inside of the rectangle [0, width] × [0, height] from a sensor pose."""
     x, y, theta = pose
     c, s = np.cos(ANGLES + theta), np.sin(ANGLES + theta)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along_x = np.where(c > 0, (width - x) / c, -x / c)
-        along_y = np.where(s > 0, (height - y) / s, -y / s)
+    c, s = (np.where(np.abs(v) < 1e-12, 1e-12, v) for v in (c, s))
+    along_x = np.where(c > 0, (width - x) / c, -x / c)
+    along_y = np.where(s > 0, (height - y) / s, -y / s)
     ranges = np.minimum(along_x, along_y)
     if rng is not None:
         ranges = ranges + sigma * rng.standard_normal(BEAMS)

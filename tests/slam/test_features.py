@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slam import CONCAVE, CONVEX, Scan
+from slam.features import FeatureConfig, FeatureExtractor
+from slam.geometry import inverse, transform_points, wrap
+from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
+
+ROOM = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]])
+inside = st.tuples(st.floats(1, 5), st.floats(1, 4), st.floats(-3.1, 3.1)).map(np.array)
+
+
+def polygon_scan(pose: np.ndarray, loops: list[np.ndarray], rng: np.random.Generator | None = None) -> Scan:
+    """Scan closed polygons by brute force."""
+    direction = np.column_stack([np.cos(ANGLES + pose[2]), np.sin(ANGLES + pose[2])])
+    ranges = np.full(BEAMS, np.inf)
+    for loop in loops:
+        for a, b in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            e, d = b - a, a - pose[:2]
+            det = direction[:, 0] * -e[1] + direction[:, 1] * e[0]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                t = (d[0] * -e[1] + d[1] * e[0]) / det
+                u = (direction[:, 0] * d[1] - direction[:, 1] * d[0]) / det
+            hit = (t > 0) & (u >= 0) & (u <= 1)
+            ranges = np.where(hit & (t < ranges), t, ranges)
+    if rng is not None:
+        ranges = ranges + 0.01 * rng.standard_normal(BEAMS)
+    return Scan(ranges, angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=20.0)
+
+
+def polar(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    local = transform_points(inverse(pose), points)
+    return np.column_stack([np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])])
+
+
+@given(inside)
+def test_a_clean_room_has_exact_corners_and_walls(pose: np.ndarray) -> None:
+    extractor = FeatureExtractor()
+    extractor.extract(room_scan(pose))
+    corners, lines = extractor.corners(), extractor.lines()
+    true = polar(pose, ROOM)
+    assert 3 <= len(corners.kind) <= 4  # one may lie where the circle of beams begins
+    for seen, direction, kind in zip(corners.range_bearing, corners.direction, corners.kind, strict=True):
+        error = np.column_stack([true[:, 0] - seen[0], wrap(true[:, 1] - seen[1])])
+        i = int(np.argmin(np.abs(error).sum(1)))
+        assert np.abs(error[i]).max() < 1e-3
+        assert kind == CONCAVE
+        inward = math.atan2(*np.sign(np.array([3.0, 2.5]) - ROOM[i])[::-1])
+        assert abs(float(wrap(direction + pose[2] - inward))) < 1e-2
+    walls = {0.0: pose[0], math.pi / 2: pose[1], math.pi: 6 - pose[0], -math.pi / 2: 5 - pose[1]}
+    for alpha, r in lines.hesse:
+        outward = float(wrap(alpha + pose[2] + math.pi))
+        nearest = min(walls, key=lambda a: abs(float(wrap(a - outward))))
+        assert abs(r - walls[nearest]) < 1e-6
+
+
+def test_corner_errors_have_the_declared_covariance() -> None:
+    """NEES of corners over noisy scans: no surer than they should be, and not much less sure."""
+    rng = np.random.default_rng(0)
+    extractor = FeatureExtractor()
+    nees, found = [], 0
+    for _ in range(400):
+        pose = np.array([rng.uniform(1, 5), rng.uniform(1, 4), rng.uniform(-3, 3)])
+        extractor.extract(room_scan(pose, rng))
+        corners, true = extractor.corners(), polar(pose, ROOM)
+        found += len(corners.kind)
+        for z, cov in zip(corners.range_bearing, corners.cov, strict=True):
+            error = np.column_stack([true[:, 0] - z[0], wrap(true[:, 1] - z[1])])
+            e = error[np.argmin(np.abs(error[:, 1]))]
+            nees.append(e @ np.linalg.solve(cov, e))
+    assert found > 0.9 * 4 * 400
+    assert 0.8 < np.mean(nees) < 2.2  # two degrees of freedom; the floor makes it less
+    assert np.quantile(nees, 0.997) < 13
+
+
+def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None:
+    box = np.array([[3.0, 2.0], [3.6, 2.0], [3.6, 2.6], [3.0, 2.6]])
+    pose = np.array([1.5, 1.0, 0.4])
+    extractor = FeatureExtractor()
+    extractor.extract(polygon_scan(pose, [ROOM, box], np.random.default_rng(1)))
+    corners = extractor.corners()
+    convex = corners.range_bearing[corners.kind == CONVEX]
+    true = polar(pose, box)
+    assert len(convex) == 1  # (3.0, 2.0) faces the sensor; the two rims of the shadow are no corners
+    assert np.abs(convex[0] - true[0]).max() < 0.02
+    direction = float(wrap(corners.direction[corners.kind == CONVEX][0] + pose[2]))
+    assert abs(direction - math.atan2(-1, -1)) < 0.1
+
+
+def test_lost_beams_and_open_space_are_no_surfaces() -> None:
+    rng = np.random.default_rng(2)
+    scan = room_scan(np.array([2.0, 2.0, 0.0]), rng)
+    scan.ranges[:90] = np.inf
+    scan.ranges[rng.random(BEAMS) < 0.05] = np.nan
+    extractor = FeatureExtractor(FeatureConfig())
+    extractor.extract(scan)
+    assert np.all(extractor.surface[~np.isfinite(scan.ranges)] == -1)
+    assert np.count_nonzero(extractor.surface >= 0) > 0.85 * np.count_nonzero(np.isfinite(scan.ranges))
+    scan.ranges[:] = np.nan
+    assert len(extractor.extract(scan)) == 0
+
+
+def test_a_round_column_is_no_corner() -> None:
+    pose = np.array([1.0, 1.0, 0.0])
+    around = np.linspace(0, 2 * math.pi, 90, endpoint=False)
+    column = np.array([2.5, 2.0]) + 0.3 * np.column_stack([np.cos(around), np.sin(around)])
+    extractor = FeatureExtractor()
+    for seed in range(20):
+        extractor.extract(polygon_scan(pose, [ROOM, column], np.random.default_rng(seed)))
+        assert not np.any(extractor.corners().kind == CONVEX)
