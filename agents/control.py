@@ -30,12 +30,12 @@ class ControlConfig:
     """Speeds, accelerations and gaps of the path follower."""
 
     speed_share: float = 0.95  # of the robot's limit
-    near_wall_m_s: float = 0.3  # speed at the least clearance at which the robot may turn
-    open_m: float = 0.35  # clearance beyond that one from which walls no longer slow it
+    near_wall_m_s: float = 0.4  # speed at the least clearance at which the robot may turn
+    open_m: float = 0.25  # clearance beyond that one from which walls no longer slow it
     acceleration_m_s2: float = 1.2
     deceleration_m_s2: float = 0.8  # towards the goal and into turns
     braking_m_s2: float = 1.5  # what the safety check counts on: a slippery floor gives no more
-    turn_rate_rad_s: float = 1.0
+    turn_rate_rad_s: float = 0.8
     turn_gain: float = 2.0  # turn rate per heading error [1/s]
     turn_acceleration_rad_s2: float = 3.0
     lag_s: float = 0.2  # a step and the motors' lag: how long a twist is held before braking shows
@@ -46,6 +46,7 @@ class ControlConfig:
     align_rad: float = 0.25  # heading error within which a tight passage is entered
     map_gap_m: float = 0.04  # between body and occupied cells
     scan_gap_m: float = 0.04  # between body and what the scan hit
+    arrival_m_s: float = 0.2  # speed at which the goal is reached; what is left is braked away there
     arrived_m: float = 0.12
     arrived_rad: float = 0.2
 
@@ -172,7 +173,7 @@ class PathFollower:
         # From v²/2a + v·lag = rest: the lag's distance is spent before braking shows.
         rest = self.remaining_m
         lag = config.lag_s * config.deceleration_m_s2
-        stopping = max(0.05, math.sqrt(lag * lag + 2.0 * config.deceleration_m_s2 * rest) - lag)
+        stopping = max(config.arrival_m_s, math.sqrt(lag * lag + 2.0 * config.deceleration_m_s2 * rest) - lag)
         return direction, min(self._max_speed, walls, stopping, self._turn_speed(at, reach))
 
     def _turn_speed(self, at: float, reach: float) -> float:

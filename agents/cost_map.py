@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import require
 from slam.types import Belief
 
@@ -24,6 +24,7 @@ __all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance"]
 
 Array = NDArray[np.float64]
 
+_ALL = slice(None)
 _FAR_M = 10.0  # clearances beyond this say nothing more
 
 
@@ -42,8 +43,8 @@ class PlannerConfig:
     tight_margin_m: float = 0.07  # tight: inscribed radius + this
     unknown_margin_m: float = 0.02  # from what is not known: inscribed radius + this
     preferred_m: float = 0.2  # clearance beyond the comfortable one from which nearness costs nothing
-    near_cost: float = 2.0  # added to the price of a metre at the comfortable clearance
-    tight_cost: float = 6.0  # added again at the tight clearance
+    near_cost: float = 1.0  # added to the price of a metre at the comfortable clearance
+    tight_cost: float = 3.0  # added again at the tight clearance
     path_spacing_m: float = 0.1
 
     def __post_init__(self) -> None:
@@ -85,10 +86,10 @@ class CostMap:
         return np.clip(index[:, ::-1], 0, limit)
 
 
-def belief_classes(belief: Belief) -> NDArray[np.int8]:
-    """Return the grid's classes ``(rows, cols)``, with what the robot's body has passed over taken for free."""
-    classes: NDArray[np.int8] = belief.grid.classes()
-    classes[(classes == UNKNOWN) & (belief.grid.visited != 0)] = FREE
+def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
+    """Return the grid's classes, all or a window, with what the robot's body has passed over taken for free."""
+    classes: NDArray[np.int8] = CLASS_OF[belief.grid.log_odds[rows, cols].view(np.uint8)]
+    classes[(classes == UNKNOWN) & (belief.grid.visited[rows, cols] != 0)] = FREE
     return classes
 
 

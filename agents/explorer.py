@@ -36,8 +36,8 @@ class PatienceConfig:
 
     replan_s: float = 1.0
     min_replan_s: float = 0.3  # between two choices, whatever happens
-    settle_s: float = 0.3  # how long to look from a view point before it counts as looked from
-    looks: int = 3  # at one piece of frontier, each from nearer, before it is let be
+    settle_s: float = 0.2  # how long to look from a view point before it counts as looked from
+    looks: int = 2  # at one piece of frontier, each from nearer, before it is let be
     nearer: float = 0.4  # share of the view range left at each further look
     stuck_s: float = 4.0  # without moving or turning: recover
     recover_s: float = 1.5
@@ -149,6 +149,9 @@ class Explorer(Agent):
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
+            if self._target is not None and candidates.current is None:
+                # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
+                self._note(self._target).looks += 1
             cost = float(candidates.costs[index])
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
             self._arrived_for = 0.0
@@ -242,9 +245,9 @@ class Explorer(Agent):
         grid = belief.grid
         span = math.ceil(0.35 / grid.resolution)
         row, col = grid.to_cells(np.asarray(point)[None])[0]
-        classes = cost_maps.belief_classes(belief)
-        low_r, low_c = max(int(row) - span - 1, 0), max(int(col) - span - 1, 0)
-        window = np.ascontiguousarray(classes[low_r : int(row) + span + 2, low_c : int(col) + span + 2])
+        rows = slice(max(int(row) - span - 1, 0), max(int(row) + span + 2, 0))
+        cols = slice(max(int(col) - span - 1, 0), max(int(col) + span + 2, 0))
+        window = cost_maps.belief_classes(belief, rows, cols)
         if window.shape[0] < 3 or window.shape[1] < 3:
             return True
         # The rim of the window is cut off: there the mask takes the outside for unknown.

@@ -26,12 +26,13 @@ class FrontierConfig:
 
     min_extent_m: float = 0.3  # longer side of a cluster's bounding box
     min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
+    min_clearance_m: float = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
     spacing_m: float = 0.6  # a long cluster is looked at in pieces of about this size
-    view_range_m: float = 2.5  # farthest place to look from; never beyond 0.8 of the lidar's range
+    view_range_m: float = 0.8  # farthest place to look from; never beyond 0.8 of the lidar's range
     beyond_m: float = 0.3  # how far behind the frontier a view point must see
 
     def __post_init__(self) -> None:
-        for name in ("min_extent_m", "min_unknown_m2", "beyond_m"):
+        for name in ("min_extent_m", "min_unknown_m2", "min_clearance_m", "beyond_m"):
             value = getattr(self, name)
             require(math.isfinite(value) and value >= 0, f"FrontierConfig.{name} must be ≥ 0, got {value}")
         for name in ("spacing_m", "view_range_m"):
@@ -71,7 +72,8 @@ def frontier_mask(classes: NDArray[np.int8]) -> NDArray[np.bool_]:
 def find(cost_map: CostMap, config: FrontierConfig) -> Frontiers:
     """Return the frontiers of a planning grid, small clusters and small unknown pockets left out."""
     classes, resolution = cost_map.classes, cost_map.resolution
-    mask = frontier_mask(classes) & _borders_a_large_pocket(classes, resolution, config.min_unknown_m2)
+    mask = frontier_mask(classes) & (cost_map.clearance >= np.float32(config.min_clearance_m))
+    mask &= _borders_a_large_pocket(classes, resolution, config.min_unknown_m2)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     extent = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) * resolution
     large = extent >= config.min_extent_m - 1e-9
@@ -139,8 +141,12 @@ def _pieces(
     mean = np.stack([np.bincount(piece, cells[:, axis]) for axis in (0, 1)], axis=1) / sizes[:, None]
     away = np.sum((cells - mean[piece]) ** 2, axis=1)
     order = np.lexsort((away, piece))
-    first = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-    return order[first], sizes
+    chosen = order[np.concatenate([[0], np.cumsum(sizes)[:-1]])]
+    # Crumbs that the lattice cuts off a cluster are seen along with its other pieces.
+    largest = np.zeros(int(labels.max()) + 1, dtype=np.int64)
+    np.maximum.at(largest, labels[chosen], sizes)
+    keep = (sizes >= min(3, span)) | (sizes == largest[labels[chosen]])
+    return chosen[keep], sizes[keep]
 
 
 def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:

@@ -44,15 +44,14 @@ def local_map(belief: Belief, radius_m: float) -> LocalMap:
     """Return the clearance within a square of this half side [m] around the robot."""
     grid = belief.grid
     resolution = grid.resolution
-    classes = belief_classes(belief)
     row, col = grid.to_cells(np.asarray(belief.pose)[None, :2])[0]
     span = math.ceil(radius_m / resolution)
-    low_r, high_r = np.clip([row - span, row + span + 1], 0, classes.shape[0])
-    low_c, high_c = np.clip([col - span, col + span + 1], 0, classes.shape[1])
+    low_r, high_r = np.clip([row - span, row + span + 1], 0, grid.shape[0])
+    low_c, high_c = np.clip([col - span, col + span + 1], 0, grid.shape[1])
     if high_r <= low_r or high_c <= low_c:  # off the map: nothing is known to be near
         low_r, high_r, low_c, high_c = 0, 1, 0, 1
     origin = np.array([grid.origin[0] + low_c * resolution, grid.origin[1] + low_r * resolution])
-    window = np.ascontiguousarray(classes[low_r:high_r, low_c:high_c])
+    window = belief_classes(belief, slice(low_r, high_r), slice(low_c, high_c))
     return LocalMap(clearance(window, resolution), origin, resolution)
 
 

@@ -240,10 +240,14 @@ def resolve(cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Ma
 
 
 def from_toml(path: str | Path) -> EnvConfig:
-    """Read an environment's configuration; ``ValueError`` names the file and what is wrong with it."""
+    """Read an environment's configuration; ``ValueError`` names the file and what is wrong with it.
+
+    A [run] table is left to whoever wrote it: who explored, with which seed and versions.
+    """
     try:
         with open(path, "rb") as file:
             values = tomllib.load(file)
+        values.pop("run", None)
         return from_mapping(EnvConfig, values)
     except OSError as error:
         raise ValueError(f"cannot read config {path}: {error.strerror}") from error

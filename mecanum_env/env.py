@@ -198,7 +198,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._encoders = WheelEncoders(config.robot, config.noise, world_rng)
         world = World(
             plan, config.robot, config.noise, world_rng,
-            radii=self._encoders.true_radii, lever=self._encoders.true_lever,
+            true_radii=self._encoders.true_radii, true_lever=self._encoders.true_lever,
         )  # fmt: skip
         start = np.array(plan.start, dtype=np.float64)
         ground = GroundTruth(

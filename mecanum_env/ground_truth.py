@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, RobotConfig
-from mecanum_env.raycast import cast_rays
+from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.geometry import compose, inverse, transform_points
 from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
@@ -20,8 +20,8 @@ __all__ = ["Coverage", "GroundTruth"]
 
 Array = NDArray[np.float64]
 
-_VIEW_SPACING_M = 0.5  # between the places that visibility is computed from
-_VIEW_BEAMS = 720
+_VIEW_SPACING_M = 0.8  # between the places that visibility is computed from: a quarter of it finds 0.5 % more
+_VIEW_BEAMS = 360
 
 
 class GroundTruth:
@@ -87,10 +87,22 @@ class GroundTruth:
         grid = OccupancyGrid(self.resolution)
         increment = 2.0 * math.pi / _VIEW_BEAMS
         to_start = inverse(self.start)
+        directions = beam_directions(_VIEW_BEAMS, -math.pi, increment)
         ranges = np.empty(_VIEW_BEAMS)
         for x, y in views:
             pose = np.array([x, y, self.start[2]])
-            cast_rays(plan.segments, plan.circles, x, y, pose[2], -math.pi, increment, lidar.range_max_m, ranges)
+            cast_rays(
+                plan.segments,
+                plan.circles,
+                x,
+                y,
+                pose[2],
+                directions,
+                -math.pi,
+                increment,
+                lidar.range_max_m,
+                ranges,
+            )
             scan = Scan(ranges, angle_min=-math.pi, angle_increment=increment, range_max=lidar.range_max_m)
             grid.integrate(compose(to_start, pose), scan)
             grid.take_changes()

@@ -42,9 +42,7 @@ class ApartmentConfig:
         # Below 0.9 m the disc that must get everywhere does not pass on the lattice.
         interval(self, "door_m", low=0.9, high=1.6)
         interval(self, "wall_m", low=0.1, high=0.5)
-        require(
-            all(isinstance(n, int) for n in self.rooms), "ApartmentConfig.rooms must be two whole numbers"
-        )
+        require(all(isinstance(n, int) for n in self.rooms), "ApartmentConfig.rooms must be two whole numbers")
         for name in ("links", "furniture"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"ApartmentConfig.{name} must be in [0, 1], got {value}")
@@ -192,9 +190,7 @@ def _add_row(
     return indices
 
 
-def _add_doors(
-    layout: Layout, rows: list[list[int]], config: ApartmentConfig, rng: np.random.Generator
-) -> bool:
+def _add_doors(layout: Layout, rows: list[list[int]], config: ApartmentConfig, rng: np.random.Generator) -> bool:
     """Give every room of the rows a door to the corridor, and some neighbours one to each other."""
     joined = {room for door in layout.doors for room in door.rooms}
     pairs: list[tuple[int, int]] = []

@@ -55,7 +55,7 @@ def find_corners(
 
 
 def _unique_within(points: Array) -> NDArray[np.int64]:
-    """Indices of points no two of which are within the touching distance (lattice neighbours are merged too)."""
+    """Return the indices of points no two of which are within the touching distance."""
     order = np.lexsort((points[:, 1], points[:, 0]))
     return np.sort(order[_first_of_cluster(np.ascontiguousarray(points[order]))])
 
@@ -85,9 +85,7 @@ def _orient(
     middle = walls[:, None, :2] + shares[None, :, None] * along[:, None, :]
     # 0.6 cells off the surface: surely in the next cell, and still within a wall one cell thick.
     offset = 0.6 * resolution * left[:, None, :]
-    count = [
-        np.count_nonzero(_lookup(free, (middle + s * offset - origin) / resolution), axis=1) for s in (1, -1)
-    ]
+    count = [np.count_nonzero(_lookup(free, (middle + s * offset - origin) / resolution), axis=1) for s in (1, -1)]
     flip = count[1] > count[0]
     turned = np.where(flip[:, None], walls[:, [2, 3, 0, 1]], walls)
     both = (count[0] == len(shares)) & (count[1] == len(shares))

@@ -31,6 +31,7 @@ INK: Colour = (110, 100, 92)
 _WALL_M = 0.22  # how deep solid matter is drawn behind its surface
 _BORDER_M = 0.5
 _MAX_SIDE_PX = 8192
+_OVERSAMPLING = 4  # drawn so much larger, then averaged: OpenCV's own anti-aliasing swells every outline
 _SHIFT = 4  # OpenCV's fixed-point fraction bits: anti-aliased to 1/16 pixel
 
 
@@ -61,8 +62,7 @@ def draw_plan(plan: FloorPlan, *, pixels_per_m: float = 40.0, robot: RobotConfig
         rim = np.stack([x + radius * np.cos(angle), y + radius * np.sin(angle)], axis=1)
         canvas.outlined(rim, FURNITURE, FURNITURE_EDGE)
     _draw_robot(canvas, plan, robot or RobotConfig())
-    _draw_scale(canvas)
-    return canvas.image
+    return _with_scale(canvas)
 
 
 def contact_sheet(plans: Sequence[FloorPlan], columns: int = 4, *, pixels_per_m: float = 20.0) -> Image:
@@ -97,11 +97,19 @@ class _Canvas:
     def __init__(self, plan: FloorPlan, pixels_per_m: float) -> None:
         x0, y0, x1, y1 = plan.bounds
         side = max(x1 - x0, y1 - y0) + 2 * _BORDER_M
-        self.scale = min(pixels_per_m, _MAX_SIDE_PX / side)
+        self.page_scale = min(pixels_per_m, _MAX_SIDE_PX / side)
+        self.oversampling = max(1, min(_OVERSAMPLING, int(_MAX_SIDE_PX / (side * self.page_scale))))
+        self.line_type = cv2.LINE_8 if self.oversampling > 1 else cv2.LINE_AA
+        self.scale = self.page_scale * self.oversampling
         self.left, self.top = x0 - _BORDER_M, y1 + _BORDER_M
-        size = (math.ceil((v + 2 * _BORDER_M) * self.scale) for v in (y1 - y0, x1 - x0))
+        size = (math.ceil((v + 2 * _BORDER_M) * self.page_scale) * self.oversampling for v in (y1 - y0, x1 - x0))
         self.image: Image = np.empty((*size, 3), np.uint8)
         self.image[:] = PAGE
+
+    def page(self) -> Image:
+        """Return the picture at its final size."""
+        rows, cols = (v // self.oversampling for v in self.image.shape[:2])
+        return np.asarray(cv2.resize(self.image, (cols, rows), interpolation=cv2.INTER_AREA), np.uint8)
 
     def pixels(self, points: Array) -> NDArray[np.int32]:
         """Fixed-point pixel positions of points ``(n, 2)`` [m]."""
@@ -115,7 +123,7 @@ class _Canvas:
     def lines(self, segments: Array, colour: Colour, width_m: float) -> None:
         pairs = self.pixels(segments.reshape(-1, 2)).reshape(-1, 2, 2)
         cv2.polylines(
-            self.image, list(pairs), False, colour, self.line_width(width_m), cv2.LINE_AA, shift=_SHIFT
+            self.image, list(pairs), False, colour, self.line_width(width_m), self.line_type, shift=_SHIFT
         )
 
     def bands(self, segments: Array, colour: Colour, width_m: float) -> None:
@@ -127,15 +135,15 @@ class _Canvas:
         a, b = segments[:, :2] - ahead, segments[:, 2:] + ahead
         outlines = np.stack([a - left, b - left, b + left, a + left], axis=1)
         for outline in self.pixels(outlines.reshape(-1, 2)).reshape(-1, 4, 2):
-            cv2.fillConvexPoly(self.image, outline, colour, cv2.LINE_AA, shift=_SHIFT)
+            cv2.fillConvexPoly(self.image, outline, colour, self.line_type, shift=_SHIFT)
 
     def fill(self, loops: list[Array], colour: Colour) -> None:
-        cv2.fillPoly(self.image, [self.pixels(p) for p in loops], colour, cv2.LINE_AA, shift=_SHIFT)
+        cv2.fillPoly(self.image, [self.pixels(p) for p in loops], colour, self.line_type, shift=_SHIFT)
 
     def outlined(self, polygon: Array, colour: Colour, edge: Colour) -> None:
         points = [self.pixels(polygon)]
-        cv2.fillPoly(self.image, points, colour, cv2.LINE_AA, shift=_SHIFT)
-        cv2.polylines(self.image, points, True, edge, self.line_width(0.025), cv2.LINE_AA, shift=_SHIFT)
+        cv2.fillPoly(self.image, points, colour, self.line_type, shift=_SHIFT)
+        cv2.polylines(self.image, points, True, edge, self.line_width(0.025), self.line_type, shift=_SHIFT)
 
     def raster(self, plan: FloorPlan) -> None:
         """Paint the free cells, for walls that do not close."""
@@ -155,19 +163,18 @@ def _draw_robot(canvas: _Canvas, plan: FloorPlan, robot: RobotConfig) -> None:
     canvas.fill([transform_points(pose, arrow)], FLOOR)
 
 
-def _draw_scale(canvas: _Canvas) -> None:
-    """Draw a bar of one metre (ten, a hundred, … on a large plan) below the plan, on the left."""
+def _with_scale(canvas: _Canvas) -> Image:
+    """Return the page with a bar of one metre (ten, a hundred, … on a large plan) below the plan, on the left."""
     rows, cols = canvas.image.shape[:2]
     metres = 10 ** max(0, math.floor(math.log10(0.4 * cols / canvas.scale)))
     x, y = canvas.left + _BORDER_M, canvas.top - rows / canvas.scale + 0.14
     ends = np.array([[x, y, x + metres, y], [x, y - 0.06, x, y + 0.06]])
     canvas.lines(np.vstack([ends, ends[1] + [metres, 0, metres, 0]]), INK, 0.025)
-    if canvas.scale >= 20:
-        at = (round((x + metres - canvas.left + 0.1) * canvas.scale), rows - round(0.08 * canvas.scale))
-        text = 0.4 * canvas.scale / 40.0
-        cv2.putText(
-            canvas.image, f"{metres} m", at, cv2.FONT_HERSHEY_SIMPLEX, text, INK, 1, cv2.LINE_AA
-        )
+    page, scale = canvas.page(), canvas.page_scale
+    if scale >= 20:
+        at = (round((x + metres - canvas.left + 0.1) * scale), page.shape[0] - round(0.08 * scale))
+        cv2.putText(page, f"{metres} m", at, cv2.FONT_HERSHEY_SIMPLEX, 0.01 * scale, INK, 1, cv2.LINE_AA)
+    return page
 
 
 def _loops(walls: Array) -> list[Array] | None:

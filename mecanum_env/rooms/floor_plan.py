@@ -182,9 +182,7 @@ class FloorPlan:
         The start's own cell counts as passable, even where the disc would touch something there.
         """
         passable = clearance_of(self.free, self.resolution) >= radius_m
-        col, row = (
-            int((v - o) // self.resolution) for v, o in zip(self.start[:2], self.origin, strict=True)
-        )
+        col, row = (int((v - o) // self.resolution) for v, o in zip(self.start[:2], self.origin, strict=True))
         passable[row, col] = True
         _, labels = cv2.connectedComponents(passable.astype(np.uint8), connectivity=4)
         return np.asarray(labels == labels[row, col], np.bool_)

@@ -174,9 +174,7 @@ class Furnisher:
         u, v = 0.5 * (self.rng.random(2) + self.rng.random(2))
         return x0 + GAP + int(u * (room_x + 1)), y0 + GAP + int(v * (room_y + 1))
 
-    def _try_sides(
-        self, group: list[tuple[float, float, float, float]], width_m: float, corner: float
-    ) -> bool:
+    def _try_sides(self, group: list[tuple[float, float, float, float]], width_m: float, corner: float) -> bool:
         """Place boxes given as (along from, along to, off the wall from, to) [m] against a random wall."""
         local = [(cells(a), cells(b), cells(c), cells(d)) for a, b, c, d in group]
         width = cells(width_m)
@@ -195,9 +193,7 @@ class Furnisher:
                 return True
         return False
 
-    def _against(
-        self, side: int, at: int, length: int, mirrored: bool, piece: tuple[int, int, int, int]
-    ) -> Box:
+    def _against(self, side: int, at: int, length: int, mirrored: bool, piece: tuple[int, int, int, int]) -> Box:
         """Box of a piece in the frame of a wall (0 lower, 1 left, 2 upper, 3 right)."""
         x0, y0, x1, y1 = self.room
         a, b, near, far = at + piece[0], at + piece[1], piece[2], piece[3]

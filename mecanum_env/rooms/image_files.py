@@ -1,4 +1,4 @@
-"""Image files as grey rasters, read with distrust: the size is checked in the header before anything is decoded."""
+"""Image files as grey rasters, read with distrust: sizes are checked in the header before anything is decoded."""
 
 from __future__ import annotations
 
@@ -125,7 +125,9 @@ def _png_size(data: bytes) -> tuple[int, int]:
     return width, height
 
 
-_PGM_HEADER = re.compile(rb"P([25])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s")
+_PGM_HEADER = re.compile(
+    rb"P([25])(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})(?:\s|#[^\n]*\n)+(\d{1,9})\s"
+)
 
 
 def _pgm_fields(data: bytes) -> tuple[int, int, int, int, int]:

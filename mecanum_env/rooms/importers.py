@@ -135,7 +135,7 @@ def from_raster(
     free = np.ascontiguousarray(free, dtype=np.bool_)
     if free.ndim != 2 or not free.any():
         raise FloorPlanError(
-            f"{what} has no free space: bright cells are free; check negate and the thresholds, or invert the image"
+            f"{what} has no free space: bright cells are free; check negate and free_thresh, or invert the image"
         )
     rng = generator(seed)
     walls = outline_segments(free) * resolution

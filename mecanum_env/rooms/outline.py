@@ -2,8 +2,9 @@
 
 First the exact outline is walked along the edges between free and other cells; then its stairs, and only they,
 are replaced by straight pieces. A stair is a run of one-cell jogs, the way in which a raster shows a slanting or
-a curved wall. A piece goes from one jog to another, as far as every corner of the outline between them stays within the bound;
-as it begins and ends on the outline, it does not leave it either.
+a curved wall. A piece goes from one jog to another where every corner of the outline between them stays within
+the bound; as it begins and ends on the outline, it does not leave it either. The middles of neighbouring jogs can
+always be joined so, and dynamic programming finds the fewest pieces.
 """
 
 from __future__ import annotations
@@ -19,8 +20,9 @@ __all__ = ["outline_segments", "trace"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_TOLERANCE = 0.5 - 1e-9  # [cells]
-_PLACES = 5  # where along a jog pieces may meet
+_TOLERANCE = 0.5 + 1e-9  # [cells]: the flat top of an arc is cut by exactly half a cell
+_PLACES = 5  # where along a jog pieces may meet; odd, so that its middle is one
+_WINDOW = 96  # jogs that one piece spans at most
 
 # Headings along the lattice: 0 east, 1 north, 2 west, 3 south, as steps in column (x) and row (y).
 _DX = np.array([1, 0, -1, 0], np.int64)
@@ -160,11 +162,12 @@ def _straighten_loop(
         while start < count and role[start] == 0:
             start += 1
     begin, at = n, start
-    x, y = path[start]
     while at < start + count:
-        out[n, 0], out[n, 1] = x, y
-        n += 1
-        at, x, y = _farthest(path, role, count, at, start + count, x, y)
+        stop = at + 1
+        while stop < start + count and role[stop % count] != 2:
+            stop += 1
+        n = _straighten_stair(path, role, count, at, stop, out, n)
+        at = stop
     if n - begin < 3:
         # Straightened to nothing; keep the exact outline of so small a thing.
         n = begin
@@ -196,55 +199,91 @@ def _stations(loop: Array, stair: NDArray[np.bool_], path: Array, role: NDArray[
 
 
 @njit(cache=True, nogil=True)
-def _farthest(
-    path: Array, role: NDArray[np.int64], count: int, at: int, end: int, x: float, y: float
-) -> tuple[int, float, float]:
-    """Return the farthest station that a straight piece from (x, y) can go to within the bound, and where in it.
+def _straighten_stair(
+    path: Array, role: NDArray[np.int64], count: int, at: int, stop: int, out: Array, n: int
+) -> int:
+    """Append the fewest straight pieces from station ``at`` to ``stop``, both met exactly; return the row after.
 
-    A jog may be met anywhere along it but at its ends; of the places that will do, the one is taken that leaves
-    the smallest error.
+    Dynamic programming over the jogs and over places along each; of as few pieces, those with the least error.
+    The row for ``stop`` is left to what follows.
     """
-    # The next station, met in its middle, is within the bound from wherever a piece may end.
-    best = at + 1
-    while best < end and role[best % count] == 0:
-        best += 1
-    best_x, best_y = path[best % count]
-    if role[best % count] == 2 or best >= end:
-        return best, best_x, best_y
-    for candidate in range(best, end + 1):
-        what = role[candidate % count]
-        if what == 0:
-            continue
-        # The loop must close where it began, so the last station is met in its middle.
-        fixed = what == 2 or candidate == end
-        least = 2.0
-        for place in range(_PLACES):
-            share = 0.5 if fixed else (place + 0.5) / _PLACES
-            to_x, to_y = path[candidate % count]
-            if not fixed:
-                before, after = path[(candidate - 1) % count], path[(candidate + 1) % count]
-                to_x = before[0] + share * (after[0] - before[0])
-                to_y = before[1] + share * (after[1] - before[1])
-            error = _deviation(path, role, count, at, candidate, x, y, to_x, to_y)
-            if error < least and (fixed or _goes_on(path, role, count, candidate, to_x, to_y)):
-                least = error
-                if error <= _TOLERANCE:
-                    best, best_x, best_y = candidate, to_x, to_y
-            if fixed:
+    size = 2
+    for i in range(at + 1, stop):
+        if role[i % count] == 1:
+            size += 1
+    out[n] = path[at % count]
+    if size == 2:
+        return n + 1
+    station = np.empty(size, np.int64)
+    station[0], station[size - 1] = at, stop
+    k = 1
+    for i in range(at + 1, stop):
+        if role[i % count] == 1:
+            station[k] = i
+            k += 1
+    cost = np.full(size * _PLACES, np.inf)
+    previous = np.zeros(size * _PLACES, np.int64)
+    cost[_PLACES // 2] = 0.0
+    for j in range(1, size):
+        for i in range(j - 1, max(-1, j - 1 - _WINDOW), -1):
+            # What cannot be spanned from a nearer station cannot from one farther off.
+            if not _relax(path, role, count, station, i, j, cost, previous):
                 break
-        if least > _TOLERANCE and candidate > best or what == 2:
-            break
-    return best, best_x, best_y
+    last = (size - 1) * _PLACES + _PLACES // 2
+    pieces, state = 0, last
+    while state >= _PLACES:
+        pieces += 1
+        state = previous[state]
+    state = previous[last]
+    for row in range(n + pieces - 1, n, -1):
+        out[row, 0], out[row, 1] = _place(path, count, station[state // _PLACES], state % _PLACES)
+        state = previous[state]
+    return n + pieces
 
 
 @njit(cache=True, nogil=True)
-def _goes_on(path: Array, role: NDArray[np.int64], count: int, at: int, x: float, y: float) -> bool:
-    """Whether a piece from (x, y) in a jog to the middle of the next station is within the bound."""
-    following = at + 1
-    while role[following % count] == 0:
-        following += 1
-    to_x, to_y = path[following % count]
-    return _deviation(path, role, count, at, following, x, y, to_x, to_y) <= _TOLERANCE
+def _relax(
+    path: Array,
+    role: NDArray[np.int64],
+    count: int,
+    station: NDArray[np.int64],
+    i: int,
+    j: int,
+    cost: Array,
+    previous: NDArray[np.int64],
+) -> bool:
+    """Offer every piece from station i to station j; return whether one is within the bound."""
+    spanned = False
+    middle, last = _PLACES // 2, station.shape[0] - 1
+    for q in range(_PLACES):
+        if j == last and q != middle:
+            continue
+        bx, by = _place(path, count, station[j], middle if j == last else q)
+        for p in range(_PLACES):
+            start = i * _PLACES + p
+            if cost[start] == np.inf:
+                continue
+            ax, ay = _place(path, count, station[i], p)
+            error = _deviation(path, role, count, station[i], station[j], ax, ay, bx, by)
+            if error > _TOLERANCE:
+                continue
+            spanned = True
+            offer = cost[start] + 1.0 + 0.1 * error
+            if offer < cost[j * _PLACES + q]:
+                cost[j * _PLACES + q] = offer
+                previous[j * _PLACES + q] = start
+    return spanned
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _place(path: Array, count: int, station: int, place: int) -> tuple[float, float]:
+    """Return one of the places along a jog; the middle one is the station itself."""
+    x, y = path[station % count]
+    if place == _PLACES // 2:
+        return x, y
+    before, after = path[(station - 1) % count], path[(station + 1) % count]
+    share = (place + 0.5) / _PLACES
+    return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
 
 
 @njit(cache=True, nogil=True)

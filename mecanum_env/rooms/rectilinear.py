@@ -32,15 +32,11 @@ def surfaces(rectangles: Array) -> Array:
     line, low, high, sign = _runs(np.diff(free, axis=0)[:, 1:-1])
     # Free to the right of a vertical line (sign +1): walk it downwards, and free space is on the left.
     down = sign > 0
-    upright = np.stack(
-        [xs[line], ys[np.where(down, high, low)], xs[line], ys[np.where(down, low, high)]], axis=1
-    )
+    upright = np.stack([xs[line], ys[np.where(down, high, low)], xs[line], ys[np.where(down, low, high)]], axis=1)
     line, low, high, sign = _runs(np.diff(free, axis=1)[1:-1].T)
     # Free above a horizontal line (sign +1): walk it to the right.
     right = sign > 0
-    level = np.stack(
-        [xs[np.where(right, low, high)], ys[line], xs[np.where(right, high, low)], ys[line]], axis=1
-    )
+    level = np.stack([xs[np.where(right, low, high)], ys[line], xs[np.where(right, high, low)], ys[line]], axis=1)
     return np.ascontiguousarray(np.vstack([upright, level]))
 
 

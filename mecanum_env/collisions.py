@@ -1,0 +1,138 @@
+"""Contacts: the pymunk space with a plan's surfaces and the robot's body, and the events made of its reports."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pymunk
+from numpy.typing import NDArray
+
+from mecanum_env.config import RobotConfig
+
+if TYPE_CHECKING:
+    from mecanum_env.rooms.floor_plan import FloorPlan
+
+__all__ = ["CONTACT_GAP_S", "Contacts", "add_robot", "build_space"]
+
+Array = NDArray[np.float64]
+
+CONTACT_GAP_S = 0.5
+"""A contact is a new one when the robot has touched nothing for this long [s]."""
+
+_ROBOT = 1  # collision type
+_FRICTION = 0.5  # of robot and of surfaces each; pymunk multiplies the two
+_ELASTICITY = 0.2  # likewise
+_SLOP_M = 0.002  # pymunk lets shapes overlap by this much; its default of 0.1 is 10 cm here
+_OVERLAP_KEPT = 0.3  # share of a deeper overlap that is left after 20 ms
+
+
+class Contacts:
+    """What pymunk reports of contacts within one physics step, and the events made of it.
+
+    Apart from :class:`World`, so that the space's callbacks do not tie world and space into a cycle.
+    """
+
+    def __init__(self) -> None:
+        self.touched = False
+        self.count = 0
+        self.peak = 0.0
+        self.total = 0.0
+        self._pairs = 0  # of shapes that touch now
+        self._clear_for_s = math.inf
+
+    def begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        """Note that the robot begins to touch a shape."""
+        self.touched = True
+        self._pairs += 1
+
+    def separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        """Note that the robot no longer touches a shape."""
+        self._pairs -= 1
+
+    def close_step(self, dt: float, impulse: float) -> None:
+        """Turn what was reported during a physics step of ``dt`` [s] into events.
+
+        The impulse [N·s] is the net one: single shapes' push against each other where a wall has seams.
+        """
+        if self.touched:
+            if self._clear_for_s >= CONTACT_GAP_S:
+                self.count += 1
+                self.peak = self.total = 0.0
+            self._clear_for_s = 0.0
+            self.peak = max(self.peak, impulse)
+            self.total += impulse
+        else:
+            self._clear_for_s += dt
+        self.touched = self._pairs > 0
+
+    def pass_clear(self, duration: float) -> None:
+        """Let time [s] go by in which nothing was touched."""
+        self._clear_for_s += duration
+
+
+def build_space(plan: FloorPlan, contacts: Contacts) -> pymunk.Space:
+    """Return a space with every surface of the plan, always inserted in the plan's order."""
+    space = pymunk.Space()
+    space.collision_slop = _SLOP_M
+    space.collision_bias = _OVERLAP_KEPT ** (1.0 / 0.02)
+    static = space.static_body
+    shapes: list[pymunk.Shape] = []
+    for (x1, y1, x2, y2), neighbours in zip(plan.walls.tolist(), _wall_neighbours(plan), strict=True):
+        segment = pymunk.Segment(static, (x1, y1), (x2, y2), 0.0)
+        if neighbours:
+            segment.set_neighbors(*neighbours)
+        shapes.append(segment)
+    shapes.extend(pymunk.Poly(static, polygon.tolist()) for polygon in plan.polygons)
+    shapes.extend(pymunk.Circle(static, r, (x, y)) for x, y, r in plan.circles.tolist())
+    for shape in shapes:
+        shape.friction, shape.elasticity = _FRICTION, _ELASTICITY
+    space.add(*shapes)
+    space.on_collision(_ROBOT, None, begin=contacts.begin, separate=contacts.separate)
+    return space
+
+
+def _wall_neighbours(plan: FloorPlan) -> list[tuple[tuple[float, float], tuple[float, float]] | None]:
+    """Return for each wall the points that tell pymunk where the surface goes on beyond its ends.
+
+    Without them a robot that slides along a wall of several pieces catches on each seam. pymunk drops a contact
+    at an end whose normal points to the neighbour's side. The neighbour's direction is tilted into the solid where
+    need be, so that only normals within 45° of the wall's own line are dropped; so the free side must be known.
+    """
+    walls = np.asarray(plan.walls, dtype=np.float64).reshape(-1, 4)
+    ends = walls.reshape(-1, 2, 2)
+    along = ends[:, 1] - ends[:, 0]
+    along /= np.maximum(np.hypot(along[:, 0], along[:, 1])[:, None], 1e-12)
+    left = np.column_stack([-along[:, 1], along[:, 0]])
+    middle, off = ends.mean(axis=1), 1.5 * plan.resolution
+    side = 1.0 * plan.is_free(middle + off * left) - 1.0 * plan.is_free(middle - off * left)
+    meeting: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
+    for i, end in np.ndindex(len(walls), 2):
+        meeting[_point_key(ends[i, end])].append((i, end))
+    result: list[tuple[tuple[float, float], tuple[float, float]] | None] = []
+    for i in range(len(walls)):
+        points = ends[i].copy()  # a neighbour at the end itself is none
+        for end, outward in ((0, -along[i]), (1, along[i])):
+            others = meeting[_point_key(ends[i, end])]
+            directions = [along[j] if e == 0 else -along[j] for j, e in others if j != i]
+            if directions:
+                direction = max(directions, key=lambda d: float(d @ outward))
+                normal = side[i] * left[i]
+                points[end] += direction - max(float(direction @ normal) + 1.0, 0.0) * normal
+        known = side[i] != 0.0
+        result.append(((points[0, 0], points[0, 1]), (points[1, 0], points[1, 1])) if known else None)
+    return result
+
+
+def _point_key(point: Array) -> tuple[int, int]:
+    return round(point[0] * 1e4), round(point[1] * 1e4)
+
+
+def add_robot(space: pymunk.Space, robot: RobotConfig) -> pymunk.Body:
+    body = pymunk.Body(robot.mass_kg, robot.inertia_kg_m2)
+    shape = pymunk.Poly.create_box(body, (robot.length_m, robot.width_m))
+    shape.friction, shape.elasticity, shape.collision_type = _FRICTION, _ELASTICITY, _ROBOT
+    space.add(body, shape)
+    return body

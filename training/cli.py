@@ -1,0 +1,319 @@
+"""The ``mecanum`` command. What is heavy is imported inside the commands, so that ``--help`` is quick."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+import traceback
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from training.errors import BadInput, Interrupted, one_line, suggestion
+
+if TYPE_CHECKING:
+    from training.explore import Progress
+
+__all__ = ["app", "main"]
+
+TRACEBACK_VARIABLE = "MECANUM_TRACEBACK"
+_LOG_EVERY_S = 30.0  # between two lines of progress where standard error is no terminal
+
+# typer brings its own copy of click, or uses click's, by version; either way this is the root of usage errors.
+_ClickException = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # plain help needs no rich, and shows the examples as they are typed
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        try:
+            print(f"mecanum-slam {version('mecanum-slam')}")
+        except PackageNotFoundError:
+            print("mecanum-slam, not installed: run `pip install -e .`")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    show: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
+    ] = False,
+) -> None:
+    """A mecanum-wheel robot explores rooms it has never seen, on its own SLAM belief.
+
+    \b
+    Examples:
+      mecanum explore
+      mecanum rooms --kind apartment --seeds 0:9 --out out/rooms
+      mecanum speed
+
+    \b
+    Exit codes: 0 done, 2 bad usage or bad input, 1 anything else, 130 interrupted.
+    `mecanum COMMAND --help` shows a command's options and examples.
+    """
+
+
+@app.command()
+def explore(
+    agent: Annotated[
+        str | None, typer.Option(help="Who decides where to go.  [default: nearest-frontier]")
+    ] = None,
+    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.  [default: 0]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/explore"),
+    floor_plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="X,Y,THETA", help="Start pose in the plan's frame, m and rad.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
+    ] = None,
+    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+    ] = None,
+    max_steps: Annotated[
+        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
+    ] = None,
+    coverage_target: Annotated[
+        float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Explore rooms for one episode, until the agent has nothing left to explore.
+
+    Writes into --out: map.png, truth.png, map.pgm + map.yaml (ROS map_server), trajectory_true.tum and
+    trajectory_estimate.tum, landmarks.db (SQLite), config.toml and metrics.json. Ctrl-C ends the episode and
+    keeps it as far as it came.
+
+    \b
+    Examples:
+      mecanum explore
+      mecanum explore --agent nearest-frontier --rooms apartment --slam ekf --seed 3 --out out/seed3
+      mecanum explore --floor-plan office.yaml --start 2.5,1.0,0 --out out/office
+      mecanum explore --config out/seed3/config.toml --out out/again
+      mecanum explore --rooms rectangular --noise slippery --json
+    """
+    pose = _parse_start(start)
+    if coverage_target is not None and not 0 < coverage_target <= 1:
+        raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
+    from training import explore as task
+
+    options = task.ExploreOptions(
+        out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
+        start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
+    )  # fmt: skip
+    episode = task.prepare(options)
+    with ExitStack() as stack:
+        task.run(episode, _progress(stack))
+    metrics = task.write_episode(episode)
+    if as_json:
+        print(json.dumps(metrics, ensure_ascii=False))
+    else:
+        print(_summary(metrics, out, task.FILES))
+    if episode.interrupted:
+        raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
+
+
+@app.command()
+def rooms(
+    kind: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
+    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7; at most 100.")] = "0:9",
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out/rooms"),
+    robot: Annotated[str, typer.Option(help="Robot drawn at the start.")] = "youbot",
+    as_json: Json = False,
+) -> None:
+    """Draw generated rooms: one PNG a seed, and a contact sheet of them all.
+
+    \b
+    Examples:
+      mecanum rooms
+      mecanum rooms --kind apartment --seeds 0:9 --out out/rooms
+      mecanum rooms --kind rectangular --seeds 1,4,7 --json
+    """
+    from training.rooms_command import draw_rooms
+
+    drawn = draw_rooms(kind=kind, seeds=seeds, out=out, robot=robot)
+    if as_json:
+        print(json.dumps(drawn))
+    else:
+        print(f"{len(drawn['files'])} plans in {out}, all together in {drawn['sheet']}")
+
+
+@app.command()
+def speed(
+    seconds: Annotated[float, typer.Option(min=0.1, help="How long to measure.")] = 10.0,
+    rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
+    slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
+    beams: Annotated[int, typer.Option(min=8, help="Beams of the lidar.")] = 360,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Measure the steps per second of one environment, and where the time goes.
+
+    \b
+    Examples:
+      mecanum speed
+      mecanum speed --slam odometry --beams 180 --seconds 5 --json
+    """
+    if not math.isfinite(seconds):
+        raise BadInput(f"--seconds must be finite, got {seconds}")
+    from training.speed import run
+
+    run(seconds=seconds, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
+
+
+# ---- running it ------------------------------------------------------------------------------------------------
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code; what goes wrong is one line on standard error."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    command = typer.main.get_command(app)
+    name = "mecanum"
+    if arguments and arguments[0] in _commands():
+        name = f"mecanum {arguments[0]}"
+    try:
+        code = command.main(args=arguments, prog_name="mecanum", standalone_mode=False)
+        sys.stdout.flush()
+        return code if isinstance(code, int) else 0
+    except _ClickException as error:
+        if type(error).__name__ == "NoArgsIsHelpError":
+            print(error.format_message(), file=sys.stderr)
+            return 2
+        return _fail(name, _usage_message(error), 2)
+    except BadInput as error:
+        return _fail(name, str(error), 2)
+    except Interrupted as error:
+        return _fail(name, str(error), 130)
+    except (KeyboardInterrupt, typer.Abort):
+        return _fail(name, "interrupted; nothing was written", 130)
+    except BrokenPipeError:
+        # Whoever read the output has gone; flushing on exit must not complain again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except Exception as error:
+        if os.environ.get(TRACEBACK_VARIABLE) not in (None, "", "0"):
+            traceback.print_exc()
+        text = one_line(error) or "no message"
+        return _fail(name, f"{type(error).__name__}: {text} (set {TRACEBACK_VARIABLE}=1 for a traceback)", 1)
+
+
+def _fail(name: str, message: str, code: int) -> int:
+    print(f"{name}: {message}", file=sys.stderr)
+    return code
+
+
+def _commands() -> list[str]:
+    return sorted(getattr(typer.main.get_command(app), "commands", {}))
+
+
+def _usage_message(error: Any) -> str:
+    """Return a usage error on one line, with what is allowed."""
+    context = getattr(error, "ctx", None)
+    option = getattr(error, "option_name", None)
+    if context is not None and type(error).__name__ == "NoSuchOption":
+        valid = sorted(name for p in context.command.params for name in p.opts if name.startswith("--"))
+        valid.append("--help")
+        return f"unknown option {option}{suggestion(str(option), valid)}; valid: {', '.join(valid)}"
+    message = one_line(error.format_message()).rstrip(".")
+    if message.startswith("No such command"):
+        given = (message.split("'") + ["", ""])[1]
+        return f"unknown command {given!r}{suggestion(given, _commands())}; valid: {', '.join(_commands())}"
+    return f"{message[:1].lower()}{message[1:]}; see --help"
+
+
+def _parse_start(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, theta = (float(word) for word in text.split(","))
+    except ValueError:
+        raise BadInput(f"--start {text!r} is not X,Y,THETA: three numbers in m and rad, such as 2.5,1.0,0") from None
+    if not all(map(math.isfinite, (x, y, theta))):
+        raise BadInput(f"--start {text!r} must be three finite numbers in m and rad, such as 2.5,1.0,0")
+    return x, y, theta
+
+
+# ---- what the user sees ----------------------------------------------------------------------------------------
+
+
+def _progress(stack: ExitStack) -> Progress:
+    """Return a progress bar on standard error, or a line now and then where that is no terminal."""
+    if not sys.stderr.isatty():
+        return _LogLines()
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    bar = stack.enter_context(
+        Progress(
+            TextColumn("exploring"), BarColumn(), TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
+            console=Console(stderr=True), transient=True,
+        )
+    )  # fmt: skip
+    task = bar.add_task("exploring", total=1.0, status="")
+
+    def show(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        if steps % 10 == 0:
+            bar.update(task, completed=coverage, status=f"{100 * coverage:.1f} % mapped at {time_s:.0f} s")
+
+    return show
+
+
+class _LogLines:
+    """A line on standard error every half a minute."""
+
+    def __init__(self) -> None:
+        self._next = time.monotonic() + _LOG_EVERY_S
+
+    def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        if steps % 10 == 0 and time.monotonic() >= self._next:
+            self._next += _LOG_EVERY_S
+            line = f"step {steps} of at most {max_steps}: {100 * coverage:.1f} % mapped at {time_s:.0f} s"
+            print(line, file=sys.stderr, flush=True)
+
+
+def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str]) -> str:
+    def shown(key: str, unit: str, digits: int, factor: float = 1.0) -> str:
+        value = metrics[key]
+        return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
+
+    where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
+    verdict = "success" if metrics["success"] else "target not reached"
+    heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
+    rows = (
+        ("explored", f"{where} with {metrics['slam']} and {metrics['agent']}"),
+        ("ended", f"{metrics['end']} after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
+        ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
+        ("path", f"{shown('path_length_m', 'm', 1)}, {metrics['collisions']} collisions"),
+        ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {shown('corner_mean_m', 'cm', 1, 100.0)} off on average"),
+        ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
+        ("files", f"{out}/: {', '.join(files)}"),
+    )
+    return "\n".join(f"{name:<12} {text}" for name, text in rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,55 @@
+"""What goes wrong on the command line: one line that says what, what is allowed, and what to do."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["BadInput", "Interrupted", "bad_input", "check_writable", "one_line", "suggestion"]
+
+
+class BadInput(Exception):
+    """What the user gave cannot be used: exit code 2. The message is one line with the remedy."""
+
+
+class Interrupted(Exception):
+    """The user pressed Ctrl-C: exit code 130. The message says what was kept."""
+
+
+@contextmanager
+def bad_input() -> Iterator[None]:
+    """Take a ``ValueError`` raised inside, where only the user's input is judged, for :class:`BadInput`.
+
+    Outside of such a block a ``ValueError`` is the program's own fault.
+    """
+    try:
+        yield
+    except ValueError as error:
+        raise BadInput(one_line(error)) from error
+
+
+def one_line(error: object) -> str:
+    """Return an error's message on one line."""
+    return " ".join(str(error).split())
+
+
+def suggestion(name: str, valid: Iterable[str]) -> str:
+    """Return ``" (did you mean …?)"`` where one of the valid names is close, else nothing."""
+    close = difflib.get_close_matches(name, list(valid), n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def check_writable(folder: Path) -> None:
+    """Raise :class:`BadInput` unless a folder can be written to or made; it is not made here."""
+    remedy = "choose another --out"
+    for place in (folder, *folder.absolute().parents):
+        if place.is_dir():
+            if not os.access(place, os.W_OK | os.X_OK):
+                raise BadInput(f"cannot write to {folder}: no permission to write in {place}; {remedy}")
+            return
+        if place.exists() or place.is_symlink():
+            raise BadInput(f"cannot write to {folder}: {place} is not a folder; {remedy}")
+    raise BadInput(f"cannot write to {folder}: no such place; {remedy}")

@@ -1,0 +1,315 @@
+"""``mecanum explore``: one episode, from the options to the files."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import shutil
+import signal
+import statistics
+import threading
+import time
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from tempfile import mkdtemp
+from types import FrameType
+from typing import Any, Protocol
+
+import cv2
+import gymnasium
+import numpy as np
+import tomli_w
+
+import agents
+from agents.base import Agent
+from mecanum_env import rooms as room_registry
+from mecanum_env.config import EnvConfig
+from mecanum_env.env import ExploreEnv, make_config
+from mecanum_env.render import draw_map, draw_truth, episode_view
+from mecanum_env.rooms import FloorPlan
+from slam.formats import atomic_write, write_map_server, write_tum
+from slam.landmark_map import write_landmark_map
+from slam.settings import to_mapping, unknown_name
+from training.errors import BadInput, bad_input, check_writable
+
+__all__ = ["FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
+
+FILES = (
+    "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
+    "landmarks.db", "config.toml", "metrics.json",
+)  # fmt: skip
+"""What an episode writes, ``metrics.json`` last: where it is, the others are."""
+
+LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
+"""The step limit where none is given: so many, or so many a square metre of free space."""
+
+_DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
+_DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
+_LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExploreOptions:
+    """What was asked for; ``None`` where the config file or the default decides."""
+
+    out: Path
+    agent: str | None = None
+    rooms: str | None = None
+    slam: str | None = None
+    robot: str | None = None
+    noise: str | None = None
+    seed: int | None = None
+    floor_plan: Path | None = None
+    start: tuple[float, float, float] | None = None
+    config: Path | None = None
+    max_steps: int | None = None
+    coverage_target: float | None = None
+
+
+class Progress(Protocol):
+    """Told after every step how far the episode is."""
+
+    def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        """Show it, or do not."""
+
+
+@dataclass(eq=False)
+class Episode:
+    """An episode: prepared, then run, then written."""
+
+    env: ExploreEnv
+    wrapped: Any  # the same environment, as gym.make wrapped it
+    agent: Agent
+    observation: Mapping[str, Any]
+    config: EnvConfig  # with the coverage that counts as success
+    run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
+    out: Path
+    end: str = "step limit"
+    interrupted: bool = False
+    wall_time_s: float = 0.0
+    decisions_ms: list[float] = field(default_factory=list)
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the contents of ``metrics.json``."""
+        metrics: dict[str, Any] = dict(self.env.episode_metrics())
+        coverage = metrics["coverage"]
+        metrics["decision_ms_median"] = statistics.median(self.decisions_ms) if self.decisions_ms else None
+        metrics |= {
+            "success": bool(coverage is not None and coverage >= self.config.coverage_target),
+            "agent": self.run["agent"],
+            "slam": self.config.slam,
+            "rooms": self.config.rooms if self.config.floor_plan is None else None,
+            "floor_plan": self.config.floor_plan,
+            "seed": self.run["seed"],
+            "end": self.end,
+            "interrupted": self.interrupted,
+            "wall_time_s": round(self.wall_time_s, 3),
+        }
+        return {key: _plain(value) for key, value in metrics.items()}
+
+
+# ---- before --------------------------------------------------------------------------------------------------
+
+
+def prepare(options: ExploreOptions) -> Episode:
+    """Check everything that can be checked, and place the robot; nothing is written.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, and what to do.
+    """
+    with bad_input():
+        past = _read_run_table(options.config) if options.config is not None else {}
+        run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
+        if run["agent"] not in agents.names():
+            raise unknown_name("agent", run["agent"], agents.names())
+        config = make_config(
+            config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
+            noise=options.noise, floor_plan=options.floor_plan,
+        )  # fmt: skip
+        if options.rooms is not None and options.floor_plan is None:
+            config = replace(config, floor_plan=None)
+        elif config.floor_plan is not None:
+            config = replace(config, floor_plan=str(Path(config.floor_plan).absolute()))
+        if options.coverage_target is not None:
+            config = replace(config, coverage_target=options.coverage_target)
+        check_writable(options.out)
+        plan = _make_plan(config, run["seed"])
+        # An agent maps all that it can reach; what counts as success is judged at the end.
+        limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
+        wrapped = gymnasium.make(
+            "mecanum_env:mecanum_env/Explore-v0", config=replace(config, coverage_target=1.0),
+            max_episode_steps=limit, disable_env_checker=True,
+        )  # fmt: skip
+        start = run.get("start")
+        reset_options = {"floor_plan": plan} | ({"start_pose": tuple(start)} if start is not None else {})
+        observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
+        env = wrapped.unwrapped
+        assert isinstance(env, ExploreEnv)
+        agent = agents.make(run["agent"], robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent.reset(env.belief, run["seed"])
+    run |= {"max_steps": limit}
+    return Episode(env, wrapped, agent, observation, config, run, options.out)
+
+
+def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+
+
+def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:
+    if config.floor_plan is not None:
+        return room_registry.load(config.floor_plan, seed=seed)
+    return room_registry.make(config.rooms, seed=seed, config=config.rooms_config)
+
+
+def _read_run_table(path: Path) -> dict[str, Any]:
+    """Return ``agent``, ``seed``, ``start`` and ``max_steps`` from a config's [run] table, where it has one."""
+    try:
+        values = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
+    run = values.get("run", {})
+    kinds = {"agent": str, "seed": int, "start": list, "max_steps": int}
+    wrong = [k for k, kind in kinds.items() if isinstance(run, dict) and k in run and type(run[k]) is not kind]
+    if not isinstance(run, dict) or wrong:
+        raise BadInput(f"config {path}: [run] {wrong[0] if wrong else ''} has the wrong type; see a config.toml")
+    start = run.get("start", [0.0, 0.0, 0.0])
+    good = len(start) == 3 and all(isinstance(v, int | float) and math.isfinite(v) for v in start)
+    if not good or run.get("seed", 0) < 0 or run.get("max_steps", 1) < 1:
+        raise BadInput(f"config {path}: [run] needs seed ≥ 0, max_steps ≥ 1 and start = [x, y, θ]")
+    return {name: run[name] for name in kinds if name in run}
+
+
+# ---- the episode -----------------------------------------------------------------------------------------------
+
+
+def run(episode: Episode, progress: Progress) -> None:
+    """Let the agent explore until it is done, the steps are used up, or Ctrl-C is pressed between two steps."""
+    env, agent, step = episode.env, episode.agent, episode.wrapped.step
+    patience = math.ceil(_DONE_AFTER_S / episode.config.step_s)
+    observation, goal, idle, max_steps = episode.observation, agent.goal, 0, episode.run["max_steps"]
+    began = time.perf_counter()
+    with _interrupt_flag() as interrupted:
+        for steps in range(1, max_steps + 1):
+            asked = time.perf_counter()
+            action = agent.act(observation, env.belief)
+            if agent.goal is not goal:
+                # The step in which it chose: driving on costs next to nothing.
+                episode.decisions_ms.append(1e3 * (time.perf_counter() - asked))
+                goal = agent.goal
+            observation, _, terminated, truncated, info = step(action)
+            progress(coverage=info["coverage"], time_s=info["time_s"], steps=steps, max_steps=max_steps)
+            idle = idle + 1 if goal is None else 0
+            if interrupted.is_set():
+                episode.end, episode.interrupted = "interrupted", True
+            elif terminated:
+                episode.end = "all mapped" if info["is_success"] else "collision"
+            elif idle >= patience:
+                episode.end = agent.status
+            elif not truncated:
+                continue
+            break
+    episode.wall_time_s = time.perf_counter() - began
+
+
+@contextmanager
+def _interrupt_flag() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once."""
+    flag = threading.Event()
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        if flag.is_set():
+            raise KeyboardInterrupt
+        flag.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield flag  # only the main thread may handle signals
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# ---- after -----------------------------------------------------------------------------------------------------
+
+
+def write_episode(episode: Episode) -> dict[str, Any]:
+    """Write every file of an episode and return its metrics.
+
+    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
+    while writing leaves the results of an earlier one as they were.
+    """
+    out, env, record = episode.out, episode.env, episode.env.truth.record
+    out.mkdir(parents=True, exist_ok=True)
+    folder = Path(mkdtemp(prefix=".writing-", dir=out))
+    try:
+        belief, times = env.belief, record.times
+        true_poses, estimates = record.true_poses, record.estimates
+        write_map_server(folder / "map", belief.grid)
+        write_tum(folder / "trajectory_true.tum", times, true_poses)
+        write_tum(folder / "trajectory_estimate.tum", times, estimates)
+        seen, angles = env.backend.landmark_details()
+        write_landmark_map(
+            folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
+            joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+            ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+            backend=episode.config.slam,
+        )  # fmt: skip
+        view = episode_view(env.truth.ground, belief)
+        robot, where = episode.config.robot, _place(episode)
+        pictures = {
+            "map.png": draw_map(
+                belief, estimates, view=view, robot=robot,
+                title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
+            ),
+            "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
+        }  # fmt: skip
+        for name, picture in pictures.items():
+            atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+        atomic_write(folder / "config.toml", config_text(episode))
+        metrics = episode.metrics()
+        atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+        for name in FILES:
+            (folder / name).replace(out / name)
+        return metrics
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def config_text(episode: Episode) -> str:
+    """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
+    run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
+    run["versions"] = _versions()
+    return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
+
+
+def _versions() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def _place(episode: Episode) -> str:
+    plan = episode.config.floor_plan
+    return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers of Python's own, null for what is not finite."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
