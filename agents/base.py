@@ -69,7 +69,7 @@ class Agent(ABC):
 
     @property
     def status(self) -> str:
-        """A word for what it is doing: ``driving``, ``recovering``, ``covered``, ``stuck`` …"""
+        """A word for what it is doing, such as ``driving``, ``recovering``, ``covered`` or ``stuck``."""
         return self._status
 
     def reset(self, belief: Belief, seed: int = 0) -> None:

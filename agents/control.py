@@ -60,9 +60,7 @@ class ControlConfig:
 class PathFollower:
     """Turns a path into body twists, one a step, and never one whose braking distance is blocked."""
 
-    def __init__(
-        self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float
-    ) -> None:
+    def __init__(self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float) -> None:
         self.config = config
         self._robot, self._lidar, self._step_s = robot, lidar, step_s
         self._rim = footprint(robot)
@@ -119,9 +117,7 @@ class PathFollower:
         turn = float(np.clip(self.config.turn_gain * error, -self._max_turn, self._max_turn))
         return self._send(speed * direction, turn, pose, near, scan_points(observation, self._lidar))
 
-    def drive(
-        self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief
-    ) -> Array:
+    def drive(self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the twist ``(3,)`` nearest to a velocity ``(2,)`` in the belief's frame that is safe."""
         pose = np.asarray(belief.pose, dtype=np.float64)
         near = local_map(belief, _WINDOW_M)
@@ -148,9 +144,7 @@ class PathFollower:
         """Return the direction ``(2,)`` to go in and the speed [m/s] that path and walls allow."""
         config = self.config
         speed_now = float(np.hypot(*self._velocity))
-        reach = float(
-            np.clip(config.look_ahead_s * speed_now, config.min_look_ahead_m, config.max_look_ahead_m)
-        )
+        reach = float(np.clip(config.look_ahead_s * speed_now, config.min_look_ahead_m, config.max_look_ahead_m))
         here = float(near.at(pose[None, :2])[0])
         # Cut no corner: the straight line to the target keeps the clearance that the path has.
         floor = min(float(room[: max(1, int(reach / 0.1) + 1)].min()), here) - 0.02
@@ -167,9 +161,7 @@ class PathFollower:
         braking = speed_now * config.lag_s + 0.5 * speed_now**2 / config.deceleration_m_s2
         ahead = room[: max(1, int((braking + 0.2) / 0.1) + 1)]
         spare = (min(here, float(ahead.min())) - self._turning_room) / config.open_m
-        walls = config.near_wall_m_s + (self._max_speed - config.near_wall_m_s) * float(
-            np.clip(spare, 0.0, 1.0)
-        )
+        walls = config.near_wall_m_s + (self._max_speed - config.near_wall_m_s) * float(np.clip(spare, 0.0, 1.0))
         # From v²/2a + v·lag = rest: the lag's distance is spent before braking shows.
         rest = self.remaining_m
         lag = config.lag_s * config.deceleration_m_s2

@@ -77,13 +77,13 @@ class CostMap:
     def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
         cells = np.asarray(cells, dtype=np.float64)
-        return (cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin)
+        return np.asarray((cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin))
 
     def to_cells(self, points: Array) -> NDArray[np.int64]:
         """Return the cells ``(n, 2)`` (row, column) of points ``(n, 2)`` [m], held within the grid."""
         index = np.floor((np.asarray(points) - np.asarray(self.origin)) / self.resolution).astype(np.int64)
         limit = np.array(self.classes.shape, dtype=np.int64) - 1
-        return np.clip(index[:, ::-1], 0, limit)
+        return np.asarray(np.clip(index[:, ::-1], 0, limit))
 
 
 def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
@@ -97,26 +97,33 @@ def clearance(classes: NDArray[np.int8], resolution: float) -> NDArray[np.float3
     """Return each cell's distance [m] ``(rows, cols)`` from its centre to the nearest occupied cell's edge."""
     if not (classes == OCCUPIED).any():
         return np.full(classes.shape, _FAR_M, dtype=np.float32)
-    distance = cv2.distanceTransform((classes != OCCUPIED).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    # Half a cell: from the occupied cell's centre to its edge.
-    return np.minimum((distance - np.float32(0.5)) * np.float32(resolution), np.float32(_FAR_M))
+    walls = (classes != OCCUPIED).view(np.uint8)
+    distance: NDArray[np.float32] = cv2.distanceTransform(walls, cv2.DIST_L2, cv2.DIST_MASK_5)
+    # Half a cell: from the occupied cell's centre to its edge. In place: these maps may be a million cells.
+    distance -= np.float32(0.5)
+    distance *= np.float32(resolution)
+    return np.minimum(distance, np.float32(_FAR_M), out=distance)
 
 
 def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     """Return the planning grid of a belief for a body of this size."""
-    fine = belief_classes(belief)
     fine_resolution = belief.grid.resolution
     wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
     factor = max(1, round(wanted / fine_resolution))
     resolution = factor * fine_resolution
+    row_slice, col_slice = _extent(belief)
+    fine = belief_classes(belief, row_slice, col_slice)
     # Blocks lie on the lattice of the frame, not of the grid's present corner.
-    col0, row0 = (round(v / fine_resolution) for v in belief.grid.origin)
-    row_pad, col_pad = row0 % factor, col0 % factor
+    corner = [
+        belief.grid.origin[0] + col_slice.start * fine_resolution,
+        belief.grid.origin[1] + row_slice.start * fine_resolution,
+    ]
+    col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
     rows = -(-(fine.shape[0] + row_pad) // factor) + 2
     cols = -(-(fine.shape[1] + col_pad) // factor) + 2
     origin = (
-        belief.grid.origin[0] - (col_pad + factor) * fine_resolution,
-        belief.grid.origin[1] - (row_pad + factor) * fine_resolution,
+        corner[0] - (col_pad + factor) * fine_resolution,
+        corner[1] - (row_pad + factor) * fine_resolution,
     )
     classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
     wall = np.full((rows, cols), _FAR_M, dtype=np.float32)
@@ -127,7 +134,7 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     weight = _weigh(classes, wall, resolution, config, robot, _sigma(belief.pose_cov))
     # Wherever the robot stands, it is allowed to stand, and to leave.
     reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
-    highest = np.float32(2.0 * (1.0 + config.near_cost + config.tight_cost))
+    highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
     _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
     return CostMap(classes, wall, weight, resolution, origin, (row, col))
 
@@ -140,6 +147,18 @@ def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: fl
 def tight_clearance(config: PlannerConfig, robot: RobotConfig) -> float:
     """Return the clearance [m] that the robot needs while its long side lies along the path."""
     return robot.inscribed_radius_m + config.tight_margin_m
+
+
+def _extent(belief: Belief) -> tuple[slice, slice]:
+    """Rows and columns of the grid that hold anything known, and the robot: its spare rim costs time."""
+    grid = belief.grid
+    here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
+    spans = []
+    for axis in (0, 1):
+        used = grid.log_odds.any(axis=1 - axis) | grid.visited.any(axis=1 - axis)
+        indices = np.append(np.flatnonzero(used), here[axis])
+        spans.append(slice(int(indices.min()), int(indices.max()) + 1))
+    return spans[0], spans[1]
 
 
 def _sigma(pose_cov: Array) -> float:
@@ -248,7 +267,7 @@ def _free_start(
 ) -> None:
     """Let the robot out of where it stands: cells around it, never occupied ones, at the highest price."""
     here = wall[row, col]
-    span = int(math.ceil(reach))
+    span = math.ceil(reach)
     for r in range(max(row - span, 1), min(row + span + 1, classes.shape[0] - 1)):
         for c in range(max(col - span, 1), min(col + span + 1, classes.shape[1] - 1)):
             away = math.hypot(r - row, c - col)

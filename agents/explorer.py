@@ -9,7 +9,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +88,6 @@ class _Trouble:
 class Explorer(Agent):
     """Drives from view point to view point until no frontier is left that it can reach."""
 
-    Config: ClassVar[type[ExplorerConfig]] = ExplorerConfig
-
     def __init__(
         self,
         config: ExplorerConfig | Mapping[str, Any] | None = None,
@@ -99,7 +97,7 @@ class Explorer(Agent):
         step_s: float = 0.1,
     ) -> None:
         super().__init__(robot=robot, lidar=lidar, step_s=step_s)
-        self.config = from_mapping(self.Config, config)
+        self.config = from_mapping(ExplorerConfig, config)
         self._follower = PathFollower(
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )

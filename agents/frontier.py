@@ -27,9 +27,7 @@ class NearestFrontierConfig(ExplorerConfig):
     def __post_init__(self) -> None:
         for name in ("switch_m", "switch_share"):
             value = getattr(self, name)
-            require(
-                math.isfinite(value) and value >= 0, f"NearestFrontierConfig.{name} must be ≥ 0, got {value}"
-            )
+            require(math.isfinite(value) and value >= 0, f"NearestFrontierConfig.{name} must be ≥ 0, got {value}")
 
 
 class NearestFrontier(Explorer):

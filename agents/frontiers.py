@@ -66,7 +66,7 @@ def frontier_mask(classes: NDArray[np.int8]) -> NDArray[np.bool_]:
     unknown = (classes == UNKNOWN).view(np.uint8)
     kernel = np.ones((3, 3), dtype=np.uint8)
     near = cv2.dilate(unknown, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    return (classes == FREE) & (near != 0)
+    return np.asarray((classes == FREE) & (near != 0))
 
 
 def find(cost_map: CostMap, config: FrontierConfig) -> Frontiers:
@@ -114,18 +114,14 @@ def view_points(
     return ViewPoints(cells, costs)
 
 
-def _borders_a_large_pocket(
-    classes: NDArray[np.int8], resolution: float, min_area: float
-) -> NDArray[np.bool_]:
+def _borders_a_large_pocket(classes: NDArray[np.int8], resolution: float, min_area: float) -> NDArray[np.bool_]:
     unknown = (classes == UNKNOWN).view(np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(unknown, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] * resolution**2 >= min_area
     large[0] = False
     pockets = large[labels].astype(np.uint8)
     kernel = np.ones((3, 3), dtype=np.uint8)
-    near: NDArray[np.bool_] = (
-        cv2.dilate(pockets, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) != 0
-    )
+    near: NDArray[np.bool_] = cv2.dilate(pockets, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) != 0
     return near
 
 
@@ -150,7 +146,7 @@ def _pieces(
 
 
 def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
-    """Unit vectors ``(m, 2)`` (x, y) from each cell towards the unknown cells within two cells of it."""
+    """Return unit vectors ``(m, 2)`` (x, y) from each cell towards the unknown cells within two cells of it."""
     rows, cols = classes.shape
     shift_r, shift_c = (v.ravel() for v in np.mgrid[-2:3, -2:3])
     r, c = cells[:, :1] + shift_r, cells[:, 1:] + shift_c
@@ -186,7 +182,7 @@ def _look(
 
 @njit(cache=True, nogil=True)
 def _at(classes: NDArray[np.int8], x: float, y: float) -> int:
-    row, col = int(math.floor(y)), int(math.floor(x))
+    row, col = math.floor(y), math.floor(x)
     if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
         return UNKNOWN
     return int(classes[row, col])
@@ -216,7 +212,7 @@ def _sweep(
             if kind == OCCUPIED or (kind == UNKNOWN and away > blind):
                 break
             if kind == FREE:
-                row, col = int(math.floor(py)), int(math.floor(px))
+                row, col = math.floor(py), math.floor(px)
                 if cost[row, col] < costs[index]:
                     costs[index] = cost[row, col]
                     cells[index, 0], cells[index, 1] = row, col

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -32,8 +33,8 @@ class TravelCosts:
     step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where inf
 
 
-def travel_costs(cost_map: CostMap, max_cost: float = math.inf) -> TravelCosts:
-    """Return the travel costs from the robot's cell; cells dearer than ``max_cost`` are left at infinity.
+def travel_costs(cost_map: CostMap, max_cost_m: float = math.inf) -> TravelCosts:
+    """Return the travel costs from the robot's cell; what costs more than ``max_cost_m`` is left at infinity.
 
     A step costs its length times the mean weight of its two cells. A diagonal step needs both cells beside it
     free, so that no path slips between two walls that touch at a corner.
@@ -42,8 +43,16 @@ def travel_costs(cost_map: CostMap, max_cost: float = math.inf) -> TravelCosts:
     cost = np.full(shape, np.inf, dtype=np.float32)
     step = np.full(shape, -1, dtype=np.int8)
     highest = float(cost_map.weight.max())
-    buckets = int(math.ceil(math.sqrt(2.0) * highest)) + 3
-    _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, max_cost, cost, step)
+    buckets = math.ceil(math.sqrt(2.0) * highest) + 3
+    _dial(
+        cost_map.weight,
+        cost_map.start[0],
+        cost_map.start[1],
+        buckets,
+        max_cost_m / cost_map.resolution,
+        cost,
+        step,
+    )
     cost *= np.float32(cost_map.resolution)
     return TravelCosts(cost, step)
 
@@ -74,7 +83,7 @@ def shortest_path(
 def resample(path: Array, spacing_m: float) -> Array:
     """Return a path ``(m, 2)`` with points at most ``spacing_m`` apart that keeps its ends and corners."""
     pieces = [path[:1]]
-    for a, b in zip(path[:-1], path[1:], strict=True):
+    for a, b in pairwise(path):
         count = max(1, math.ceil(float(np.hypot(*(b - a))) / spacing_m - 1e-9))
         pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
     return np.vstack(pieces)
@@ -174,12 +183,12 @@ def _segment(
 ) -> tuple[float, float]:
     """Price of the straight line a–b (inf where it leaves passable cells) and its smallest clearance."""
     length = math.hypot(b[0] - a[0], b[1] - a[1])
-    count = max(1, int(math.ceil(length / (0.5 * resolution))))
+    count = max(1, math.ceil(length / (0.5 * resolution)))
     total, nearest = 0.0, np.inf
     for i in range(count + 1):
         share = i / count
-        col = int(math.floor((a[0] + share * (b[0] - a[0]) - origin[0]) / resolution))
-        row = int(math.floor((a[1] + share * (b[1] - a[1]) - origin[1]) / resolution))
+        col = math.floor((a[0] + share * (b[0] - a[0]) - origin[0]) / resolution)
+        row = math.floor((a[1] + share * (b[1] - a[1]) - origin[1]) / resolution)
         if weight[row, col] <= 0.0:
             return np.inf, 0.0
         # Trapezoidal rule: the ends count half.

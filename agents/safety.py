@@ -1,4 +1,4 @@
-"""The last check before a twist goes out: would the body, braking from it, come onto something?
+"""The last check before a twist goes out: the body, braking from it, must come onto nothing.
 
 Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind.
 """
@@ -65,9 +65,7 @@ def footprint(robot: RobotConfig, spacing_m: float = 0.05) -> Array:
     return np.ascontiguousarray(np.vstack(sides + ends))
 
 
-def scan_points(
-    observation: Mapping[str, Any] | None, lidar: LidarConfig, *, within_m: float = 2.0
-) -> Array:
+def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig, *, within_m: float = 2.0) -> Array:
     """Return what the scan in an observation hit ``(n, 2)`` [m], in the body frame; empty where there is none.
 
     Raises
@@ -87,9 +85,7 @@ def scan_points(
     # Nothing returned at 1; a return below the least range is no return (NaN compares false).
     hit = (share < 1.0) & (ranges > lidar.range_min_m) & (ranges < within_m)
     angles = lidar.angle_min + lidar.angle_increment * np.flatnonzero(hit)
-    return np.stack(
-        [lidar.offset_m + ranges[hit] * np.cos(angles), ranges[hit] * np.sin(angles)], axis=1
-    )
+    return np.stack([lidar.offset_m + ranges[hit] * np.cos(angles), ranges[hit] * np.sin(angles)], axis=1)
 
 
 @njit(cache=True, nogil=True)
@@ -166,7 +162,7 @@ def _sample(field: NDArray[np.float32], origin: Array, resolution: float, x: flo
     next_c, next_r = min(col + 1, cols - 1), min(row + 1, rows - 1)
     low = field[row, col] * (1.0 - fu) + field[row, next_c] * fu
     high = field[next_r, col] * (1.0 - fu) + field[next_r, next_c] * fu
-    return low * (1.0 - fv) + high * fv
+    return float(low * (1.0 - fv) + high * fv)
 
 
 @njit(cache=True, nogil=True)

@@ -97,16 +97,29 @@ class Canvas:
     def line(self, points: Array, colour: Colour, *, px: int = 1, closed: bool = False) -> None:
         """Draw a polyline through points ``(n, 2)``."""
         if len(points):
-            cv2.polylines(
-                self.image, [self.view.pixels(points)], closed, colour, px, cv2.LINE_AA, shift=_SHIFT
-            )
+            cv2.polylines(self.image, [self.view.pixels(points)], closed, colour, px, cv2.LINE_AA, shift=_SHIFT)
 
-    def dot(self, point: Array, colour: Colour, *, px: float) -> None:
-        """Draw a disc of a radius in pixels."""
-        centre = self.view.pixels(point)[0]
-        cv2.circle(
-            self.image, centre.tolist(), round(px * (1 << _SHIFT)), colour, cv2.FILLED, cv2.LINE_AA, _SHIFT
-        )
+    def segments(self, ends: Array, colour: Colour, *, px: int = 1) -> None:
+        """Draw many segments ``(n, 4)``: x1, y1, x2, y2."""
+        pairs = list(self.view.pixels(ends.reshape(-1, 2)).reshape(-1, 2, 2))
+        cv2.polylines(self.image, pairs, False, colour, px, cv2.LINE_AA, shift=_SHIFT)
+
+    def dots(self, points: Array, colour: Colour, *, px: float) -> None:
+        """Draw a disc of a radius in pixels at each point ``(n, 2)``."""
+        radius = round(px * (1 << _SHIFT))
+        for centre in self.view.pixels(points).tolist():
+            cv2.circle(self.image, centre, radius, colour, cv2.FILLED, cv2.LINE_AA, _SHIFT)
+
+    def squares(self, points: Array, colour: Colour, *, px: int) -> None:
+        """Set a square of pixels at each of many points ``(n, 2)``: quick, and not antialiased."""
+        # The square's middle, from its first pixel.
+        centre = self.view.pixels(points) / (1 << _SHIFT) - 0.5 * (px - 1)
+        col, row = np.round(centre).astype(np.int64).T
+        height, width = self.image.shape[:2]
+        inside = (col >= 0) & (row >= 0) & (col <= width - px) & (row <= height - px)
+        for i in range(px):
+            for j in range(px):
+                self.image[row[inside] + i, col[inside] + j] = colour
 
     def bands(self, segments: Array, colour: Colour, width_m: float) -> None:
         """Draw segments ``(n, 4)`` this wide to either side and beyond either end: corners come out square."""
@@ -175,9 +188,7 @@ def put_text(
     if font is None:
         width = 2 if bold else 1
         plain = text.replace("·", "-").replace("σ", "sigma").replace("²", "2")
-        cv2.putText(
-            image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), colour, width, cv2.LINE_AA
-        )
+        cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), colour, width, cv2.LINE_AA)
     else:
         cv2.putText(image, text, at, colour, font, round(size), 700 if bold else 400)
 

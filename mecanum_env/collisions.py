@@ -27,6 +27,8 @@ _FRICTION = 0.5  # of robot and of surfaces each; pymunk multiplies the two
 _ELASTICITY = 0.2  # likewise
 _SLOP_M = 0.002  # pymunk lets shapes overlap by this much; its default of 0.1 is 10 cm here
 _OVERLAP_KEPT = 0.3  # share of a deeper overlap that is left after 20 ms
+_SNAP_M = 2.0**-20  # about a micrometre; see build_space
+_STEEPEST = 2.0  # tangent of the angle, 63°, from the wall's normal beyond which a contact at a seam is dropped
 
 
 class Contacts:
@@ -80,7 +82,10 @@ def build_space(plan: FloorPlan, contacts: Contacts) -> pymunk.Space:
     space.collision_bias = _OVERLAP_KEPT ** (1.0 / 0.02)
     static = space.static_body
     shapes: list[pymunk.Shape] = []
-    for (x1, y1, x2, y2), neighbours in zip(plan.walls.tolist(), _wall_neighbours(plan), strict=True):
+    # To drop a contact at a seam, pymunk compares the contact's point with the wall's end for equality, after an
+    # interpolation that returns the end exactly only if its coordinates have few binary digits.
+    walls = np.round(np.asarray(plan.walls, dtype=np.float64).reshape(-1, 4) / _SNAP_M) * _SNAP_M
+    for (x1, y1, x2, y2), neighbours in zip(walls.tolist(), _wall_neighbours(plan, walls), strict=True):
         segment = pymunk.Segment(static, (x1, y1), (x2, y2), 0.0)
         if neighbours:
             segment.set_neighbors(*neighbours)
@@ -94,14 +99,15 @@ def build_space(plan: FloorPlan, contacts: Contacts) -> pymunk.Space:
     return space
 
 
-def _wall_neighbours(plan: FloorPlan) -> list[tuple[tuple[float, float], tuple[float, float]] | None]:
+def _wall_neighbours(
+    plan: FloorPlan, walls: Array
+) -> list[tuple[tuple[float, float], tuple[float, float]] | None]:
     """Return for each wall the points that tell pymunk where the surface goes on beyond its ends.
 
     Without them a robot that slides along a wall of several pieces catches on each seam. pymunk drops a contact
     at an end whose normal points to the neighbour's side. The neighbour's direction is tilted into the solid where
-    need be, so that only normals within 45° of the wall's own line are dropped; so the free side must be known.
+    need be, so that only normals nearly along the wall are dropped; so the free side must be known.
     """
-    walls = np.asarray(plan.walls, dtype=np.float64).reshape(-1, 4)
     ends = walls.reshape(-1, 2, 2)
     along = ends[:, 1] - ends[:, 0]
     along /= np.maximum(np.hypot(along[:, 0], along[:, 1])[:, None], 1e-12)
@@ -120,7 +126,7 @@ def _wall_neighbours(plan: FloorPlan) -> list[tuple[tuple[float, float], tuple[f
             if directions:
                 direction = max(directions, key=lambda d: float(d @ outward))
                 normal = side[i] * left[i]
-                points[end] += direction - max(float(direction @ normal) + 1.0, 0.0) * normal
+                points[end] += direction - max(float(direction @ normal) + _STEEPEST, 0.0) * normal
         known = side[i] != 0.0
         result.append(((points[0, 0], points[0, 1]), (points[1, 0], points[1, 1])) if known else None)
     return result
@@ -131,6 +137,7 @@ def _point_key(point: Array) -> tuple[int, int]:
 
 
 def add_robot(space: pymunk.Space, robot: RobotConfig) -> pymunk.Body:
+    """Add the robot's body, a box with its centre of mass in the middle, at the origin; return it."""
     body = pymunk.Body(robot.mass_kg, robot.inertia_kg_m2)
     shape = pymunk.Poly.create_box(body, (robot.length_m, robot.width_m))
     shape.friction, shape.elasticity, shape.collision_type = _FRICTION, _ELASTICITY, _ROBOT

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.rooms.floor_plan import FloorPlan
-from slam.geometry import compose, inverse, transform_points
+from slam.geometry import compose, inverse, transform_points, wrap_scalar
 from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.types import Scan
 
@@ -51,6 +51,8 @@ class GroundTruth:
     ) -> None:
         self.plan = plan
         self.start = np.asarray(start, dtype=np.float64)
+        self._start = self.start.tolist()
+        self._cos, self._sin = math.cos(self._start[2]), math.sin(self._start[2])
         self.resolution = resolution
         seen = self._view_from_everywhere(robot, lidar)
         self.lattice_origin = seen.lattice_origin
@@ -69,7 +71,12 @@ class GroundTruth:
 
     def in_start_frame(self, pose_world: Array) -> Array:
         """Return a world pose ``(3,)`` in the start frame."""
-        return compose(inverse(self.start), pose_world)
+        x, y, theta = pose_world.tolist()
+        x0, y0, theta0 = self._start
+        dx, dy = x - x0, y - y0
+        return np.array(
+            [self._cos * dx + self._sin * dy, -self._sin * dx + self._cos * dy, wrap_scalar(theta - theta0)]
+        )
 
     def _view_from_everywhere(self, robot: RobotConfig, lidar: LidarConfig) -> OccupancyGrid:
         """Map the plan without noise from all over the places that the robot's body can reach."""

@@ -137,33 +137,40 @@ def _fill_local(
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
     c, s = math.cos(theta) * step, math.sin(theta) * step
-    x0, y0 = x / resolution - col0, y / resolution - row0
-    half = 0.5 * size
     rows, cols = log_odds.shape
     probability, observed, trail = out[0], out[1], out[2]
+    # Positions in cells as fixed-point numbers: sixteen bits of fraction, so that a shift is the floor.
+    one = 65536.0
+    half = 0.5 * size - 0.5
+    col_left, row_left = np.int64(s * one), np.int64(-c * one)  # one pixel to the right
+    dcol_a, dcol_b = np.int64(0.25 * (c - s) * one), np.int64(0.25 * (c + s) * one)
+    drow_a, drow_b = np.int64(0.25 * (s + c) * one), np.int64(0.25 * (s - c) * one)
     for i in range(size):
-        ahead = half - i - 0.5
+        ahead = half - i
+        col = np.int64((x / resolution - col0 + c * ahead - s * half) * one)
+        row = np.int64((y / resolution - row0 + s * ahead + c * half) * one)
         for j in range(size):
-            left = half - j - 0.5
-            px = x0 + c * ahead - s * left
-            py = y0 + s * ahead + c * left
-            best = -128
-            seen = 0
-            been = 0
-            for q in range(4):
-                da = 0.25 if q & 1 else -0.25
-                dl = 0.25 if q & 2 else -0.25
-                col = math.floor(px + c * da - s * dl)
-                row = math.floor(py + s * da + c * dl)
-                if 0 <= row < rows and 0 <= col < cols:
-                    v = log_odds[row, col]
-                    if v != 0:
-                        seen = 255
-                        best = max(best, v)
-                    been |= visited[row, col]
-            probability[i, j] = PROBABILITY_BYTE[best & 255] if seen else UNKNOWN_BYTE
-            observed[i, j] = seen
-            trail[i, j] = 255 * been
+            c0, c1, c2, c3 = (col + dcol_a) >> 16, (col + dcol_b) >> 16, (col - dcol_a) >> 16, (col - dcol_b) >> 16
+            r0, r1, r2, r3 = (row + drow_a) >> 16, (row + drow_b) >> 16, (row - drow_a) >> 16, (row - drow_b) >> 16
+            col += col_left
+            row += row_left
+            if min(min(c0, c1), min(c2, c3)) < 0 or min(min(r0, r1), min(r2, r3)) < 0 or (
+                max(max(c0, c1), max(c2, c3)) >= cols or max(max(r0, r1), max(r2, r3)) >= rows
+            ):  # fmt: skip
+                probability[i, j] = UNKNOWN_BYTE
+                observed[i, j] = trail[i, j] = 0
+                continue
+            # Zero means never observed: below every observed value, so that it loses against each.
+            v0, v1, v2, v3 = log_odds[r0, c0], log_odds[r1, c1], log_odds[r2, c2], log_odds[r3, c3]
+            if (v0 | v1 | v2 | v3) == 0:
+                probability[i, j] = UNKNOWN_BYTE
+                observed[i, j] = trail[i, j] = 0
+                continue
+            v0, v1 = v0 if v0 != 0 else -128, v1 if v1 != 0 else -128
+            v2, v3 = v2 if v2 != 0 else -128, v3 if v3 != 0 else -128
+            probability[i, j] = PROBABILITY_BYTE[max(max(v0, v1), max(v2, v3)) & 255]
+            observed[i, j] = 255
+            trail[i, j] = 255 * (visited[r0, c0] | visited[r1, c1] | visited[r2, c2] | visited[r3, c3])
 
 
 @njit(cache=True, nogil=True)

@@ -207,7 +207,7 @@ def wheel_dynamics(
 ) -> None:
     """Integrate wheels, motors, traction and body velocity over ``dt``; theory.md, "The robot itself".
 
-    Each substep splits into drift, motors and traction. Traction is semi-implicit: with k_i = μ N/√(s_i² + s₀²)
+    Each substep splits into motors, traction and drift. Traction is semi-implicit: with k_i = μ N/√(s_i² + s₀²)
     frozen at the slip s_i at its start, the forces −k_i s_i are taken at its end, which costs a 3 × 3 solve
     and makes the substep dissipative whatever its length (the wheels and the body form M q' = −AᵀKA q with K
     positive semidefinite). Explicit integration would need rates of over 1000/s resolved.
@@ -247,21 +247,9 @@ def wheel_dynamics(
     sum0, sum1, sum2, sum3 = 0.0, 0.0, 0.0, 0.0
     x, y, angle = 0.0, 0.0, 0.0
     c, s = math.cos(state[2]), math.sin(state[2])
-    half_h = 0.5 * h / lever
+    quarter_h = 0.25 * h / lever
     for _ in range(substeps):
-        # Drift: constant world velocity, hence body axes that turn under it. The heading's cosine and sine
-        # advance by a Cayley rotation, which keeps their norm and gets the angle right to O(h⁵).
-        half = half_h * vl
-        angle += 2.0 * half
-        half *= 1.0 + half * half / 3.0
-        norm = 1.0 / (1.0 + half * half)
-        turn_c, turn_s = (1.0 - half * half) * norm, 2.0 * half * norm
-        new_c, new_s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
-        mid_c, mid_s = 0.5 * (c + new_c), 0.5 * (s + new_s)
-        x += h * (mid_c * vx - mid_s * vy)
-        y += h * (mid_s * vx + mid_c * vy)
-        c, s = new_c, new_s
-        vx, vy = turn_c * vx + turn_s * vy, turn_c * vy - turn_s * vx
+        old_vx, old_vy, old_vl = vx, vy, vl
         sum0, sum1, sum2, sum3 = sum0 + w0, sum1 + w1, sum2 + w2, sum3 + w3
 
         # Motors.
@@ -295,9 +283,24 @@ def wheel_dynamics(
         w2 += g2 * arm2 * (q2 + dvx + dvy - dvl)
         w3 += g3 * arm3 * (q3 + dvx - dvy + dvl)
         vx, vy, vl = vx + dvx, vy + dvy, vl + dvl
+        sum0, sum1, sum2, sum3 = sum0 + w0, sum1 + w1, sum2 + w2, sum3 + w3
+
+        # Drift at the mean of the old and the new velocity; then the body's axes turn under the velocity. The
+        # heading's cosine and sine advance by a Cayley rotation: norm kept, angle right to O(h⁵).
+        mean_vx, mean_vy = 0.5 * (old_vx + vx), 0.5 * (old_vy + vy)
+        x += h * (c * mean_vx - s * mean_vy)
+        y += h * (s * mean_vx + c * mean_vy)
+        half = quarter_h * (old_vl + vl)
+        angle += 2.0 * half
+        half *= 1.0 + half * half / 3.0
+        norm = 1.0 / (1.0 + half * half)
+        turn_c, turn_s = (1.0 - half * half) * norm, 2.0 * half * norm
+        c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
+        vx, vy = turn_c * vx + turn_s * vy, turn_c * vy - turn_s * vx
     state[3], state[4], state[5] = vx, vy, vl / lever
     state[6], state[7], state[8], state[9] = w0, w1, w2, w3
     state[10], state[11], state[12], state[13] = ref0, ref1, ref2, ref3
-    state[14], state[15] = state[14] + h * sum0, state[15] + h * sum1
-    state[16], state[17] = state[16] + h * sum2, state[17] + h * sum3
+    half = 0.5 * h
+    state[14], state[15] = state[14] + half * sum0, state[15] + half * sum1
+    state[16], state[17] = state[16] + half * sum2, state[17] + half * sum3
     motion[0], motion[1], motion[2] = x, y, angle

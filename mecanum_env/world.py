@@ -287,8 +287,7 @@ class World:
         # length to the last one's, and a wall struck in a short step throws the robot back in a long one.
         parts = max(1, math.ceil(self._fastest * dt / MAX_TRAVEL_M))
         dx, dy, turn = motion.tolist()
-        vx0, vy0 = dx / dt, dy / dt
-        body.velocity = vx0, vy0
+        body.velocity = dx / dt, dy / dt
         body.angular_velocity = turn / dt
         for _ in range(parts):
             self._space.step(dt / parts)
@@ -302,8 +301,9 @@ class World:
             # The contact has the last word on the velocity; elsewhere it is the kernel's, at the step's end.
             vx, vy = body.velocity
             c, s = math.cos(angle), math.sin(angle)
-            state[3], state[4], state[5] = c * vx + s * vy, c * vy - s * vx, body.angular_velocity
-            impulse = self.robot.mass_kg * math.hypot(vx - vx0, vy - vy0)
+            ahead, aside = c * vx + s * vy, c * vy - s * vx
+            impulse = self.robot.mass_kg * math.hypot(ahead - state[3], aside - state[4])
+            state[3], state[4], state[5] = ahead, aside, body.angular_velocity
         contacts.close_step(dt, impulse)
 
     def _place_body(self) -> None:

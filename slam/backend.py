@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.features import FeatureConfig, FeatureExtractor
-from slam.geometry import compose
 from slam.key_scans import KeyScanConfig, KeyScans
 from slam.motion import OdometryNoise
 from slam.occupancy import OccupancyGrid
@@ -126,12 +125,23 @@ class Backend(abc.ABC):
 
     def sensor_pose(self) -> Array:
         """Return where the sensor is believed to be ``(3,)``."""
-        return compose(self.pose, np.array([self.config.lidar_offset_m, 0.0, 0.0]))
+        x, y, theta = self.pose.tolist()
+        offset = self.config.lidar_offset_m
+        return np.array([x + offset * math.cos(theta), y + offset * math.sin(theta), theta])
 
-    def _draw(self, scan: Scan, ids: NDArray[np.int64], points: Array) -> None:
-        """Draw a scan from the believed pose; ``ids`` and ``points`` are the landmarks seen with it."""
-        pose = self.pose
+    def _draw(self, scan: Scan) -> None:
+        """Draw a scan from the believed pose, and keep it where the sensor has moved on."""
         sensor = self.sensor_pose()
+        x, y, theta = sensor.tolist()
         self.grid.integrate(sensor, scan, self.extractor.surface)
-        self.grid.mark_visited(float(pose[0]), float(pose[1]), self.config.body_radius_m)
-        self.key_scans.offer(sensor, scan, self.extractor.surface, ids, points)
+        offset = self.config.lidar_offset_m
+        self.grid.mark_visited(
+            x - offset * math.cos(theta), y - offset * math.sin(theta), self.config.body_radius_m
+        )
+        if self.key_scans.wants(x, y, theta):
+            ids, points = self._landmarks_in_view()
+            self.key_scans.keep(sensor, scan, self.extractor.surface, ids, points)
+
+    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
+        """Return ids ``(k,)`` and estimates ``(k, 2)`` of the landmarks that the last scan showed."""
+        return np.zeros(0, np.int64), np.zeros((0, 2))

@@ -63,6 +63,7 @@ class EkfSlam(Backend):
         self._h = np.zeros((_MAX_OBSERVATIONS, 2, 5))
         self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(_MAX_OBSERVATIONS)
+        self._last_match = self._match[:0]
         self.nis = 0.0
         self.nis_dof = 0
 
@@ -80,8 +81,8 @@ class EkfSlam(Backend):
         match = self._associate(z)
         self._correct(z, match)
         self._manage(z, match, scan)
-        ids, points = self._seen(match)
-        self._draw(scan, ids, points)
+        self._last_match = match
+        self._draw(scan)
         self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
 
     def observe(self, observations: Observations) -> None:
@@ -155,7 +156,8 @@ class EkfSlam(Backend):
         self._x, self._p = x, p
         self._w = np.zeros((2 * _MAX_OBSERVATIONS, size))
 
-    def _seen(self, match: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
+    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
+        match = self._last_match
         rows = match[match >= 0]
         rows = rows[rows < self._book.count]  # one may just have been dropped
         return self._book.ids[rows], self._points[rows]
@@ -174,8 +176,9 @@ class EkfSlam(Backend):
     @property
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
-        upper = self._p[:3, :3]
-        return upper + np.triu(upper, 1).T
+        out = np.empty((3, 3))
+        _symmetric(self._p, out)
+        return out
 
     @property
     def joint_cov(self) -> Array:
@@ -369,6 +372,14 @@ def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
     p[n, n] = p[0, n] - ry * p[2, n] + r00
     p[n, n + 1] = p[0, n + 1] - ry * p[2, n + 1] + r01
     p[n + 1, n + 1] = p[1, n + 1] + rx * p[2, n + 1] + r11
+
+
+@njit(cache=True, nogil=True)
+def _symmetric(p: Array, out: Array) -> None:
+    """Write the leading block of an upper triangle as the full symmetric matrix."""
+    for i in range(out.shape[0]):
+        for j in range(i, out.shape[0]):
+            out[i, j] = out[j, i] = p[i, j]
 
 
 @njit(cache=True, nogil=True)

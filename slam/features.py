@@ -1,8 +1,9 @@
 """Scan → straight surfaces and the corners where they meet, each with a covariance from its fit.
 
 Split and merge (iterative end-point fit) over the scan's points in order of bearing; every piece is fitted by
-total least squares. A corner is where two fitted surfaces meet *and the scan runs through without a break*:
-the rim of an occlusion is no landmark, since it moves with the robot.
+total least squares. A corner is where two fitted surfaces meet and the scan runs
+through without a break, or where one ends in front of something farther away. The rim of a shadow is neither:
+it moves with the robot.
 """
 
 from __future__ import annotations
@@ -36,6 +37,9 @@ class FeatureConfig:
     grazing_deg: float = 8.0  # flattest incidence at which neighbouring points still belong together
     min_angle_deg: float = 55.0  # between the surfaces of a corner; pieces of a round column meet at less
     max_gap_m: float = 0.12  # from the corner to the nearest point of either surface
+    edge_length_m: float = 0.35  # of a surface whose visible end is taken for a corner
+    edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
+    edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
     sigma_floor_m: float = 0.002  # of a corner, along each axis: what the model of straight walls leaves out
 
     def __post_init__(self) -> None:
@@ -78,14 +82,14 @@ class FeatureExtractor:
         self._angles = np.zeros(0)
         self._scan_of: tuple[int, float, float] = (0, 0.0, 0.0)
         self._lines = np.zeros((_MAX_LINES, 14))
-        self._corners = np.zeros((_MAX_LINES, 8))
+        self._corners = np.zeros((3 * _MAX_LINES, 8))
         self._line_count = 0
         self._corner_count = 0
         c = self.config
         self._limits = np.array([
             c.range_sigma_m, c.split_sigmas, c.split_floor_m, c.min_points, c.min_length_m,
             math.radians(c.grazing_deg), math.sin(math.radians(c.min_angle_deg)), c.max_gap_m,
-            c.sigma_floor_m,
+            c.sigma_floor_m, c.edge_length_m, c.edge_jump_m, c.edge_spacing_m,
         ])  # fmt: skip
 
     def extract(self, scan: Scan) -> NDArray[np.float64]:
@@ -106,7 +110,7 @@ class FeatureExtractor:
             self.surface = np.zeros(n, np.int16)
             self._scan_of = key
         self._line_count, self._corner_count = _extract(
-            scan.ranges, self._angles, scan.angle_increment, scan.range_min, self._limits, self._xy, self._beam,
+            scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits, self._xy, self._beam,
             self._stack, self._pieces, self.surface, self._lines, self._corners,
         )  # fmt: skip
         return self._corners[: self._corner_count]
@@ -137,7 +141,7 @@ class FeatureExtractor:
 
 @njit(cache=True, nogil=True)
 def _extract(
-    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, xy: Array,
+    ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array, xy: Array,
     beam: NDArray[np.int64], stack: NDArray[np.int64], pieces: NDArray[np.int64], surface: NDArray[np.int16],
     lines: Array, corners: Array,
 ) -> tuple[int, int]:  # fmt: skip
@@ -154,13 +158,26 @@ def _extract(
             last_line = -1
         if line_count == _MAX_LINES or not _fit(xy, first, last, limits, lines[line_count]):
             continue
+        line = lines[line_count]
+        line[11], line[12] = beam[first], beam[last]
+        line[13] = 0.0
         for i in range(first, last + 1):
             surface[beam[i]] = line_count
         # Noise near a corner may leave a sliver between its two surfaces; its points must lie on either.
-        if last_line >= 0 and _all_on(xy, last_end, first, lines[last_line], lines[line_count], limits):
-            corner_count += _meet(lines[last_line], lines[line_count], increment, limits, corners[corner_count])
+        if last_line >= 0 and _all_on(xy, last_end, first, lines[last_line], line, limits):
+            met = _meet(lines[last_line], line, increment, limits, corners[corner_count])
+            corner_count += met
+            lines[last_line, 13] += 2.0 * met
+            line[13] += met
         last_line, last_end = line_count, last
         line_count += 1
+    for k in range(line_count):
+        for side in range(2):
+            # Bit 0 or 1 of column 13: this end already makes a corner with the neighbouring surface.
+            if int(lines[k, 13]) & (1 << side) == 0:
+                corner_count += _edge(
+                    lines[k], side, ranges, rays, increment, range_max, limits, corners[corner_count]
+                )
     return line_count, corner_count
 
 
@@ -282,7 +299,8 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     """Fit a line to a piece by total least squares; tell whether it is a surface.
 
     ``line``: normal (2), distance r, centroid (2), then the variance of the offset at the centroid, of the
-    slope, and their covariance, the extent along the line from the centroid (2), and the number of points.
+    slope, and their covariance, the extent along the line from the centroid (2), the number of points; then
+    (by the caller) the first and last beam, and which ends make a corner.
     """
     # The end points are shared with what comes before and after, and may lie on that: the fit leaves them out.
     a, b = first + 1, last - 1
@@ -405,12 +423,6 @@ def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array
     cxx = a * a * v1 + b * b * v2 + floor
     cxy = a * c * v1 + b * d * v2
     cyy = c * c * v1 + d * d * v2 + floor
-    ux, uy = x / rho, y / rho
-    # To polar: rows (ux, uy) and (-uy, ux)/ρ.
-    corner[0], corner[1] = rho, math.atan2(y, x)
-    corner[2] = ux * ux * cxx + 2.0 * ux * uy * cxy + uy * uy * cyy
-    corner[3] = (-ux * uy * cxx + (ux * ux - uy * uy) * cxy + ux * uy * cyy) / rho
-    corner[4] = (uy * uy * cxx - 2.0 * ux * uy * cxy + ux * ux * cyy) / (rho * rho)
     # Unit vectors from the corner along both surfaces.
     f = math.copysign(1.0, -s1)
     g = math.copysign(1.0, -s2)
@@ -419,8 +431,74 @@ def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array
     # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
     # one that stands out into it.
     left = (-ax) * by - (-ay) * bx > 0.0
-    corner[5] = CONCAVE if left else CONVEX
     sign = 1.0 if left else -1.0
-    corner[6] = math.atan2(sign * (ay + by), sign * (ax + bx))
-    corner[7] = 0.0
+    direction = math.atan2(sign * (ay + by), sign * (ax + bx))
+    _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, corner)
+    return 1
+
+
+@njit(cache=True, nogil=True)
+def _to_polar(
+    x: float, y: float, cxx: float, cxy: float, cyy: float, kind: int, direction: float, corner: Array
+) -> None:
+    """Write a point and its covariance as range and bearing."""
+    rho = math.sqrt(x * x + y * y)
+    ux, uy = x / rho, y / rho
+    # The Jacobian's rows are (ux, uy) and (-uy, ux)/ρ.
+    corner[0], corner[1] = rho, math.atan2(y, x)
+    corner[2] = ux * ux * cxx + 2.0 * ux * uy * cxy + uy * uy * cyy
+    corner[3] = (-ux * uy * cxx + (ux * ux - uy * uy) * cxy + ux * uy * cyy) / rho
+    corner[4] = (uy * uy * cxx - 2.0 * ux * uy * cxy + ux * ux * cyy) / (rho * rho)
+    corner[5], corner[6], corner[7] = kind, direction, 0.0
+
+
+@njit(cache=True, nogil=True)
+def _edge(
+    line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
+    corner: Array,
+) -> int:  # fmt: skip
+    """Write the corner at which a surface ends in front of something farther away; return 1 if there is one.
+
+    Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
+    beams, uniformly. Its other face is hidden; it is taken to recede at a right angle. (Where the next beam
+    stops short, something nearer hides the surface: the rim of a shadow, no landmark.)
+    """
+    if line[9] - line[8] < limits[9]:
+        return 0
+    n = ranges.shape[0]
+    step = 1 if side == 1 else -1
+    index = int(line[12]) if side == 1 else int(line[11])
+    full = n * increment > 2.0 * math.pi - 1.5 * increment
+    for _ in range(3):  # past lost beams
+        index += step
+        if index < 0 or index >= n:
+            if not full:
+                return 0
+            index %= n
+        if not math.isnan(ranges[index]):
+            break
+    if math.isnan(ranges[index]):
+        return 0
+    across = line[0] * rays[index, 0] + line[1] * rays[index, 1]
+    if across < 0.05:
+        return 0
+    missed = line[2] / across  # range at which the beam would have met the line
+    if missed > range_max - 0.1 or ranges[index] < missed + limits[10]:
+        return 0
+    t = -line[1] * (missed * rays[index, 0] - line[3]) + line[0] * (missed * rays[index, 1] - line[4])
+    end = line[9] if side == 1 else line[8]
+    spacing = abs(t - end)
+    if spacing > limits[11] or (t - end) * step < 0.0:
+        return 0
+    s = 0.5 * (t + end)
+    x, y = line[3] - line[1] * s, line[4] + line[0] * s
+    # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
+    along = 0.2 * spacing * spacing + limits[8] ** 2
+    off = line[5] + 2.0 * s * line[7] + s * s * line[6] + limits[8] ** 2
+    nx, ny, ax, ay = line[0], line[1], -line[1], line[0]
+    direction = math.atan2(step * ay - ny, step * ax - nx)
+    _to_polar(
+        x, y, along * ax * ax + off * nx * nx, along * ax * ay + off * nx * ny, along * ay * ay + off * ny * ny,
+        CONVEX, direction, corner,
+    )  # fmt: skip
     return 1

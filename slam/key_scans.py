@@ -55,26 +55,22 @@ class KeyScans:
         """Sensor poses ``(n, 3)`` of the key scans as they were last drawn."""
         return self._poses[: len(self._scans)].copy()
 
-    def offer(
-        self,
-        sensor_pose: Array,
-        scan: Scan,
-        surface: NDArray[np.int16],
-        ids: NDArray[np.int64],
-        points: Array,
-    ) -> None:
-        """Keep a scan if the sensor has moved on since the last one kept.
-
-        ``ids`` and ``points`` ``(k, 2)`` are the landmarks seen with it and their estimates at that moment.
-        """
+    def wants(self, x: float, y: float, theta: float) -> bool:
+        """Tell whether a scan from this sensor pose should be kept: it has moved on since the last one."""
         n = len(self._scans)
-        if n:
-            moved = sensor_pose - self._poses[n - 1]
-            if (
-                math.hypot(moved[0], moved[1]) < self.config.spacing_m
-                and abs(wrap_scalar(moved[2])) < self.config.spacing_rad
-            ):
-                return
+        if n == 0:
+            return True
+        last = self._poses[n - 1]
+        return bool(
+            math.hypot(x - last[0], y - last[1]) >= self.config.spacing_m
+            or abs(wrap_scalar(theta - last[2])) >= self.config.spacing_rad
+        )
+
+    def keep(
+        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], points: Array
+    ) -> None:
+        """Keep a scan; ``ids`` and ``points`` ``(k, 2)`` are the landmarks seen with it, as estimated then."""
+        n = len(self._scans)
         if n == len(self._poses):
             self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
             self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
@@ -146,8 +142,8 @@ def _corrected_poses(
                 cos_sum += px * qx + py * qy
                 sin_sum += px * qy - py * qx
                 spread += px * px + py * py
-            # Landmarks closer together than a metre say too little about the heading.
-            if spread > 0.5:
+            # Landmarks closer together than some two metres say too little about the heading.
+            if spread > 2.0:
                 theta = math.atan2(sin_sum, cos_sum)
                 c, s = math.cos(theta), math.sin(theta)
                 dx = bx - (c * ax - s * ay) - poses[k, 0]

@@ -27,7 +27,7 @@ TRACEBACK_VARIABLE = "MECANUM_TRACEBACK"
 _LOG_EVERY_S = 30.0  # between two lines of progress where standard error is no terminal
 
 # typer brings its own copy of click, or uses click's, by version; either way this is the root of usage errors.
-_ClickException = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
+_ClickException: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -56,7 +56,7 @@ def _root(
         typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
-    """A mecanum-wheel robot explores rooms it has never seen, on its own SLAM belief.
+    """Let a mecanum-wheel robot explore rooms it has never seen, on its own SLAM belief.
 
     \b
     Examples:
@@ -67,7 +67,7 @@ def _root(
     \b
     Exit codes: 0 done, 2 bad usage or bad input, 1 anything else, 130 interrupted.
     `mecanum COMMAND --help` shows a command's options and examples.
-    """
+    """  # noqa: D301
 
 
 @app.command()
@@ -115,7 +115,7 @@ def explore(
       mecanum explore --floor-plan office.yaml --start 2.5,1.0,0 --out out/office
       mecanum explore --config out/seed3/config.toml --out out/again
       mecanum explore --rooms rectangular --noise slippery --json
-    """
+    """  # noqa: D301
     pose = _parse_start(start)
     if coverage_target is not None and not 0 < coverage_target <= 1:
         raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
@@ -152,7 +152,7 @@ def rooms(
       mecanum rooms
       mecanum rooms --kind apartment --seeds 0:9 --out out/rooms
       mecanum rooms --kind rectangular --seeds 1,4,7 --json
-    """
+    """  # noqa: D301
     from training.rooms_command import draw_rooms
 
     drawn = draw_rooms(kind=kind, seeds=seeds, out=out, robot=robot)
@@ -177,7 +177,7 @@ def speed(
     Examples:
       mecanum speed
       mecanum speed --slam odometry --beams 180 --seconds 5 --json
-    """
+    """  # noqa: D301
     if not math.isfinite(seconds):
         raise BadInput(f"--seconds must be finite, got {seconds}")
     from training.speed import run
@@ -201,7 +201,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code if isinstance(code, int) else 0
     except _ClickException as error:
         if type(error).__name__ == "NoArgsIsHelpError":
-            print(error.format_message(), file=sys.stderr)
+            print(error, file=sys.stderr)
             return 2
         return _fail(name, _usage_message(error), 2)
     except BadInput as error:
@@ -240,7 +240,7 @@ def _usage_message(error: Any) -> str:
         return f"unknown option {option}{suggestion(str(option), valid)}; valid: {', '.join(valid)}"
     message = one_line(error.format_message()).rstrip(".")
     if message.startswith("No such command"):
-        given = (message.split("'") + ["", ""])[1]
+        given = [*message.split("'"), "", ""][1]
         return f"unknown command {given!r}{suggestion(given, _commands())}; valid: {', '.join(_commands())}"
     return f"{message[:1].lower()}{message[1:]}; see --help"
 
@@ -251,9 +251,9 @@ def _parse_start(text: str | None) -> tuple[float, float, float] | None:
     try:
         x, y, theta = (float(word) for word in text.split(","))
     except ValueError:
-        raise BadInput(f"--start {text!r} is not X,Y,THETA: three numbers in m and rad, such as 2.5,1.0,0") from None
+        raise BadInput(f"--start {text!r} is not X,Y,THETA in m and rad; give for instance 2.5,1.0,0") from None
     if not all(map(math.isfinite, (x, y, theta))):
-        raise BadInput(f"--start {text!r} must be three finite numbers in m and rad, such as 2.5,1.0,0")
+        raise BadInput(f"--start {text!r} must be finite; give for instance 2.5,1.0,0")
     return x, y, theta
 
 
@@ -302,13 +302,14 @@ def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str]) -> str:
 
     where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
     verdict = "success" if metrics["success"] else "target not reached"
+    corners = shown("corner_mean_m", "cm", 1, 100.0)
     heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
     rows = (
         ("explored", f"{where} with {metrics['slam']} and {metrics['agent']}"),
         ("ended", f"{metrics['end']} after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
         ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
         ("path", f"{shown('path_length_m', 'm', 1)}, {metrics['collisions']} collisions"),
-        ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {shown('corner_mean_m', 'cm', 1, 100.0)} off on average"),
+        ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {corners} off on average"),
         ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
         ("files", f"{out}/: {', '.join(files)}"),
     )

@@ -30,7 +30,7 @@ from agents.base import Agent
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv, make_config
-from mecanum_env.render import draw_map, draw_truth, episode_view
+from mecanum_env.pictures import draw_map, draw_truth, episode_view
 from mecanum_env.rooms import FloorPlan
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map

@@ -86,10 +86,10 @@ def draw_layout(config: ApartmentConfig, rng: np.random.Generator) -> tuple[Layo
     Raises
     ------
     ValueError
-        If a hundred attempts give no flat within the limits of the config.
+        If 500 attempts give no flat within the limits of the config.
     """
     low, high = (v / 0.05**2 for v in config.area_m2)
-    for _ in range(100):
+    for _ in range(500):
         layout = _attempt(config, rng)
         if layout is not None and low <= layout.area <= high:
             return _turn(layout, rng)
@@ -115,7 +115,7 @@ def _attempt(config: ApartmentConfig, rng: np.random.Generator) -> Layout | None
     row_length = length - (end + thick if end else 0)
     row_count = count - (1 if end else 0)
     below = row_count // 2 if hall or rng.random() < 0.5 else row_count - row_count // 2
-    if below < 1 or row_count - below < 1 or not 110 <= row_length <= 340 or length > 360:
+    if below < 1 or row_count - below < 1 or not 110 <= row_length <= 480 or length > 500:
         return None
     layout = Layout()
     y0, y1 = depths[0] + thick, depths[0] + thick + corridor

@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 _TOLERANCE = 0.5 + 1e-9  # [cells]: the flat top of an arc is cut by exactly half a cell
 _PLACES = 5  # where along a jog pieces may meet; odd, so that its middle is one
-_WINDOW = 96  # jogs that one piece spans at most
+_WINDOW = 64  # jogs that one piece spans at most
 
 # Headings along the lattice: 0 east, 1 north, 2 west, 3 south, as steps in column (x) and row (y).
 _DX = np.array([1, 0, -1, 0], np.int64)
@@ -224,11 +224,15 @@ def _straighten_stair(
     cost = np.full(size * _PLACES, np.inf)
     previous = np.zeros(size * _PLACES, np.int64)
     cost[_PLACES // 2] = 0.0
+    low = 0
     for j in range(1, size):
-        for i in range(j - 1, max(-1, j - 1 - _WINDOW), -1):
-            # What cannot be spanned from a nearer station cannot from one farther off.
-            if not _relax(path, role, count, station, i, j, cost, previous):
-                break
+        low = max(low, j - _WINDOW)
+        reached = False
+        for i in range(low, j):
+            spanned = _relax(path, role, count, station, i, j, cost, previous)
+            if spanned and not reached:
+                # What cannot reach this station cannot reach the next one either.
+                low, reached = i, True
     last = (size - 1) * _PLACES + _PLACES // 2
     pieces, state = 0, last
     while state >= _PLACES:
@@ -261,7 +265,8 @@ def _relax(
         bx, by = _place(path, count, station[j], middle if j == last else q)
         for p in range(_PLACES):
             start = i * _PLACES + p
-            if cost[start] == np.inf:
+            # Not worth the measuring unless it saves a piece.
+            if cost[start] + 1.0 + 0.1 * _TOLERANCE >= cost[j * _PLACES + q]:
                 continue
             ax, ay = _place(path, count, station[i], p)
             error = _deviation(path, role, count, station[i], station[j], ax, ay, bx, by)
@@ -298,12 +303,12 @@ def _deviation(
     bx: float,
     by: float,
 ) -> float:
-    """Return the largest distance of a corner between two stations from the straight piece, 2 if far too much."""
+    """Return the largest distance of a corner between two stations from the straight piece, 2 if out of bounds."""
     ux, uy = bx - ax, by - ay
     squared = ux * ux + uy * uy
     worst = 0.0 if squared > 0.0 else 2.0
     for i in range(at + 1, end):
-        if worst > 1.0:
+        if worst > _TOLERANCE:
             return 2.0
         if role[i % count] == 0:
             px, py = path[i % count, 0] - ax, path[i % count, 1] - ay

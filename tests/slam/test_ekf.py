@@ -60,7 +60,9 @@ def test_adding_a_landmark_propagates_pose_and_noise(seed: int, landmarks: int) 
 
     def place(v: np.ndarray) -> np.ndarray:
         a, b = v[2] + v[4], OFFSET
-        return np.array([v[0] + b * math.cos(v[2]) + v[3] * math.cos(a), v[1] + b * math.sin(v[2]) + v[3] * math.sin(a)])
+        return np.array(
+            [v[0] + b * math.cos(v[2]) + v[3] * math.cos(a), v[1] + b * math.sin(v[2]) + v[3] * math.sin(a)]
+        )
 
     jacobian = numerical_jacobian(place, np.concatenate([x[:3], z[:2]]))
     gr, gz = jacobian[:, :3], jacobian[:, 3:]
@@ -225,7 +227,9 @@ def test_scans_of_a_room_give_its_corners_and_keep_the_pose() -> None:
     assert len(belief.landmarks) == 4
     assert belief.landmark_kinds.tolist() == [slam.CONCAVE] * 4
     corners = np.array([[0, 0], [6, 0], [6, 5], [0, 5]])
-    mapped = belief.landmarks @ np.array([[math.cos(0.3), math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]]) + start[:2]
+    mapped = (
+        belief.landmarks @ np.array([[math.cos(0.3), math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]]) + start[:2]
+    )
     for corner in mapped:
         assert np.min(np.hypot(*(corners - corner).T)) < 0.04
     error = compose(inverse(start), pose) - belief.pose

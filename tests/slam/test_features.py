@@ -85,11 +85,39 @@ def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None
     extractor.extract(polygon_scan(pose, [ROOM, box], np.random.default_rng(1)))
     corners = extractor.corners()
     convex = corners.range_bearing[corners.kind == CONVEX]
-    true = polar(pose, box)
-    assert len(convex) == 1  # (3.0, 2.0) faces the sensor; the two rims of the shadow are no corners
-    assert np.abs(convex[0] - true[0]).max() < 0.02
-    direction = float(wrap(corners.direction[corners.kind == CONVEX][0] + pose[2]))
+    # (3, 2) faces the sensor, and both visible faces end at a corner of the box; what the box hides of the
+    # walls ends at the rim of its shadow, which is none.
+    true = polar(pose, box[[0, 1, 3]])
+    assert len(convex) == 3
+    for z in true:
+        assert np.min(np.abs(convex - z).max(axis=1)) < 0.05
+    facing = int(np.argmin(np.abs(convex - true[0]).max(axis=1)))
+    assert np.abs(convex[facing] - true[0]).max() < 0.02
+    direction = float(wrap(corners.direction[corners.kind == CONVEX][facing] + pose[2]))
     assert abs(direction - math.atan2(-1, -1)) < 0.1
+
+
+def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from() -> None:
+    """The two ends of a free-standing wall, their bias and spread against the declared covariance."""
+    wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.3], [2.0, 3.3]])
+    rng = np.random.default_rng(0)
+    extractor = FeatureExtractor()
+    errors, nees = [], []
+    for _ in range(200):
+        pose = np.array([rng.uniform(2.2, 3.8), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
+        extractor.extract(polygon_scan(pose, [ROOM, wall], rng))
+        corners = extractor.corners()
+        for z, cov, kind in zip(corners.range_bearing, corners.cov, corners.kind, strict=True):
+            if kind != CONVEX:
+                continue
+            error = polar(pose, wall[:2]) - z
+            error[:, 1] = wrap(error[:, 1])
+            e = error[np.argmin(np.abs(error).sum(1))]
+            errors.append(e)
+            nees.append(e @ np.linalg.solve(cov, e))
+    assert len(errors) > 300
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.004
+    assert 0.7 < np.mean(nees) < 2.2
 
 
 def test_lost_beams_and_open_space_are_no_surfaces() -> None:

@@ -21,7 +21,7 @@ def drawn(shift: np.ndarray) -> tuple[OccupancyGrid, KeyScans, np.ndarray]:
         seen = compose(shift, pose)
         surface = np.full(len(scan.ranges), -1, np.int16)
         grid.integrate(seen, scan, surface)
-        keys.offer(seen, scan, surface, IDS, wrong)
+        keys.keep(seen, scan, surface, IDS, wrong)
     return grid, keys, wrong
 
 
@@ -59,8 +59,9 @@ def test_only_scans_from_new_places_are_kept() -> None:
     scan = room_scan(np.array([2.0, 2.0, 0.0]))
     surface = np.full(len(scan.ranges), -1, np.int16)
     for x, theta in ((0.0, 0.0), (0.1, 0.0), (0.21, 0.0), (0.21, 0.2), (0.21, 0.3)):
-        keys.offer(np.array([x, 0.0, theta]), scan, surface, IDS, CORNERS)
+        if keys.wants(x, 0.0, theta):
+            keys.keep(np.array([x, 0.0, theta]), scan, surface, IDS, CORNERS)
     np.testing.assert_allclose(keys.poses, [[0, 0, 0], [0.21, 0, 0], [0.21, 0, 0.3]])
     for k in range(200):
-        keys.offer(np.array([k, 1.0, 0.0]), scan, surface, IDS, CORNERS)
+        keys.keep(np.array([k, 1.0, 0.0]), scan, surface, IDS, CORNERS)
     assert len(keys) == 203

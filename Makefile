@@ -1,0 +1,72 @@
+# `make explore` runs an episode, `make test` what CI runs. Both install what they need into .venv first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OTHER_GYMNASIUM := 1.2.2
+OTHER := $(VENV)/gymnasium-$(OTHER_GYMNASIUM)
+SEED ?= 0
+OUT ?= out/explore
+WORKERS ?= 2
+API_TESTS := $(wildcard tests/mecanum_env/test_env*.py)
+
+# The libraries' own threads only get in each other's way here: tests run in processes of their own.
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+export NUMBA_NUM_THREADS ?= 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.DEFAULT_GOAL := help
+.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo speed clean
+
+help: ## show this help
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+# A stamp's file date says whether what it stands for is older than what it was made from.
+$(VENV)/core.stamp: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/test.stamp: $(VENV)/core.stamp
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train]'
+	@touch $@
+
+$(OTHER).stamp: $(VENV)/test.stamp
+	rm -rf $(OTHER)
+	$(BIN)/python -m pip install --quiet --no-deps --target $(OTHER) gymnasium==$(OTHER_GYMNASIUM)
+	@touch $@
+
+install: $(VENV)/core.stamp ## install the core into .venv
+
+explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and mapped (SEED, OUT)
+	$(BIN)/mecanum explore --agent nearest-frontier --rooms apartment --slam ekf --seed $(SEED) --out $(OUT)
+	@echo "Look at $(OUT)/map.png beside $(OUT)/truth.png; the figures are in $(OUT)/metrics.json."
+
+test: lint types pytest other-gymnasium ## everything CI checks (WORKERS)
+
+lint: $(VENV)/test.stamp ## ruff
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/test.stamp ## mypy
+	$(BIN)/mypy
+
+pytest: $(VENV)/test.stamp ## the tests
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+# The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
+other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
+	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
+		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
+	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) $(API_TESTS)
+
+monte-carlo: $(VENV)/test.stamp ## the long statistical runs
+	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo
+
+speed: $(VENV)/core.stamp ## steps per second, and where the time goes
+	$(BIN)/mecanum speed
+
+clean: ## remove .venv, results and caches
+	rm -rf $(VENV) out build .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find slam mecanum_env agents training tests -name __pycache__ -type d -prune -exec rm -rf {} +

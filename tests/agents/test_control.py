@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agents.control import ControlConfig, PathFollower
+from agents.planning import resample
+from agents.safety import body_gaps, footprint, local_map, scan_points
+from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
+from slam import geometry
+from tests.agents.grids import belief_of, body_gap, drive, fill, room, two_rooms
+
+ROBOT, LIDAR = RobotConfig(), LidarConfig()
+CORNERS = 0.5 * np.array([[0.58, 0.38], [-0.58, 0.38], [-0.58, -0.38], [0.58, -0.38]])
+
+
+def follower(config: ControlConfig | None = None, lidar: LidarConfig = LIDAR) -> PathFollower:
+    return PathFollower(config or ControlConfig(), robot=ROBOT, lidar=lidar, step_s=0.1)
+
+
+def follow(classes, pose, path, *, heading=None, steps=300, observation=None):
+    """Drive a kinematic robot along a path; return its poses and the twists."""
+    pose = np.array(pose, dtype=np.float64)
+    control = follower()
+    control.set_path(resample(np.array(path, dtype=np.float64), 0.1), heading)
+    limits = np.array([0.8, 0.8, 1.5])
+    poses, twists = [pose], []
+    for _ in range(steps):
+        twist = control.follow(observation, belief_of(classes, tuple(pose)))
+        twists.append(twist)
+        pose = drive(pose, twist / limits, ROBOT)
+        poses.append(pose)
+        if control.arrived:
+            break
+    return np.array(poses), np.array(twists), control
+
+
+def test_converges_within_the_limits():
+    path = [(1.5, 1.5), (4.0, 1.5), (4.0, 4.5)]
+    poses, twists, control = follow(room(6.0, 6.0), (1.5, 1.5, math.pi), path)
+    assert control.arrived
+    assert np.hypot(*(poses[-1, :2] - path[-1])) < 0.15
+    # It keeps to the path: never farther from it than the corner's cut.
+    dense = resample(np.array(path), 0.02)
+    off = [np.hypot(*(dense - p[:2]).T).min() for p in poses]
+    assert max(off) < 0.2
+    demand = np.abs(twists) @ np.array([1.0, 1.0, ROBOT.lever_m])
+    assert demand.max() <= ROBOT.max_speed_m_s + 1e-9
+    velocity = np.array([geometry.rotation(p[2]) @ t[:2] for p, t in zip(poses, twists, strict=False)])
+    change = np.hypot(*np.diff(velocity[:-2], axis=0).T) / 0.1
+    assert change.max() <= 1.5 + 0.1
+    # It moves fast where there is room: 5.5 m within what a trapezoid of speed and the corner take.
+    assert len(twists) < 150
+    # And with its long side along the way, however it stood at first.
+    assert abs(geometry.wrap(poses[-1, 2] - 0.5 * math.pi)) < 0.3
+
+
+def test_ends_with_the_heading_asked_for():
+    poses, _, control = follow(room(6.0, 6.0), (1.5, 1.5, 0.0), [(1.5, 1.5), (3.0, 1.5)], heading=2.5)
+    assert control.arrived
+    assert abs(geometry.wrap(poses[-1, 2] - 2.5)) <= 0.2
+
+
+@pytest.mark.parametrize(("door_m", "start"), [(0.9, 0.0), (0.7, 1.4), (0.7, -2.5)])
+def test_passes_a_door_without_touching(door_m, start):
+    classes = two_rooms(door_m)
+    poses, _, control = follow(classes, (1.2, 2.0, start), [(1.2, 2.0), (6.0, 2.0)], steps=500)
+    assert control.arrived
+    assert min(body_gap(classes, p, ROBOT) for p in poses) > 0.02
+
+
+def test_never_drives_into_a_wall_it_is_led_into():
+    classes = room(6.0, 6.0)
+    fill(classes, 3.0, 0.0, 3.2, 6.0)
+    poses, _, control = follow(classes, (1.5, 3.0, 0.3), [(1.5, 3.0), (5.0, 3.0)], steps=150)
+    assert not control.arrived
+    assert min(body_gap(classes, p, ROBOT) for p in poses) > 0.02
+
+
+def test_brakes_for_what_only_the_scan_shows():
+    classes, control, pose = room(8.0, 6.0), follower(), np.array([1.5, 3.0, 0.0])
+    control.set_path(resample(np.array([(1.5, 3.0), (6.5, 3.0)]), 0.1), None)
+    angles = LIDAR.angle_min + LIDAR.angle_increment * np.arange(LIDAR.beams)
+    for _ in range(100):
+        sensor = pose[0] + LIDAR.offset_m
+        with np.errstate(divide="ignore"):
+            ranges = np.where(np.cos(angles) > 1e-3, (4.0 - sensor) / np.cos(angles), np.inf)
+        hit = np.abs(ranges * np.sin(angles)) < 0.5  # a board 1 m wide at x = 4 m, across the way
+        scan = np.where(hit, np.minimum(ranges / LIDAR.range_max_m, 1.0), 1.0).astype(np.float32)
+        twist = control.follow({"scan": scan}, belief_of(classes, tuple(pose)))
+        pose = drive(pose, twist / np.array([0.8, 0.8, 1.5]), ROBOT)
+        if abs(pose[1] - 3.0) < 0.5:
+            assert geometry.transform_points(pose, CORNERS)[:, 0].max() < 4.0
+    assert pose[0] > 3.0
+
+
+def test_gaps_against_brute_force():
+    classes = room(4.0, 4.0)
+    fill(classes, 2.5, 1.9, 2.6, 2.1)
+    pose = np.array([1.9, 2.0, 0.0])
+    near = local_map(belief_of(classes, tuple(pose)), 2.0)
+    half, timing = np.array([0.29, 0.19]), np.array([0.2, 1.5, 6.0])
+    hits = np.array([[0.6, 0.05], [0.5, 0.4]])
+    twist = np.array([0.3, 0.0, 0.0])
+    now, ahead, scan_now, scan_ahead = body_gaps(
+        twist, pose, timing, half, footprint(ROBOT), near.clearance, near.origin, near.resolution, hits
+    )
+    assert now == pytest.approx(body_gap(classes, pose, ROBOT), abs=0.02)
+    travelled = 0.3 * 0.2 + 0.3**2 / (2 * 1.5)  # v t + v²/2a
+    assert ahead == pytest.approx(now - travelled, abs=0.02)
+    assert scan_now == pytest.approx(math.hypot(0.21, 0.21))  # to the corner, less than 0.31 ahead
+    assert scan_ahead == pytest.approx(min(0.31 - travelled, math.hypot(0.21 - travelled, 0.21)), abs=1e-6)
+
+
+def test_scan_points_stand_in_the_body_frame():
+    scan = np.ones(360, np.float32)
+    scan[180], scan[270], scan[0] = 1.0 / 8.0, 0.5 / 8.0, 0.0
+    points = scan_points({"scan": scan}, LIDAR)
+    np.testing.assert_allclose(points, [[1.2, 0.0], [0.2, 0.5]], atol=1e-6)
+    assert scan_points(None, LIDAR).shape == scan_points({}, LIDAR).shape == (0, 2)
+    with pytest.raises(ValueError, match="360 beams"):
+        scan_points({"scan": np.ones(10)}, LIDAR)
+    sector = LIDAR_PRESETS["cavity"]
+    ahead = np.ones(sector.beams)
+    ahead[sector.beams // 2] = 0.1
+    np.testing.assert_allclose(scan_points({"scan": ahead}, sector), [[0.08 + 0.8, 0.0]], atol=1e-6)

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from agents import cost_map as cost_maps
+from agents.cost_map import PlannerConfig
+from agents.frontiers import FrontierConfig, find, frontier_mask, view_points
+from agents.planning import travel_costs
+from mecanum_env.config import RobotConfig
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from tests.agents.grids import RESOLUTION, belief_of, fill, half_known, room
+
+ROBOT = RobotConfig()
+rasters = arrays(
+    np.int8, st.tuples(st.integers(1, 14), st.integers(1, 14)), elements=st.sampled_from([-1, 0, 100])
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(rasters)
+def test_mask_against_its_definition(classes):
+    padded = np.pad(classes, 1, constant_values=UNKNOWN)
+    expected = np.zeros(classes.shape, dtype=bool)
+    for r, c in np.ndindex(*classes.shape):
+        expected[r, c] = classes[r, c] == FREE and (padded[r : r + 3, c : c + 3] == UNKNOWN).any()
+    np.testing.assert_array_equal(frontier_mask(classes), expected)
+
+
+def test_one_straight_frontier():
+    belief = belief_of(half_known(), (1.5, 2.0, 0.0))
+    cost_map = cost_maps.build(belief, PlannerConfig(), ROBOT)
+    found = find(cost_map, FrontierConfig())
+    assert found.extents.shape == (1,)
+    assert found.extents[0] == pytest.approx(3.7, abs=0.25)  # 4 m less what lies too near to the walls
+    np.testing.assert_allclose(found.points[:, 0], 3.95, atol=1e-9)
+    np.testing.assert_allclose(found.normals, np.tile([1.0, 0.0], (len(found.normals), 1)), atol=0.5)
+    # Pieces of about the size asked for, that together hold all of the cluster.
+    assert len(found.targets) == pytest.approx(3.7 / 0.6, abs=1.5)
+    # Crumbs of one or two cells at its ends excepted.
+    assert len(found.points) - 4 <= found.sizes.sum() <= len(found.points)
+
+
+def test_view_points_see_and_are_reachable():
+    classes = half_known()
+    fill(classes, 2.4, 1.2, 2.6, 2.8)  # a wall between the robot and the middle of the frontier
+    belief = belief_of(classes, (1.5, 2.0, 0.0))
+    cost_map = cost_maps.build(belief, PlannerConfig(), ROBOT)
+    travel = travel_costs(cost_map)
+    found = find(cost_map, FrontierConfig())
+    views = view_points(cost_map, travel, found, FrontierConfig(view_range_m=2.0), range_m=8.0)
+    assert np.isfinite(views.costs).all()
+    places = cost_map.to_points(views.cells)
+    np.testing.assert_allclose(views.costs, travel.cost[views.cells[:, 0], views.cells[:, 1]])
+    away = np.hypot(*(found.targets - places).T)
+    assert (away <= 2.0 + 0.3 + 0.2).all()
+    for place, target in zip(places, found.targets, strict=True):
+        line = place + np.linspace(0, 1, 60)[:, None] * (target - place)
+        cells = cost_map.to_cells(line)
+        assert not (cost_map.classes[cells[:, 0], cells[:, 1]] == OCCUPIED).any()
+
+
+def test_small_clusters_and_small_pockets_are_left_out():
+    classes = room(6.0, 4.0)
+    fill(classes, 3.0, 2.0, 3.2, 2.1, UNKNOWN)  # 0.02 m²
+    cost_map = cost_maps.build(belief_of(classes, (1.5, 2.0, 0.0)), PlannerConfig(), ROBOT)
+    assert len(find(cost_map, FrontierConfig()).points) == 0
+    fill(classes, 3.0, 2.0, 3.8, 2.8, UNKNOWN)
+    cost_map = cost_maps.build(belief_of(classes, (1.5, 2.0, 0.0)), PlannerConfig(), ROBOT)
+    assert len(find(cost_map, FrontierConfig()).extents) == 1
+    assert len(find(cost_map, FrontierConfig(min_extent_m=2.0)).extents) == 0
+
+
+@settings(max_examples=40, deadline=None)
+@given(rasters, st.sampled_from([(0.0, 0.0), (-0.35, 0.05), (0.1, -0.15)]))
+def test_coarse_cells_are_conservative(classes, origin):
+    belief = belief_of(classes, (0.1, 0.1, 0.0), origin=origin)
+    cost_map = cost_maps.build(belief, PlannerConfig(), ROBOT)
+    fine, grid = belief.grid.classes(), belief.grid
+    occupied = grid.to_points(np.argwhere(fine == OCCUPIED))
+    cells = cost_map.to_cells(occupied)
+    assert (cost_map.classes[cells[:, 0], cells[:, 1]] == OCCUPIED).all()
+    # A free coarse cell is free in most of its fine ones: nothing takes the unknown for free.
+    fine_classes = np.stack([fine == FREE, fine != FREE], axis=-1).reshape(-1, 2)
+    every = grid.to_points(np.argwhere(np.ones(fine.shape, dtype=bool)))
+    cells = cost_map.to_cells(every)
+    flat = cells[:, 0] * cost_map.classes.shape[1] + cells[:, 1]
+    free = np.bincount(flat, fine_classes[:, 0], cost_map.classes.size)
+    other = np.bincount(flat, fine_classes[:, 1], cost_map.classes.size)
+    assert (free > other)[cost_map.classes.ravel() == FREE].all()
+    # The robot's own cell apart, it is allowed only where the map is free, or under its body.
+    passable = np.argwhere((cost_map.weight > 0) & (cost_map.classes != FREE))
+    reach = ROBOT.circumscribed_radius_m + 2 * cost_map.resolution
+    assert (np.hypot(*(cost_map.to_points(passable) - belief.pose[:2]).T) <= reach).all()
+
+
+def test_clearance_is_exact_along_a_wall():
+    belief = belief_of(room(4.0, 4.0), (2.0, 2.0, 0.0))
+    cost_map = cost_maps.build(belief, PlannerConfig(), ROBOT)
+    points = np.array([[x, 2.0] for x in (0.35, 0.75, 1.45)])
+    cells = cost_map.to_cells(points)
+    centres = cost_map.to_points(cells)[:, 0]
+    got = cost_map.clearance[cells[:, 0], cells[:, 1]]
+    np.testing.assert_allclose(got, centres - RESOLUTION, atol=0.02)
