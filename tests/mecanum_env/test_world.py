@@ -88,11 +88,11 @@ def depth(w: World, size: float = 6.0) -> float:
     return float(max(0.0, -corners.min(), corners.max() - size))
 
 
-def random_drive(w: World, steps: int, *, seed: int = 3, scale: float = 1.0) -> Array:
+def random_drive(w: World, steps: int, *, seed: int = 3, scale: float = 1.0, hold: int = 5) -> Array:
     rng = np.random.default_rng(seed)
     path = []
     for step in range(steps):
-        if step % 5 == 0:
+        if step % hold == 0:
             wheels = twist_action_to_wheels(w.robot, scale * rng.uniform(-1, 1, 3))
         w.step(wheels, STEP, 0.02)
         path.append(np.concatenate([w.pose, w.twist, w.wheel_speeds, w.wheel_increments]))
@@ -155,7 +155,7 @@ def test_leaving_pymunk_out_changes_nothing_among_obstacles() -> None:
     box = np.array([[3.8, 2.5], [4.4, 2.5], [4.4, 3.4], [3.8, 3.4]])
     plan = room(6.0, (2.2, 3.0, 0.1), polygons=(box,), circles=np.array([[1.0, 1.2, 0.3]]))
     worlds = [world(plan, shortcut=shortcut) for shortcut in (True, False)]
-    paths = [random_drive(w, 250, seed=1) for w in worlds]
+    paths = [random_drive(w, 250, seed=1, hold=20) for w in worlds]
     assert worlds[0].collisions == worlds[1].collisions > 2
     assert worlds[0].last_impulse == pytest.approx(worlds[1].last_impulse, abs=1e-6)
     np.testing.assert_allclose(paths[0], paths[1], rtol=0, atol=1e-6)
@@ -192,7 +192,8 @@ def test_patches_cover_their_share_and_only_then_draw_numbers() -> None:
     plan = room(8.0, (4.0, 4.0, 0.0))
     rng = np.random.default_rng(5)
     floor = build_floor(plan, NOISE_PRESETS["slippery"], rng)
-    inner = floor.friction[1:-1, 1:-1][plan.free]
+    pad = (floor.friction.shape[0] - plan.free.shape[0]) // 2
+    inner = floor.friction[pad:-pad, pad:-pad][plan.free]
     share = np.mean(inner < 0.6)
     assert 0.25 <= share < 0.28
     assert np.all((floor.patches[:, 3] >= 0.15) & (floor.patches[:, 3] <= 0.3))
@@ -301,7 +302,7 @@ def test_tapping_a_wall_again_at_once_is_the_same_contact() -> None:
     drive(w, (0.3, 0, 0), 1.0)
     peak = w.last_impulse
     assert w.collisions == 1
-    drive(w, (-0.3, 0, 0), 0.3)
+    drive(w, (-0.3, 0, 0), 0.2)
     assert footprint(w).max() < 5.995
     drive(w, (0.3, 0, 0), 0.6)
     assert w.collisions == 1
@@ -362,7 +363,7 @@ import sys
 sys.path[:0] = {paths!r}
 from test_world import *
 w = world(room(3.0, (1.5, 1.5, 0.0)), noise=NOISE_PRESETS["slippery"])
-path = random_drive(w, 120)
+path = random_drive(w, 120, hold=20)
 assert w.collisions
 print(path.tobytes().hex())
 """
@@ -372,13 +373,13 @@ def test_a_seed_gives_the_same_path_to_the_last_bit_in_any_process() -> None:
     here = Path(__file__).resolve()
     code = SCRIPT.format(paths=[str(here.parent), str(here.parents[2])])
     w = world(room(3.0, (1.5, 1.5, 0.0)), noise=NOISE_PRESETS["slippery"])
-    own = random_drive(w, 120).tobytes().hex()
+    own = random_drive(w, 120, hold=20).tobytes().hex()
     child = subprocess.run(
         [sys.executable, "-c", code], env=os.environ.copy(), capture_output=True, text=True, check=True
     )
     assert child.stdout.strip() == own
     other = World(w.plan, ROBOT, NOISE_PRESETS["slippery"], np.random.default_rng(8))
-    assert random_drive(other, 120).tobytes().hex() != own
+    assert random_drive(other, 120, hold=20).tobytes().hex() != own
 
 
 def test_the_generator_yields_the_same_numbers_whatever_is_done() -> None:
