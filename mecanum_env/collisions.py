@@ -26,7 +26,7 @@ _ROBOT = 1  # collision type
 _FRICTION = 0.5  # of robot and of surfaces each; pymunk multiplies the two
 _ELASTICITY = 0.2  # likewise
 # pymunk lets shapes overlap by this much; its default of 0.1 is 10 cm here. The deeper the robot is in a wall, the
-# oftener it catches on the wall's seams: at 2 mm on one in fifteen, at 0.2 mm on hardly any.
+# oftener it catches on the wall's seams: at 2 mm on about one in ten, at 0.2 mm on one in fifty.
 _SLOP_M = 0.0002
 _OVERLAP_KEPT = 0.3  # share of a deeper overlap that is left after 20 ms
 _SNAP_M = 2.0**-20  # about a micrometre; see build_space

@@ -195,6 +195,8 @@ class EnvConfig:
         require(abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s")
         require(0.01 <= self.grid_resolution_m <= 1, "EnvConfig.grid_resolution_m must be in [0.01, 1]")
         require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
+        tables = isinstance(self.rooms_config, Mapping) and isinstance(self.slam_config, Mapping)
+        require(tables, "EnvConfig.rooms_config and slam_config must be tables of settings")
 
 
 # Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slam.association import innovation_blocks, nearest_neighbour
 from slam.backend import Backend, BackendConfig
 from slam.geometry import wrap_scalar
-from slam.landmarks import KIND, LandmarkBook, LandmarkPolicy
+from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
 from slam.motion import predict_robot
 from slam.settings import require
 from slam.types import Belief, Observations, Odometry, Scan
@@ -137,7 +137,7 @@ class EkfSlam(Backend):
             self._enlarge()
         add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         self._n += 2
-        self._book.add(float(z[KIND]), float(z[KIND + 1]) + float(self._x[2]), known_id)
+        self._book.add(float(z[KIND]), float(z[DIRECTION]) + float(self._x[2]), known_id)
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""

@@ -38,6 +38,8 @@ class FeatureConfig:
     min_angle_deg: float = 55.0  # between the surfaces of a corner; pieces of a round column meet at less
     max_gap_m: float = 0.12  # from the corner to the nearest point of either surface
     edge_length_m: float = 0.35  # of a surface whose visible end is taken for a corner
+    edge_points: int = 8  # … and the points on it: fewer would let a piece of a round column pass for straight
+    edge_face_m: float = 0.25  # thickest wall of which the end face may show
     edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
     sigma_floor_m: float = 0.002  # of a corner, along each axis: what the model of straight walls leaves out
@@ -89,13 +91,14 @@ class FeatureExtractor:
         self._limits = np.array([
             c.range_sigma_m, c.split_sigmas, c.split_floor_m, c.min_points, c.min_length_m,
             math.radians(c.grazing_deg), math.sin(math.radians(c.min_angle_deg)), c.max_gap_m,
-            c.sigma_floor_m, c.edge_length_m, c.edge_jump_m, c.edge_spacing_m,
+            c.sigma_floor_m, c.edge_length_m, c.edge_jump_m, c.edge_spacing_m, c.edge_points, c.edge_face_m,
         ])  # fmt: skip
 
     def extract(self, scan: Scan) -> NDArray[np.float64]:
         """Return the corners as rows of ``(m, 8)`` (a view, until the next call).
 
-        Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and a spare.
+        Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and 1 for the visible
+        end of a surface, 0 for a meeting of two.
         :meth:`corners` and :meth:`lines` give the same as named arrays.
         """
         n = len(scan.ranges)
@@ -383,7 +386,7 @@ def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
         return False
     coefficient, deviation = bulge / norm, sigma / math.sqrt(norm)
     # As a sagitta: what the curve departs by between the middle and the ends.
-    return abs(coefficient) > 3.0 * deviation and abs(coefficient) * largest > 0.5 * sigma
+    return abs(coefficient) > 2.5 * deviation and abs(coefficient) * largest > 0.5 * sigma
 
 
 @njit(cache=True, nogil=True)
@@ -433,13 +436,13 @@ def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array
     left = (-ax) * by - (-ay) * bx > 0.0
     sign = 1.0 if left else -1.0
     direction = math.atan2(sign * (ay + by), sign * (ax + bx))
-    _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, corner)
+    _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, 0, corner)
     return 1
 
 
 @njit(cache=True, nogil=True)
 def _to_polar(
-    x: float, y: float, cxx: float, cxy: float, cyy: float, kind: int, direction: float, corner: Array
+    x: float, y: float, cxx: float, cxy: float, cyy: float, kind: int, direction: float, edge: int, corner: Array
 ) -> None:
     """Write a point and its covariance as range and bearing."""
     rho = math.sqrt(x * x + y * y)
@@ -449,7 +452,7 @@ def _to_polar(
     corner[2] = ux * ux * cxx + 2.0 * ux * uy * cxy + uy * uy * cyy
     corner[3] = (-ux * uy * cxx + (ux * ux - uy * uy) * cxy + ux * uy * cyy) / rho
     corner[4] = (uy * uy * cxx - 2.0 * ux * uy * cxy + ux * ux * cyy) / (rho * rho)
-    corner[5], corner[6], corner[7] = kind, direction, 0.0
+    corner[5], corner[6], corner[7] = kind, direction, edge
 
 
 @njit(cache=True, nogil=True)
@@ -460,45 +463,63 @@ def _edge(
     """Write the corner at which a surface ends in front of something farther away; return 1 if there is one.
 
     Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
-    beams, uniformly. Its other face is hidden; it is taken to recede at a right angle. (Where the next beam
-    stops short, something nearer hides the surface: the rim of a shadow, no landmark.)
+    beams, uniformly. A short end face may show in between (a wall is as thick as that), all of it behind the
+    line; hidden or not, it is taken to recede at a right angle. (Where a beam stops short of the line, something
+    nearer hides the surface: the rim of a shadow, no landmark.)
     """
-    if line[9] - line[8] < limits[9]:
+    if line[9] - line[8] < limits[9] or line[10] < limits[12]:
         return 0
     n = ranges.shape[0]
     step = 1 if side == 1 else -1
     index = int(line[12]) if side == 1 else int(line[11])
     full = n * increment > 2.0 * math.pi - 1.5 * increment
-    for _ in range(3):  # past lost beams
+    end = line[9] if side == 1 else line[8]
+    t = missed = 0.0
+    faces = 0
+    while True:
         index += step
         if index < 0 or index >= n:
             if not full:
                 return 0
             index %= n
-        if not math.isnan(ranges[index]):
-            break
-    if math.isnan(ranges[index]):
-        return 0
-    across = line[0] * rays[index, 0] + line[1] * rays[index, 1]
-    if across < 0.05:
-        return 0
-    missed = line[2] / across  # range at which the beam would have met the line
-    if missed > range_max - 0.1 or ranges[index] < missed + limits[10]:
-        return 0
-    t = -line[1] * (missed * rays[index, 0] - line[3]) + line[0] * (missed * rays[index, 1] - line[4])
-    end = line[9] if side == 1 else line[8]
+        reach = ranges[index]
+        if math.isnan(reach):
+            continue
+        across = line[0] * rays[index, 0] + line[1] * rays[index, 1]
+        if across < 0.05:
+            return 0
+        missed = line[2] / across  # range at which the beam would meet the line
+        if missed > range_max - 0.1 or reach < missed - limits[1] * limits[0]:
+            return 0
+        if faces == 0:
+            t = -line[1] * (missed * rays[index, 0] - line[3]) + line[0] * (missed * rays[index, 1] - line[4])
+        if reach > missed + limits[10]:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            depth = line[0] * px + line[1] * py - line[2]
+            beyond = (-line[1] * (px - line[3]) + line[0] * (py - line[4]) - end) * step
+            if not (depth < limits[13] and -limits[13] < beyond < limits[13]):
+                break  # past the end face, or there is none to see
+        else:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            beyond = (-line[1] * (px - line[3]) + line[0] * (py - line[4]) - end) * step
+            if beyond > limits[13]:
+                return 0  # the surface goes on, a little off the line
+        faces += 1
+        if faces > 40:
+            return 0
     spacing = abs(t - end)
     if spacing > limits[11] or (t - end) * step < 0.0:
         return 0
     s = 0.5 * (t + end)
     x, y = line[3] - line[1] * s, line[4] + line[0] * s
     # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
-    along = 0.2 * spacing * spacing + limits[8] ** 2
+    # An end face that shows may be bevelled: its first points still pass for the surface's.
+    along = 0.2 * spacing * spacing + limits[8] ** 2 + (4.0 * limits[0] ** 2 if faces > 0 else 0.0)
     off = line[5] + 2.0 * s * line[7] + s * s * line[6] + limits[8] ** 2
     nx, ny, ax, ay = line[0], line[1], -line[1], line[0]
     direction = math.atan2(step * ay - ny, step * ax - nx)
     _to_polar(
         x, y, along * ax * ax + off * nx * nx, along * ax * ay + off * nx * ny, along * ay * ay + off * ny * ny,
-        CONVEX, direction, corner,
+        CONVEX, direction, 1, corner,
     )  # fmt: skip
     return 1

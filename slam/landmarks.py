@@ -22,12 +22,12 @@ __all__ = ["KIND", "LandmarkBook", "LandmarkPolicy"]
 
 Array = NDArray[np.float64]
 
-KIND = 5  # column of an observation row (see FeatureExtractor.extract); its direction is in the next
+KIND, DIRECTION, EDGE = 5, 6, 7  # columns of an observation row, see FeatureExtractor.extract
 
 # Columns of ``marks``, one row a landmark.
-_KIND, _DIRECTION, _SEEN, _MISSED = range(4)
+_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN = range(5)
 # Columns of the tentative ones.
-_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE = range(6)
+_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
 _TENTATIVE = 64
 
 
@@ -35,11 +35,14 @@ _TENTATIVE = 64
 class LandmarkPolicy:
     """When a corner becomes a landmark, and when it ceases to be one."""
 
-    confirm_after: int = 3  # sightings
+    confirm_after: int = 3  # sightings …
+    edge_baseline_m: float = 0.2  # … a surface's visible end also from two places this far apart
     forget_after: int = 20  # updates without a sighting, while tentative
-    tentative_gate_m: float = 0.15  # two sightings farther apart are two corners
+    tentative_gate_m: float = 0.1  # two sightings farther apart are two corners
     new_distance_m: float = 0.2  # a new corner is at least this far from a landmark of its kind
     drop_after: int = 15  # contradictions more than sightings
+    overlook_after: int = 25  # dropped when overlooked, in plain view, more often than this …
+    overlook_ratio: float = 5.0  # … and this many times the sightings
     clear_margin_m: float = 0.3  # a beam that goes this far beyond a landmark contradicts it
 
     def __post_init__(self) -> None:
@@ -56,14 +59,14 @@ class LandmarkBook:
         self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
         self._next_id = 0
         self._ids = np.zeros(32, np.int64)
-        self._marks = np.zeros((32, 4))
-        self._tentative = np.zeros((_TENTATIVE, 6))
+        self._marks = np.zeros((32, 5))
+        self._tentative = np.zeros((_TENTATIVE, 8))
         self._tentative_count = np.zeros(1, np.int64)
         self._new = np.zeros(256, np.int64)
 
     @property
     def marks(self) -> Array:
-        """Kind and direction, sightings and contradictions ``(n, 4)``. A view."""
+        """Kind and direction, sightings, contradictions and times overlooked ``(n, 5)``. A view."""
         return self._marks[: self.count]
 
     @property
@@ -100,7 +103,7 @@ class LandmarkBook:
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -124,31 +127,29 @@ class LandmarkBook:
             self._new = np.zeros(len(z), np.int64)
         count = _review(
             x, offset, z, match, self.marks, self._tentative, self._tentative_count,
-            p.tentative_gate_m, p.confirm_after, p.forget_after, self._new,
+            p.tentative_gate_m, p.confirm_after, p.edge_baseline_m, p.forget_after, self._new,
         )  # fmt: skip
         return self._new[:count]
 
     def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
-        """Return the rows to drop, highest first: landmarks that beams keep passing through."""
-        worst = _look_through(
-            x,
-            offset,
-            scan.ranges,
-            scan.angle_min,
-            scan.angle_increment,
-            self.marks,
-            self.policy.clear_margin_m,
-        )
-        if worst <= self.policy.drop_after:
+        """Return the rows to drop, highest first: landmarks that beams keep passing through, or that do not show."""
+        p = self.policy
+        doubtful = _look_through(
+            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self.marks, p.clear_margin_m,
+            p.drop_after, p.overlook_after, p.overlook_ratio,
+        )  # fmt: skip
+        if not doubtful:
             return []
-        surplus = self.marks[:, _MISSED] - self.marks[:, _SEEN]
-        return [int(i) for i in np.flatnonzero(surplus > self.policy.drop_after)[::-1]]
+        marks = self.marks
+        passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
+        overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
+        return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
 
 
 @njit(cache=True, nogil=True)
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, tentative: Array,
-    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, forget_after: int,
+    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, baseline: float, forget_after: int,
     new: NDArray[np.int64],
 ) -> int:  # fmt: skip
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -159,6 +160,7 @@ def _review(
     for k in range(z.shape[0]):
         if match[k] >= 0:
             marks[match[k], _SEEN] += 1.0
+            marks[match[k], _UNSEEN] -= 1.0  # what the look through will add to every landmark in view
             continue
         if match[k] != UNMATCHED:
             continue
@@ -178,12 +180,15 @@ def _review(
             nearest = n
             n += 1
             tentative[nearest, _COUNT] = 0.0
-            tentative[nearest, _T_KIND] = z[k, 5]
+            t = tentative[nearest]
+            t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
+        # Compared with where it was first seen: what wanders with the robot never settles.
         t = tentative[nearest]
-        t[_X], t[_Y], t[_T_DIRECTION] = px, py, turn
+        t[_T_DIRECTION] = turn
         t[_COUNT] += 1.0
         t[_AGE] = 0.0
-        if t[_COUNT] >= confirm_after:
+        moved = (x[0] - t[_FROM_X]) ** 2 + (x[1] - t[_FROM_Y]) ** 2
+        if t[_COUNT] >= confirm_after and (z[k, EDGE] == 0.0 or moved >= baseline * baseline):
             new[found] = k
             found += 1
             t[_AGE] = forget_after + 1.0
@@ -199,14 +204,16 @@ def _review(
 
 @njit(cache=True, nogil=True)
 def _look_through(
-    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, marks: Array, margin: float
-) -> float:
-    """Count a contradiction for each landmark that three neighbouring beams pass; return the largest surplus."""
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, marks: Array, margin: float,
+    drop_after: float, overlook_after: float, overlook_ratio: float,
+) -> bool:  # fmt: skip
+    """Count, for each landmark near by, whether three beams pass it or one ends at it; tell if any is doubtful."""
     c, s = math.cos(x[2]), math.sin(x[2])
     sx, sy = x[0] + offset * c, x[1] + offset * s
     beams = ranges.shape[0]
-    full = beams * increment > 2.0 * math.pi - 1.5 * increment
-    worst = -1e9
+    circle = round(2.0 * math.pi / increment)
+    full = beams >= circle
+    doubtful = False
     for i in range(marks.shape[0]):
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy
@@ -216,14 +223,22 @@ def _look_through(
         rho = math.sqrt(d2)
         b = round(wrap_scalar(math.atan2(dy, dx) - x[2] - angle_min) / increment)
         if b < 0:
-            b += round(2.0 * math.pi / increment)
-        passed = True
+            b += circle
+        passed, ended = 0, 0
         for q in range(b - 1, b + 2):
             j = q % beams if full else q
-            if j < 0 or j >= beams or not ranges[j] > rho + margin:
-                passed = False
-                break
-        if passed:
+            if 0 <= j < beams:
+                if ranges[j] > rho + margin:
+                    passed += 1
+                elif abs(ranges[j] - rho) < 0.5 * margin:
+                    ended += 1
+        if passed == 3:
             marks[i, _MISSED] += 1.0
-            worst = max(worst, marks[i, _MISSED] - marks[i, _SEEN])
-    return worst
+        elif ended > 0:
+            marks[i, _UNSEEN] += 1.0
+        if (
+            marks[i, _MISSED] - marks[i, _SEEN] > drop_after
+            or marks[i, _UNSEEN] > overlook_after + overlook_ratio * marks[i, _SEEN]
+        ):
+            doubtful = True
+    return doubtful

@@ -126,6 +126,7 @@ def explore(
         start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
     )  # fmt: skip
     episode = task.prepare(options)
+    print(f"exploring, at most {episode.run['max_steps']} steps; Ctrl-C ends it and keeps the results", file=sys.stderr)
     with ExitStack() as stack:
         task.run(episode, _progress(stack))
     metrics = task.write_episode(episode)
@@ -210,11 +211,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(name, str(error), 130)
     except (KeyboardInterrupt, typer.Abort):
         return _fail(name, "interrupted; nothing was written", 130)
-    except BrokenPipeError:
-        # Whoever read the output has gone; flushing on exit must not complain again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except Exception as error:
+        _drop_unwritable_output()
         if os.environ.get(TRACEBACK_VARIABLE) not in (None, "", "0"):
             traceback.print_exc()
         text = one_line(error) or "no message"
@@ -224,6 +222,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _fail(name: str, message: str, code: int) -> int:
     print(f"{name}: {message}", file=sys.stderr)
     return code
+
+
+def _drop_unwritable_output() -> None:
+    """Where standard output takes nothing any more, let nobody try again on exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _commands() -> list[str]:

@@ -42,9 +42,12 @@ def suggestion(name: str, valid: Iterable[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def check_writable(folder: Path) -> None:
-    """Raise :class:`BadInput` unless a folder can be written to or made; it is not made here."""
+def check_writable(folder: Path, files: Iterable[str] = ()) -> None:
+    """Raise :class:`BadInput` unless a folder, and files in it, can be written to or made; none is made here."""
     remedy = "choose another --out"
+    for name in files:
+        if (folder / name).is_dir():
+            raise BadInput(f"cannot write {folder / name}: it is a folder; {remedy}")
     for place in (folder, *folder.absolute().parents):
         if place.is_dir():
             if not os.access(place, os.W_OK | os.X_OK):

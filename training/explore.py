@@ -139,7 +139,7 @@ def prepare(options: ExploreOptions) -> Episode:
             config = replace(config, floor_plan=str(Path(config.floor_plan).absolute()))
         if options.coverage_target is not None:
             config = replace(config, coverage_target=options.coverage_target)
-        check_writable(options.out)
+        check_writable(options.out, FILES)
         plan = _make_plan(config, run["seed"])
         # An agent maps all that it can reach; what counts as success is judged at the end.
         limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
@@ -249,41 +249,48 @@ def write_episode(episode: Episode) -> dict[str, Any]:
     The files are made in a folder beside their place and then renamed, one after the other: a run that fails
     while writing leaves the results of an earlier one as they were.
     """
-    out, env, record = episode.out, episode.env, episode.env.truth.record
+    out = episode.out
     out.mkdir(parents=True, exist_ok=True)
     folder = Path(mkdtemp(prefix=".writing-", dir=out))
     try:
-        belief, times = env.belief, record.times
-        true_poses, estimates = record.true_poses, record.estimates
-        write_map_server(folder / "map", belief.grid)
-        write_tum(folder / "trajectory_true.tum", times, true_poses)
-        write_tum(folder / "trajectory_estimate.tum", times, estimates)
-        seen, angles = env.backend.landmark_details()
-        write_landmark_map(
-            folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
-            joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
-            ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
-            backend=episode.config.slam,
-        )  # fmt: skip
-        view = episode_view(env.truth.ground, belief)
-        robot, where = episode.config.robot, _place(episode)
-        pictures = {
-            "map.png": draw_map(
-                belief, estimates, view=view, robot=robot,
-                title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
-            ),
-            "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
-        }  # fmt: skip
-        for name, picture in pictures.items():
-            atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
-        atomic_write(folder / "config.toml", config_text(episode))
-        metrics = episode.metrics()
-        atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
-        for name in FILES:
-            (folder / name).replace(out / name)
+        with _interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
+            metrics = _write_into(folder, episode)
+            for name in FILES:
+                (folder / name).replace(out / name)
         return metrics
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_into(folder: Path, episode: Episode) -> dict[str, Any]:
+    env, record = episode.env, episode.env.truth.record
+    belief, times = env.belief, record.times
+    true_poses, estimates = record.true_poses, record.estimates
+    write_map_server(folder / "map", belief.grid)
+    write_tum(folder / "trajectory_true.tum", times, true_poses)
+    write_tum(folder / "trajectory_estimate.tum", times, estimates)
+    seen, angles = env.backend.landmark_details()
+    write_landmark_map(
+        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
+        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+        backend=episode.config.slam,
+    )  # fmt: skip
+    view = episode_view(env.truth.ground, belief)
+    robot, where = episode.config.robot, _place(episode)
+    pictures = {
+        "map.png": draw_map(
+            belief, estimates, view=view, robot=robot,
+            title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
+        ),
+        "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
+    }  # fmt: skip
+    for name, picture in pictures.items():
+        atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+    atomic_write(folder / "config.toml", config_text(episode))
+    metrics = episode.metrics()
+    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    return metrics
 
 
 def config_text(episode: Episode) -> str:

@@ -57,7 +57,8 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str = "youbot", colum
         if kind not in room_registry.names():
             raise unknown_name("rooms", kind, room_registry.names())
         body = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
-        check_writable(out)
+        sheet_name = f"{kind}-sheet.png"
+        check_writable(out, [sheet_name, *(f"{kind}-{seed}.png" for seed in chosen)])
         plans = [room_registry.make(kind, seed=seed) for seed in chosen]
     out.mkdir(parents=True, exist_ok=True)
     files = []
@@ -65,7 +66,7 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str = "youbot", colum
         path = out / f"{kind}-{seed}.png"
         atomic_write(path, cv2.imencode(".png", draw_plan(plan, pixels_per_m=60.0, robot=body))[1].tobytes())
         files.append(str(path))
-    sheet = out / f"{kind}-sheet.png"
+    sheet = out / sheet_name
     picture = contact_sheet(plans, columns, pixels_per_m=24.0)
     atomic_write(sheet, cv2.imencode(".png", picture)[1].tobytes())
     areas = {str(seed): round(plan.area_m2, 3) for seed, plan in zip(chosen, plans, strict=True)}

@@ -12,29 +12,63 @@ from tests.slam.simulated import ANGLE_MIN, INCREMENT
 POSE = np.zeros(3)
 
 
-def corner(x: float, y: float, kind: float = 1.0, direction: float = 0.0) -> np.ndarray:
-    return np.array([math.hypot(x, y), math.atan2(y, x), 1e-4, 0.0, 1e-5, kind, direction, 0.0])
+def corner(x: float, y: float, kind: float = 1.0, edge: bool = True) -> np.ndarray:
+    return np.array([math.hypot(x, y), math.atan2(y, x), 1e-4, 0.0, 1e-5, kind, 0.0, float(edge)])
 
 
-def test_a_corner_is_confirmed_after_three_sightings_at_one_place() -> None:
+def test_a_meeting_of_two_surfaces_is_confirmed_after_three_sightings() -> None:
     book = LandmarkBook(LandmarkPolicy(confirm_after=3))
+    for expected in ([], [], [0]):
+        assert book.review(POSE, 0.0, corner(2, 1, edge=False)[None], np.array([UNMATCHED])).tolist() == expected
+
+
+def test_the_end_of_a_surface_is_confirmed_after_three_sightings_from_two_places() -> None:
+    book = LandmarkBook(LandmarkPolicy(confirm_after=3, edge_baseline_m=0.2))
     new = np.array([UNMATCHED])
-    assert len(book.review(POSE, 0.0, corner(2, 1)[None], new)) == 0
-    assert len(book.review(POSE, 0.0, corner(2.05, 1)[None], new)) == 0
-    assert len(book.review(POSE, 0.0, corner(2, 1, kind=-1.0)[None], new)) == 0  # another kind: another corner
-    assert len(book.review(POSE, 0.0, corner(4, 1)[None], new)) == 0
-    assert len(book.review(POSE, 0.0, corner(2, 1)[None], np.array([IGNORED]))) == 0
-    assert book.review(POSE, 0.0, corner(2.02, 1)[None], new).tolist() == [0]
-    assert len(book.review(POSE, 0.0, corner(2.02, 1)[None], new)) == 0  # it starts over once confirmed
+
+    def see(x: float, y: float, from_x: float = 0.0, kind: float = 1.0, match: np.ndarray = new) -> list[int]:
+        pose = np.array([from_x, 0.0, 0.0])
+        return book.review(pose, 0.0, corner(x - from_x, y, kind)[None], match).tolist()
+
+    assert see(2, 1) == []
+    assert see(2.05, 1) == []
+    assert see(2, 1, kind=-1.0) == []  # another kind: another corner
+    assert see(4, 1) == []
+    assert see(2.02, 1) == []  # three sightings, but all from one place
+    assert see(2, 1, from_x=0.3, match=np.array([IGNORED])) == []
+    assert see(2.02, 1, from_x=0.3) == [0]
+    assert see(2.02, 1, from_x=0.3) == []  # it starts over once confirmed
+
+
+def test_what_wanders_with_the_robot_is_never_confirmed() -> None:
+    book = LandmarkBook(LandmarkPolicy(confirm_after=3))
+    for k in range(20):
+        x = 0.04 * k
+        assert len(book.review(np.array([x, 0.0, 0.0]), 0.0, corner(2, 1)[None], np.array([UNMATCHED]))) == 0
 
 
 def test_a_tentative_corner_is_forgotten() -> None:
-    book = LandmarkBook(LandmarkPolicy(confirm_after=2, forget_after=5))
+    book = LandmarkBook(LandmarkPolicy(confirm_after=2, edge_baseline_m=0.0, forget_after=5))
     new = np.array([UNMATCHED])
     book.review(POSE, 0.0, corner(2, 1)[None], new)
     for _ in range(6):
         book.review(POSE, 0.0, np.zeros((0, 8)), np.zeros(0, np.int64))
     assert len(book.review(POSE, 0.0, corner(2, 1)[None], new)) == 0
+
+
+def test_a_landmark_in_plain_view_that_never_shows_again_is_dropped() -> None:
+    book = LandmarkBook(LandmarkPolicy(overlook_after=10, overlook_ratio=2.0))
+    book.add(1.0, 0.0, None)
+    book.add(1.0, 0.0, None)
+    x = np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0, 3.0])
+    scan = Scan(np.full(360, 3.0), ANGLE_MIN, INCREMENT, 8.0)  # beams end at both, but only one is recognised
+    dropped: list[int] = []
+    for _ in range(14):
+        book.review(x[:3], 0.0, corner(0.0, 3.0)[None], np.array([1]))
+        dropped += book.contradicted(x, 0.0, scan)
+        if dropped:
+            break
+    assert dropped == [0]
 
 
 def test_a_landmark_that_beams_pass_through_is_dropped_and_one_on_a_wall_is_not() -> None:
