@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 import slam
@@ -143,7 +145,10 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     the same episode, bit for bit; its room and its noise depend on neither agent nor backend.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: dict[str, Any] = {  # noqa: RUF012 - declared so by gymnasium.Env
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+    }
 
     def __init__(
         self,
@@ -171,7 +176,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.render_mode = render_mode
         self._action = action
         self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS[action],), np.float32)
-        self.observation_space = observation_space(self.config)
+        self.observation_space = cast("spaces.Space[Observation]", observation_space(self.config))
         self.backend = make_backend(self.config)
         self.lidar = Lidar(self.config.lidar, self.config.noise)
         self._ready = False
@@ -248,7 +253,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             info["episode_metrics"] = self.episode_metrics()
         return self._observe(), float(sum(terms.values())), bool(terminated), False, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> Any:
         """Return truth beside belief as an RGB image ``(h, w, 3)``."""
         if self.render_mode is None:
             gymnasium.logger.warn('render() needs render_mode="rgb_array" in gym.make')
@@ -287,8 +292,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         else:
             plan = room_registry.make(self.config.rooms, seed=room_seed, config=self.config.rooms_config)
         if start is not None:
-            pose = tuple(float(v) for v in start)
-            plan = dataclasses.replace(plan, start=pose, start_clearance_m=self.config.robot.inscribed_radius_m)
+            plan = plan.with_start(start, clearance_m=self.config.robot.inscribed_radius_m)
         return plan
 
     def _wheel_targets(self, action: NDArray[np.float32]) -> Array:
@@ -351,7 +355,25 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
 
     def _find_step_limit(self) -> int | None:
-        return self.spec.max_episode_steps if self.spec is not None else None
+        limit = _time_limit_of_caller()
+        if limit is None and self.spec is not None:
+            limit = self.spec.max_episode_steps
+        return limit
+
+
+def _time_limit_of_caller() -> int | None:
+    """Return the step limit of the ``TimeLimit`` wrapper that this very reset came through, if any.
+
+    ``gym.make(…, max_episode_steps=N)`` tells nobody but that wrapper, yet ``progress`` and the last step's
+    ``episode_metrics`` depend on it; a wrapper of our own to pass it on would rule out ``vector_entry_point``.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        wrapper = frame.f_locals.get("self")
+        if isinstance(wrapper, TimeLimit):
+            return int(wrapper._max_episode_steps)
+        frame = frame.f_back
+    return None
 
 
 def make_backend(config: EnvConfig) -> Backend:

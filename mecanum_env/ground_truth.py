@@ -154,7 +154,7 @@ class Coverage:
 
     def _overlap(self, grid: OccupancyGrid) -> NDArray[np.bool_]:
         free = on_lattice(grid.classes() == FREE, grid.lattice_origin, self._truth)
-        return free & self._truth.mappable
+        return np.asarray(free & self._truth.mappable)
 
 
 def on_lattice(

@@ -25,19 +25,22 @@ LOCAL_CELL_M = 0.1
 """Side of a pixel of ``map_local`` [m]."""
 UNKNOWN_BYTE = 128
 _TWIST_LIMIT = 2.0
+_COV_LIMIT = 1e6  # m², m·rad, rad²: Gymnasium asks for finite bounds
+_DISTANCE_LIMIT_M = 1e4
 
 
 def observation_space(config: EnvConfig) -> spaces.Dict:
     """Return the space that :func:`observe` fills."""
-    infinite = np.inf
     return spaces.Dict(
         {
             "map_local": spaces.Box(0, 255, (3, MAP_SIZE, MAP_SIZE), np.uint8),
             "map_global": spaces.Box(0, 255, (3, MAP_SIZE, MAP_SIZE), np.uint8),
             "scan": spaces.Box(0.0, 1.0, (config.lidar.beams,), np.float32),
             "pose": spaces.Box(-1.0, 1.0, (4,), np.float32),
-            "pose_cov": spaces.Box(-infinite, infinite, (6,), np.float32),
-            "landmarks": spaces.Box(-infinite, infinite, (config.max_landmarks_observed, 6), np.float32),
+            "pose_cov": spaces.Box(-_COV_LIMIT, _COV_LIMIT, (6,), np.float32),
+            "landmarks": spaces.Box(
+                -_DISTANCE_LIMIT_M, _DISTANCE_LIMIT_M, (config.max_landmarks_observed, 6), np.float32
+            ),
             "twist": spaces.Box(-_TWIST_LIMIT, _TWIST_LIMIT, (3,), np.float32),
             "progress": spaces.Box(0.0, 1.0, (2,), np.float32),
         }
@@ -88,6 +91,7 @@ def observe(
         float(twist[2]) / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2 / (4.0 * half * half),
     )  # fmt: skip
     backend.near_landmarks(landmarks)
+    np.clip(landmarks, -_DISTANCE_LIMIT_M, _DISTANCE_LIMIT_M, out=landmarks)
     return {
         "map_local": map_local,
         "map_global": map_global,
@@ -116,7 +120,7 @@ def _fill_numbers(
     k = 4
     for i in range(3):
         for j in range(i, 3):
-            out[k] = cov[i, j]
+            out[k] = min(max(cov[i, j], -_COV_LIMIT), _COV_LIMIT)
             k += 1
     out[10] = min(max(vx, -_TWIST_LIMIT), _TWIST_LIMIT)
     out[11] = min(max(vy, -_TWIST_LIMIT), _TWIST_LIMIT)

@@ -93,9 +93,7 @@ def extent_of_truth(ground: GroundTruth) -> Box:
     return extent(ground.mappable, ground.resolution, origin) or (-1.0, -1.0, 1.0, 1.0)
 
 
-def extent(
-    mask: NDArray[np.bool_], resolution: float, origin: tuple[float, float]
-) -> Box | None:
+def extent(mask: NDArray[np.bool_], resolution: float, origin: tuple[float, float]) -> Box | None:
     """Return the box x_min, y_min, x_max, y_max [m] around the cells that are set."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):

@@ -58,7 +58,7 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
             s11 += h[1, a] * v * h[1, b]
     dr, db = z[0] - rho, wrap_scalar(z[1] - bearing)
     det = s00 * s11 - s01 * s01
-    return (s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det
+    return float((s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det)
 
 
 @njit(cache=True, nogil=True)

@@ -113,8 +113,8 @@ class FeatureExtractor:
             self.surface = np.zeros(n, np.int16)
             self._scan_of = key
         self._line_count, self._corner_count = _extract(
-            scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits, self._xy, self._beam,
-            self._stack, self._pieces, self.surface, self._lines, self._corners,
+            scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits, self._xy,
+            self._beam,            self._stack, self._pieces, self.surface, self._lines, self._corners,
         )  # fmt: skip
         return self._corners[: self._corner_count]
 
@@ -197,7 +197,7 @@ def _breaks(r0: float, r1: float, angle: float, limits: Array) -> bool:
         return True
     limit = near * math.sin(angle) / math.sin(grazing - angle) + 4.0 * limits[0]
     gap_squared = near * near + far * far - 2.0 * near * far * math.cos(angle)
-    return gap_squared > limit * limit
+    return bool(gap_squared > limit * limit)
 
 
 @njit(cache=True, nogil=True)
@@ -358,7 +358,7 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     line[8], line[9], line[10] = t0, t1, n
     if ax * tx + ay * ty < 0.0:
         line[7] = -line[7]
-    return abs(t1 - t0) >= limits[4]
+    return bool(abs(t1 - t0) >= limits[4])
 
 
 @njit(cache=True, nogil=True)

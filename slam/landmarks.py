@@ -132,7 +132,7 @@ class LandmarkBook:
         return self._new[:count]
 
     def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
-        """Return the rows to drop, highest first: landmarks that beams keep passing through, or that do not show."""
+        """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
         p = self.policy
         doubtful = _look_through(
             x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self.marks, p.clear_margin_m,

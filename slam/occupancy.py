@@ -127,7 +127,7 @@ class OccupancyGrid:
     def to_cells(self, points: Array) -> NDArray[np.int64]:
         """Return row and column ``(n, 2)`` of points ``(n, 2)`` [m]; they may lie outside the grid."""
         cells = np.floor(np.asarray(points, dtype=np.float64) / self.resolution).astype(np.int64)
-        return cells[..., ::-1] - np.array([self._row0, self._col0])
+        return np.asarray(cells[..., ::-1] - np.array([self._row0, self._col0]), dtype=np.int64)
 
     def to_points(self, cells: NDArray[np.int64]) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` given as row, column."""

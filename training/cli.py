@@ -126,7 +126,10 @@ def explore(
         start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
     )  # fmt: skip
     episode = task.prepare(options)
-    print(f"exploring, at most {episode.run['max_steps']} steps; Ctrl-C ends it and keeps the results", file=sys.stderr)
+    print(
+        f"exploring, at most {episode.run['max_steps']} steps; Ctrl-C ends it and keeps the results",
+        file=sys.stderr,
+    )
     with ExitStack() as stack:
         task.run(episode, _progress(stack))
     metrics = task.write_episode(episode)

@@ -126,6 +126,9 @@ def prepare(options: ExploreOptions) -> Episode:
     """
     with bad_input():
         past = _read_run_table(options.config) if options.config is not None else {}
+        if any(v is not None for v in (options.rooms, options.floor_plan, options.seed)):
+            # Other rooms: neither the start nor the step limit is meant for them.
+            past = {name: value for name, value in past.items() if name in _DEFAULTS}
         run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
         if run["agent"] not in agents.names():
             raise unknown_name("agent", run["agent"], agents.names())
