@@ -55,6 +55,10 @@ def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array) -> None:
         free = cv2.warpAffine(plan.free.astype(np.float32), matrix, (view.width, view.height))
         canvas.image[free > 0.5] = FLOOR
     else:
+        # Free space lies on the left of every wall: a loop that runs clockwise goes around something solid.
+        for loop in loops:
+            if _signed_area(loop) < 0:
+                canvas.fill([seen(loop)], WALL)
         canvas.fill([seen(loop) for loop in loops], FLOOR)
     angles = np.linspace(0.0, 2.0 * math.pi, 64, endpoint=False)
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -62,6 +66,11 @@ def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array) -> None:
     for outline in (*plan.polygons, *rims):
         canvas.fill([seen(outline)], FURNITURE)
         canvas.line(seen(outline), FURNITURE_EDGE, px=canvas.width(0.02), closed=True)
+
+
+def _signed_area(loop: Array) -> float:
+    x, y = loop.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def paint_landmarks(canvas: Canvas, belief: Belief, *, dot_px: float) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from training.errors import BadInput, Interrupted, one_line, suggestion
+from training.errors import BadInput, Interrupted, bad_input, one_line, suggestion
 
 if TYPE_CHECKING:
     from training.explore import Progress
@@ -126,10 +126,6 @@ def explore(
         start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
     )  # fmt: skip
     episode = task.prepare(options)
-    print(
-        f"exploring, at most {episode.run['max_steps']} steps; Ctrl-C ends it and keeps the results",
-        file=sys.stderr,
-    )
     with ExitStack() as stack:
         task.run(episode, _progress(stack))
     metrics = task.write_episode(episode)
@@ -184,8 +180,11 @@ def speed(
     """  # noqa: D301
     if not math.isfinite(seconds):
         raise BadInput(f"--seconds must be finite, got {seconds}")
+    from mecanum_env.env import make_config
     from training.speed import run
 
+    with bad_input():
+        make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
     run(seconds=seconds, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
 
 
@@ -202,6 +201,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = command.main(args=arguments, prog_name="mecanum", standalone_mode=False)
         sys.stdout.flush()
+        if code == 130:  # newer versions of typer hand KeyboardInterrupt back so
+            raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except _ClickException as error:
         if type(error).__name__ == "NoArgsIsHelpError":
@@ -213,7 +214,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Interrupted as error:
         return _fail(name, str(error), 130)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail(name, "interrupted; nothing was written", 130)
+        return _fail(name, "interrupted before the results were written", 130)
     except Exception as error:
         _drop_unwritable_output()
         if os.environ.get(TRACEBACK_VARIABLE) not in (None, "", "0"):
@@ -292,16 +293,16 @@ def _progress(stack: ExitStack) -> Progress:
 
 
 class _LogLines:
-    """A line on standard error every half a minute."""
+    """A line on standard error at the start, and every half a minute."""
 
     def __init__(self) -> None:
-        self._next = time.monotonic() + _LOG_EVERY_S
+        self._next = 0.0
 
     def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
-        if steps % 10 == 0 and time.monotonic() >= self._next:
-            self._next += _LOG_EVERY_S
-            line = f"step {steps} of at most {max_steps}: {100 * coverage:.1f} % mapped at {time_s:.0f} s"
-            print(line, file=sys.stderr, flush=True)
+        if steps % 10 == 1 and time.monotonic() >= self._next:
+            self._next = time.monotonic() + _LOG_EVERY_S
+            done = f"{100 * coverage:.1f} % mapped at {time_s:.0f} s"
+            print(f"exploring: step {steps} of at most {max_steps}, {done}", file=sys.stderr, flush=True)
 
 
 def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str]) -> str:

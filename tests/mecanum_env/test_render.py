@@ -9,12 +9,15 @@ import pytest
 
 from mecanum_env import rooms
 from mecanum_env.canvas import Canvas, View, _round_length
+from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
+from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.paint import FRONTIER, LANDMARK, PLANNED_PATH
 from mecanum_env.pictures import draw_map, draw_truth, episode_view
 from mecanum_env.render import FRAME_SHAPE, frontier_cells, render_frame
-from mecanum_env.rooms.draw import ROBOT
-from slam.geometry import transform_points
+from mecanum_env.rooms.draw import FLOOR, ROBOT, WALL
+from mecanum_env.rooms.importers import from_raster
+from slam.geometry import inverse, transform_points
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
@@ -177,3 +180,16 @@ def test_the_end_of_the_path_is_the_robot(env: ExploreEnv) -> None:
 )
 def test_scale_bars_are_round(longest: float, length: float) -> None:
     assert _round_length(longest) == pytest.approx(length)
+
+
+def test_a_pillar_is_solid_however_thick() -> None:
+    free = np.zeros((80, 80), bool)
+    free[5:75, 5:75] = True
+    free[30:50, 30:50] = False
+    plan = from_raster(free, name="pillar", resolution=0.05, start=(0.8, 0.8, 0.4))
+    ground = GroundTruth(plan, np.array(plan.start), robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+    view = View.fit((-2.0, -2.0, 4.0, 4.0), 600, 600)
+    image = draw_truth(ground, np.zeros((1, 3)), view=view)
+    for point, colour in (((2.0, 2.0), WALL), ((1.0, 2.0), FLOOR), ((3.0, 3.0), FLOOR), ((0.2, 2.0), WALL)):
+        ((col, row),) = view.pixels(transform_points(inverse(ground.start), np.array([point]))) // 16
+        assert tuple(image[row, col]) == colour, point

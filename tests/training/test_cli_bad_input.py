@@ -177,3 +177,18 @@ def test_bad_rooms(argv: list[str], words: list[str], tmp_path: Path, capsys: py
     line = refused(["rooms", "--out", str(tmp_path / "out"), *argv], capsys)
     assert all(word in line for word in words), line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--rooms", "castle"], ["unknown rooms 'castle'", "apartment"]),
+        (["--slam", "efk"], ["unknown SLAM backend 'efk'", "did you mean 'ekf'?"]),
+        (["--beams", "2"], ["--beams"]),
+        (["--seconds", "nan"], ["--seconds"]),
+        (["--seconds", "inf"], ["--seconds", "finite"]),
+    ],
+)
+def test_bad_speed(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(["speed", *argv], capsys)
+    assert all(word in line for word in words), line

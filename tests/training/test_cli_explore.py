@@ -189,6 +189,18 @@ def test_ctrl_c_keeps_the_episode_so_far(tmp_path: Path) -> None:
     assert len(times) == metrics["steps"] + 1
 
 
+def test_ctrl_c_before_the_episode_writes_nothing(tmp_path: Path) -> None:
+    # A config that is read from a pipe keeps the command waiting before the first step.
+    os.mkfifo(tmp_path / "config.toml")
+    process = run("explore", "--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out"))
+    with open(tmp_path / "config.toml", "w"):  # opens as soon as the other side reads
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "mecanum explore: interrupted before the results were written\n"
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full")
 def test_what_is_not_the_users_fault_is_one_line_with_exit_code_1(tmp_path: Path) -> None:
     with open("/dev/full", "w") as full:

@@ -1,0 +1,182 @@
+"""Steps per second of one environment on one core, and where each microsecond goes (``mecanum speed``)."""
+
+from __future__ import annotations
+
+import json
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+import agents
+import mecanum_env
+from mecanum_env.env import ExploreEnv
+from mecanum_env.observation import Observation
+from slam.settings import to_mapping
+
+__all__ = ["measure", "run"]
+
+# Whose method is which stage, innermost first; a stage's time excludes that of the stages within it.
+_STAGES: tuple[tuple[str, str, str], ...] = (
+    ("physics", "truth.world", "step"),
+    ("odometry", "_encoders", "odometry"),
+    ("lidar", "lidar", "scan"),
+    ("predict", "backend", "predict"),
+    ("features", "backend.extractor", "extract"),
+    ("association", "backend", "_associate"),
+    ("correction", "backend", "_correct"),
+    ("landmarks", "backend", "_manage"),
+    ("grid", "backend.grid", "integrate"),
+    ("key scans", "backend.key_scans", "redraw_if_moved"),
+    ("update, rest", "backend", "update"),
+    ("coverage", "_coverage", "update"),
+    ("observation", "", "_observe"),
+    ("info", "", "_info"),
+    ("reward", "", "_outcome"),
+)
+
+
+class _Stopwatch:
+    """Times the stages of an environment's steps, by standing in for their methods."""
+
+    def __init__(self) -> None:
+        self.step: dict[str, float] = {}
+        self.steps: dict[str, list[float]] = {name: [] for name, _, _ in _STAGES}
+        self.steps["wiring"] = []
+        self._open: list[float] = []
+
+    def attach(self, env: ExploreEnv) -> None:
+        """Put the watch on an environment that has just been reset."""
+        for stage, path, method in _STAGES:
+            owner: Any = env
+            for part in filter(None, path.split(".")):
+                owner = getattr(owner, part, None)
+            if owner is not None and hasattr(owner, method):
+                inner = getattr(type(owner), method).__get__(owner)
+                setattr(owner, method, self._timed(stage, inner))
+
+    def _timed(self, stage: str, inner: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            self._open.append(0.0)
+            start = time.perf_counter()
+            try:
+                return inner(*args, **kwargs)
+            finally:
+                whole = time.perf_counter() - start
+                nested = self._open.pop()
+                self.step[stage] = self.step.get(stage, 0.0) + whole - nested
+                if self._open:
+                    self._open[-1] += whole
+
+        return timed
+
+    def close_step(self, whole: float) -> None:
+        """Book one step that took ``whole`` seconds."""
+        for name, samples in self.steps.items():
+            if name != "wiring":
+                samples.append(self.step.get(name, 0.0))
+        self.steps["wiring"].append(whole - sum(self.step.values()))
+        self.step = {}
+
+
+def _drive(
+    env: gymnasium.Env[Observation, Any], seconds: float, seed: int, watch: _Stopwatch | None
+) -> tuple[list[float], list[int]]:
+    """Explore for ``seconds`` of stepping; return the time of each step [s] and the landmarks at each.
+
+    The agent's own time is not counted, but it is what makes the steps those of an exploration, with the
+    landmarks and the map that such a room gives.
+    """
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
+    times: list[float] = []
+    landmarks: list[int] = []
+    spent = 0.0
+    done = True
+    observation: Observation = {}
+    while spent < seconds:
+        if done:
+            observation, _ = env.reset(seed=seed)
+            agent.reset(inner.belief, seed=seed)
+            seed += 1
+            if watch is not None:
+                watch.attach(inner)
+        action = agent.act(observation, inner.belief)
+        start = time.perf_counter()
+        observation, _, terminated, truncated, _ = env.step(action)
+        took = time.perf_counter() - start
+        if watch is not None:
+            watch.close_step(took)
+        done = terminated or truncated or agent.status in ("covered", "stuck")
+        times.append(took)
+        landmarks.append(inner.backend.landmark_count)
+        spent += took
+    return times, landmarks
+
+
+def measure(*, seconds: float, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
+    """Return ``steps_per_second``, ``stages_us``, ``landmarks_mean``, ``rss_mb`` and ``config``."""
+    env = gymnasium.make(
+        "mecanum_env:mecanum_env/Explore-v0",
+        rooms=rooms, slam=slam, lidar={"beams": beams}, config={"coverage_target": 1.0},
+        max_episode_steps=mecanum_env.MAX_EPISODE_STEPS,
+    )  # fmt: skip
+    _drive(env, 0.2, seed, None)  # compiles what is not compiled yet
+    rss_before = _rss_mb()
+    times, landmarks = _drive(env, seconds, seed, None)
+    watch = _Stopwatch()
+    timed, _ = _drive(env, min(seconds, 5.0), seed, watch)
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    stages = {name: 1e6 * statistics.median(samples) for name, samples in watch.steps.items()}
+    means = {name: 1e6 * statistics.fmean(samples) for name, samples in watch.steps.items()}
+    return {
+        "steps_per_second": len(times) / sum(times),
+        "step_us_median": 1e6 * statistics.median(times),
+        "step_us_p99": 1e6 * float(np.quantile(times, 0.99)),
+        "stages_us": stages,
+        "stages_us_mean": means,
+        "watched_step_us_median": 1e6 * statistics.median(timed),
+        "landmarks_mean": float(np.mean(landmarks)),
+        "steps": len(times),
+        "rss_mb": _rss_mb(),
+        "rss_mb_before": rss_before,
+        "machine": f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}",
+        "config": to_mapping(inner.config),
+    }
+
+
+def run(*, seconds: float, rooms: str, slam: str, beams: int, seed: int, as_json: bool) -> dict[str, Any]:
+    """Measure, and print a table (or one JSON object) on standard output."""
+    print(f"measuring {rooms}, {slam}, {beams} beams for {seconds:g} s of stepping …", file=sys.stderr)
+    result = measure(seconds=seconds, rooms=rooms, slam=slam, beams=beams, seed=seed)
+    if as_json:
+        print(json.dumps(result))
+        return result
+    print(
+        f"{result['steps_per_second']:,.0f} complete steps per second ({result['steps']:,} steps; median "
+        f"{result['step_us_median']:.0f} µs, 99th percentile {result['step_us_p99']:.0f} µs; "
+        f"{result['landmarks_mean']:.0f} landmarks on average; {result['rss_mb']:.0f} MB)"
+    )
+    print(f"{'stage':<14}{'median µs':>10}{'mean µs':>10}")
+    for name, median in sorted(result["stages_us"].items(), key=lambda item: -item[1]):
+        print(f"{name:<14}{median:>10.1f}{result['stages_us_mean'][name]:>10.1f}")
+    return result
+
+
+def _rss_mb() -> float:
+    """Return this process's resident memory [MB]; 0 where the platform does not tell."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            pages = int(file.read().split()[1])
+    except OSError:
+        return 0.0
+    import resource
+
+    return pages * resource.getpagesize() / 1e6
