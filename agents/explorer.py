@@ -18,8 +18,9 @@ from agents import cost_map as cost_maps
 from agents.base import Agent, Goal
 from agents.control import ControlConfig, PathFollower
 from agents.cost_map import CostMap, PlannerConfig
-from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask, view_points
+from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask
 from agents.planning import TravelCosts, shortest_path, travel_costs
+from agents.sight import Watch, view_points
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.settings import from_mapping, require
@@ -37,8 +38,7 @@ class PatienceConfig:
     replan_s: float = 1.0
     min_replan_s: float = 0.3  # between two choices, whatever happens
     settle_s: float = 0.2  # how long to look from a view point before it counts as looked from
-    looks: int = 2  # at one piece of frontier, each from nearer, before it is let be
-    nearer: float = 0.4  # share of the view range left at each further look
+    looks: int = 1  # at one piece of frontier before it is let be
     stuck_s: float = 4.0  # without moving or turning: recover
     recover_s: float = 1.5
     avoid_s: float = 20.0  # how long a goal that did not work out is put last; doubled each time
@@ -50,7 +50,6 @@ class PatienceConfig:
         for f in fields(self):
             value = getattr(self, f.name)
             require(math.isfinite(value) and value > 0, f"PatienceConfig.{f.name} must be > 0, got {value}")
-        require(self.nearer < 1, f"PatienceConfig.nearer must be < 1, got {self.nearer}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +118,7 @@ class Explorer(Agent):
         self._anchor = np.zeros(3)
         self._anchored_at = 0.0
         self._troubles: list[_Trouble] = []
+        self._track: list[Array] = []  # sensor poses (3,) that frontiers were seen from
 
     # ---- choosing ------------------------------------------------------------------------------------------
 
@@ -161,16 +161,17 @@ class Explorer(Agent):
         config = self.config
         cost_map = cost_maps.build(belief, config.planner, self._robot)
         travel = travel_costs(cost_map)
-        frontiers = find(cost_map, config.frontiers)
+        watch = self._watch_kept()
+        frontiers = find(cost_map, config.frontiers, watch)
         troubles = [self._trouble(point) for point in frontiers.targets]
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
         views = view_points(
             cost_map,
             travel,
-            frontiers,
-            config.frontiers,
-            range_m=self._lidar.range_max_m,
-            shares=config.patience.nearer**looks,
+            frontiers.targets,
+            frontiers.normals,
+            range_m=watch.range_m,
+            beyond_m=config.frontiers.beyond_m,
         )
         costs = views.costs.copy()
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
@@ -180,6 +181,25 @@ class Explorer(Agent):
         if np.isfinite(costs[~avoided]).any():
             costs[avoided] = np.inf
         return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
+
+    def _watch_kept(self) -> Watch:
+        return Watch(
+            poses=np.array(self._track).reshape(-1, 3),
+            range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m),
+            half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
+        )
+
+    def _keep_watch(self, belief: Belief) -> None:
+        """Remember from where the sensor has looked, every little way and turn."""
+        sensor = geometry.compose(
+            np.asarray(belief.pose, dtype=np.float64), np.array([self._lidar.offset_m, 0.0, 0.0])
+        )
+        if self._track:
+            moved = float(np.hypot(*(sensor[:2] - self._track[-1][:2])))
+            turned = abs(geometry.wrap_scalar(sensor[2] - self._track[-1][2]))
+            if moved < 0.2 and (self._lidar.field_of_view_deg >= 360.0 or turned < 0.3):
+                return
+        self._track.append(sensor)
 
     def _current(self, frontiers: Frontiers, costs: Array) -> int | None:
         if self._target is None or not len(costs):
@@ -208,6 +228,7 @@ class Explorer(Agent):
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
+        self._keep_watch(belief)
         if self._due(belief):
             self._goal = self.choose(belief)
             self._chosen_at = self._time

@@ -53,7 +53,7 @@ Settings = str | Mapping[str, Any]
 ACTIONS = {"twist": 3, "wheels": 4}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Truth:
     """What is really so: for metrics and drawing only."""
 
@@ -235,7 +235,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._odometry = self._encoders.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
         plan = self.truth.plan
         self.scan = self.lidar.scan(plan.segments, plan.circles, world.pose, self._sensor_rng)
-        self.truth = dataclasses.replace(self.truth, scan=self.scan)
+        self.truth.scan = self.scan
         self.backend.predict(self._odometry)
         self._give_truth()
         self.backend.update(self.scan)
@@ -296,14 +296,9 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return plan
 
     def _wheel_targets(self, action: NDArray[np.float32]) -> Array:
-        a = np.asarray(action, dtype=np.float64)
-        size = ACTIONS[self._action]
-        if a.shape != (size,) or not math.isfinite(float(a.sum())):
-            raise ValueError(f"an action is {size} finite numbers in [-1, 1], got {action!r}")
-        a = np.clip(a, -1.0, 1.0)
         if self._action == "wheels":
-            return action_to_wheels(self.config.robot, a)
-        return twist_action_to_wheels(self.config.robot, a)
+            return action_to_wheels(self.config.robot, action)
+        return twist_action_to_wheels(self.config.robot, action)
 
     def _give_truth(self) -> None:
         if isinstance(self.backend, TruthSlam):
@@ -333,6 +328,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
         estimate, cov = self.backend.pose, self.backend.pose_cov
         nees = float(nees_pose(estimate, cov, true_pose))
+        x, y, theta = estimate.tolist()
+        true_x, true_y, true_theta = true_pose.tolist()
         record, world = self.truth.record, self.truth.world
         time_s = self._steps * self.config.step_s
         record.append(time_s, true_pose, estimate, coverage, nees)
@@ -343,8 +340,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "path_length_m": record.path_length_m,
             "time_s": time_s,
             "true_pose": true_pose,
-            "position_error_m": math.hypot(true_pose[0] - estimate[0], true_pose[1] - estimate[1]),
-            "heading_error_rad": abs(wrap_scalar(true_pose[2] - estimate[2])),
+            "position_error_m": math.hypot(true_x - x, true_y - y),
+            "heading_error_rad": abs(wrap_scalar(true_theta - theta)),
             "nees": nees,
         }
 
@@ -383,7 +380,6 @@ def make_backend(config: EnvConfig) -> Backend:
 
 def _entropy(cov: Array) -> float:
     """Return the pose's differential entropy up to a constant: ½ log |Σ| [nat]."""
-    a, b, c = cov[0, 0], cov[0, 1], cov[0, 2]
-    d, e, f = cov[1, 1], cov[1, 2], cov[2, 2]
+    (a, b, c), (_, d, e), (_, _, f) = cov.tolist()
     det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
-    return 0.5 * math.log(max(float(det), 1e-60))
+    return 0.5 * math.log(max(det, 1e-60))

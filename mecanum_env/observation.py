@@ -149,32 +149,50 @@ def _fill_local(
     col_left, row_left = np.int64(s * one), np.int64(-c * one)  # one pixel to the right
     dcol_a, dcol_b = np.int64(0.25 * (c - s) * one), np.int64(0.25 * (c + s) * one)
     drow_a, drow_b = np.int64(0.25 * (s + c) * one), np.int64(0.25 * (s - c) * one)
+    reach_col = abs(dcol_a) + abs(dcol_b)
+    reach_row = abs(drow_a) + abs(drow_b)
     for i in range(size):
         ahead = half - i
         col = np.int64((x / resolution - col0 + c * ahead - s * half) * one)
         row = np.int64((y / resolution - row0 + s * ahead + c * half) * one)
+        # A line of pixels whose two ends lie in the grid lies in it altogether.
+        last_col, last_row = col + (size - 1) * col_left, row + (size - 1) * row_left
+        inside = (
+            min(col, last_col) - reach_col >= 0
+            and min(row, last_row) - reach_row >= 0
+            and (max(col, last_col) + reach_col) >> 16 < cols
+            and (max(row, last_row) + reach_row) >> 16 < rows
+        )
         for j in range(size):
-            c0, c1, c2, c3 = (col + dcol_a) >> 16, (col + dcol_b) >> 16, (col - dcol_a) >> 16, (col - dcol_b) >> 16
-            r0, r1, r2, r3 = (row + drow_a) >> 16, (row + drow_b) >> 16, (row - drow_a) >> 16, (row - drow_b) >> 16
+            here_col, here_row = col, row
             col += col_left
             row += row_left
-            if min(min(c0, c1), min(c2, c3)) < 0 or min(min(r0, r1), min(r2, r3)) < 0 or (
-                max(max(c0, c1), max(c2, c3)) >= cols or max(max(r0, r1), max(r2, r3)) >= rows
-            ):  # fmt: skip
+            if not inside and (
+                here_col - reach_col < 0
+                or here_row - reach_row < 0
+                or (here_col + reach_col) >> 16 >= cols
+                or (here_row + reach_row) >> 16 >= rows
+            ):
                 probability[i, j] = UNKNOWN_BYTE
                 observed[i, j] = trail[i, j] = 0
                 continue
-            # Zero means never observed: below every observed value, so that it loses against each.
-            v0, v1, v2, v3 = log_odds[r0, c0], log_odds[r1, c1], log_odds[r2, c2], log_odds[r3, c3]
-            if (v0 | v1 | v2 | v3) == 0:
+            # Zero means never observed: it loses against every observed value.
+            v0 = log_odds[(here_row + drow_a) >> 16, (here_col + dcol_a) >> 16]
+            v1 = log_odds[(here_row + drow_b) >> 16, (here_col + dcol_b) >> 16]
+            v2 = log_odds[(here_row - drow_a) >> 16, (here_col - dcol_a) >> 16]
+            v3 = log_odds[(here_row - drow_b) >> 16, (here_col - dcol_b) >> 16]
+            best = max(max(v0, v1), max(v2, v3))
+            if best == 0:
+                best = -128
+                for v in (v0, v1, v2, v3):
+                    best = max(best, v if v != 0 else -128)
+            if best == -128:
                 probability[i, j] = UNKNOWN_BYTE
                 observed[i, j] = trail[i, j] = 0
-                continue
-            v0, v1 = v0 if v0 != 0 else -128, v1 if v1 != 0 else -128
-            v2, v3 = v2 if v2 != 0 else -128, v3 if v3 != 0 else -128
-            probability[i, j] = PROBABILITY_BYTE[max(max(v0, v1), max(v2, v3)) & 255]
-            observed[i, j] = 255
-            trail[i, j] = 255 * (visited[r0, c0] | visited[r1, c1] | visited[r2, c2] | visited[r3, c3])
+            else:
+                probability[i, j] = PROBABILITY_BYTE[best & 255]
+                observed[i, j] = 255
+                trail[i, j] = 255 * visited[here_row >> 16, here_col >> 16]
 
 
 @njit(cache=True, nogil=True)

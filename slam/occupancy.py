@@ -32,6 +32,7 @@ HIT, MISS = 17, -8  # 0.85 and -0.4 nat: p = 0.70 and 0.40
 MAX_LOG_ODDS, MIN_LOG_ODDS = 70, -40  # p = 0.97 and 0.12
 OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 
+_WORD = 8  # cells that the kernel looks at together
 _CHUNK = 32  # the grid's edges lie on multiples of this, so that every overview block is whole
 _OVERVIEW = 64  # the overview never has more than this many blocks a side
 _FIXED_POINT = 4  # fractional bits of the polygon's vertices
@@ -50,6 +51,9 @@ def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]
 
 
 PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
+_NO_MARKS = np.uint64(0)
+_ALL_FREE = np.full(_WORD, _IN_FREE, np.uint8).view(np.uint64)[0]
+_ALL_SURELY_FREE = np.full(_WORD, MIN_LOG_ODDS, np.int8).view(np.uint64)[0]
 
 
 class OccupancyGrid:
@@ -200,12 +204,12 @@ class OccupancyGrid:
         n = len(scan.ranges)
         reach = math.ceil(scan.range_max / self.resolution) + 3
         if self._mask.shape[0] < 2 * reach + 1:
-            self._mask = np.zeros((2 * reach + 1, 2 * reach + 1), np.uint8)
+            self._mask = np.zeros((2 * reach + 1, (2 * reach // _WORD + 3) * _WORD), np.uint8)
         rays = self._ray_table(n, scan.angle_min, scan.angle_increment)
         x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
-        # The mask's centre cell is the sensor's.
+        # The sensor is near the mask's middle; its columns lie eight cells to a word of the grid's.
         mask_row = math.floor(y / self.resolution) - reach
-        mask_col = math.floor(x / self.resolution) - reach
+        mask_col = (math.floor(x / self.resolution) - reach) & -_WORD
         full_circle = n * scan.angle_increment > 2 * math.pi - 1.5 * scan.angle_increment
         polygon = np.empty((n + 1, 2), np.int32)
         count, r0, c0, r1, c1 = _outline(
@@ -214,6 +218,7 @@ class OccupancyGrid:
         )  # fmt: skip
         if count < 3:
             return
+        c0, c1 = c0 & -_WORD, c1 | (_WORD - 1)
         mask = self._mask[r0 : r1 + 1, c0 : c1 + 1]
         offset = (-c0 << _FIXED_POINT, -r0 << _FIXED_POINT)  # in the fixed-point units of the vertices
         cv2.fillPoly(mask, [polygon[:count]], _IN_FREE, cv2.LINE_8, _FIXED_POINT, offset)
@@ -227,7 +232,8 @@ class OccupancyGrid:
             grown[: self._change_count] = self._changes[: self._change_count]
             self._changes = grown
         self._change_count, known, entropy = _fuse(
-            self.log_odds, mask, mask_row + r0 - self._row0, mask_col + c0 - self._col0,
+            self.log_odds, self.log_odds.view(np.uint64), mask, mask.view(np.uint64),
+            mask_row + r0 - self._row0, mask_col + c0 - self._col0,
             self._overview_probability, self._overview_known, self.overview_block,
             self._changes, self._change_count, self._row0, self._col0,
         )  # fmt: skip
@@ -378,36 +384,40 @@ def _mark_surfaces(
 
 @njit(cache=True, nogil=True)
 def _fuse(
-    log_odds: NDArray[np.int8], mask: NDArray[np.uint8], row0: int, col0: int,
-    overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], block: int,
-    changes: NDArray[np.int32], count: int, lattice_row: int, lattice_col: int,
+    log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], mask: NDArray[np.uint8],
+    mask_words: NDArray[np.uint64], row0: int, col0: int, overview_probability: NDArray[np.int32],
+    overview_known: NDArray[np.int32], block: int, changes: NDArray[np.int32], count: int, lattice_row: int,
+    lattice_col: int,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Add a scan's mask to the grid and wipe it; return the change count and the known cells and entropy added."""
-    rows, cols = mask.shape
+    """Add a scan's mask to the grid and wipe it.
+
+    Return the number of changes, and by how much the known cells and the entropy went up. Eight cells at a time
+    are passed over where the scan says nothing, or only that surely free cells are free: most of a known map.
+    """
     known = 0
     entropy = 0.0
-    for i in range(rows):
-        marks = mask[i]
-        cells = log_odds[row0 + i, col0 : col0 + cols]
-        # First look whether the row changes at all: most of a known map is saturated, and this vectorises.
-        changed = 0
-        for j in range(cols):
-            m = marks[j]
-            v = cells[j]
-            changed |= ((m == _IN_FREE) & (v > MIN_LOG_ODDS)) | ((m == _IN_SURFACE) & (v < MAX_LOG_ODDS))
-        if changed != 0:
-            for j in range(cols):
-                m = marks[j]
-                if m == 0:
+    word0 = col0 // _WORD
+    for i in range(mask.shape[0]):
+        for word in range(mask_words.shape[1]):
+            marks = mask_words[i, word]
+            if marks == _NO_MARKS:
+                continue
+            mask_words[i, word] = _NO_MARKS
+            if marks == _ALL_FREE and log_odds_words[row0 + i, word0 + word] == _ALL_SURELY_FREE:
+                continue
+            for k in range(_WORD):
+                mark = (marks >> np.uint64(8 * k)) & np.uint64(255)  # little-endian, as x86 and ARM are
+                if mark == 0:
                     continue
-                old = int(cells[j])
-                new: int = min(old + HIT, MAX_LOG_ODDS) if m == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
+                row, col = row0 + i, col0 + _WORD * word + k
+                old = int(log_odds[row, col])
+                new: int = min(old + HIT, MAX_LOG_ODDS) if mark == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
                 if new == old:
                     continue
                 if new == 0:
                     new = -1  # zero means never observed
-                cells[j] = new
-                r, c = (row0 + i) // block, (col0 + j) // block
+                log_odds[row, col] = new
+                r, c = row // block, col // block
                 delta = int(PROBABILITY_BYTE[new & 255])
                 entropy += ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255]
                 if old == 0:
@@ -417,12 +427,11 @@ def _fuse(
                     delta -= int(PROBABILITY_BYTE[old & 255])
                 overview_probability[r, c] += delta
                 if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
-                    changes[count, 0] = lattice_row + row0 + i
-                    changes[count, 1] = lattice_col + col0 + j
+                    changes[count, 0] = lattice_row + row
+                    changes[count, 1] = lattice_col + col
                     changes[count, 2] = CLASS_OF[old & 255]
                     changes[count, 3] = CLASS_OF[new & 255]
                     count += 1
-        marks[:] = 0
     return count, known, entropy
 
 

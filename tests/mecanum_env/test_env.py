@@ -265,7 +265,7 @@ def test_wrong_settings_are_named(kwargs: dict[str, Any], message: str) -> None:
 def test_wrong_actions_are_refused(action: list[float]) -> None:
     env = make().unwrapped
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"an action is 3 finite numbers in \[-1, 1\]"):
+    with pytest.raises(ValueError, match=r"an action must be 3 finite numbers in \[-1, 1\]"):
         env.step(np.array(action, np.float32))
 
 
