@@ -73,6 +73,7 @@ class CostMap:
     resolution: float  # [m]
     origin: tuple[float, float]  # lower-left corner of cell (0, 0) in the belief's frame [m]
     start: tuple[int, int]  # the robot's cell
+    suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
 
     def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
@@ -127,7 +128,9 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     )
     classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
     wall = np.full((rows, cols), _FAR_M, dtype=np.float32)
-    _coarsen(fine, clearance(fine, fine_resolution), factor, row_pad, col_pad, classes, wall)
+    suspect = np.zeros((rows, cols), dtype=np.bool_)
+    log_odds = belief.grid.log_odds[row_slice, col_slice]
+    _coarsen(fine, log_odds, clearance(fine, fine_resolution), factor, row_pad, col_pad, classes, wall, suspect)
     x, y = float(belief.pose[0]), float(belief.pose[1])
     row = min(max(int((y - origin[1]) // resolution), 1), rows - 2)
     col = min(max(int((x - origin[0]) // resolution), 1), cols - 2)
@@ -136,7 +139,7 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
     highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
     _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
-    return CostMap(classes, wall, weight, resolution, origin, (row, col))
+    return CostMap(classes, wall, weight, resolution, origin, (row, col), suspect)
 
 
 def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
@@ -198,12 +201,14 @@ def _weigh(
 @njit(cache=True, nogil=True)
 def _coarsen(
     fine: NDArray[np.int8],
+    log_odds: NDArray[np.int8],
     distance: NDArray[np.float32],
     factor: int,
     row_pad: int,
     col_pad: int,
     classes: NDArray[np.int8],
     wall: NDArray[np.float32],
+    suspect: NDArray[np.bool_],
 ) -> None:
     rows, cols = fine.shape
     for row in range(1, classes.shape[0] - 1):
@@ -219,6 +224,8 @@ def _coarsen(
                         occupied += 1
                     elif fine[r, c] == FREE:
                         free += 1
+                    elif log_odds[r, c] > 0:
+                        suspect[row, col] = True
             if occupied > 0:
                 classes[row, col] = OCCUPIED
             elif 2 * free > factor * factor:

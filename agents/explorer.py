@@ -174,6 +174,11 @@ class Explorer(Agent):
             beyond_m=config.frontiers.beyond_m,
         )
         costs = views.costs.copy()
+        # The farther the way, the more there must be to see.
+        settings = config.frontiers
+        share = np.minimum(costs / settings.far_m, 1.0)
+        wanted = settings.min_extent_m + share * (settings.far_extent_m - settings.min_extent_m)
+        costs[frontiers.extents[frontiers.target_labels] < wanted - 1e-9] = np.inf
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
         costs[(looks >= config.patience.looks) | (failures >= config.patience.attempts)] = np.inf
         # What did not work out lately comes last, but comes before giving up.
@@ -183,9 +188,11 @@ class Explorer(Agent):
         return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
 
     def _watch_kept(self) -> Watch:
+        # Beams fall no farther apart than a cell of the planning grid.
+        dense = max(self.config.planner.resolution_m / self._lidar.angle_increment, 1.0)
         return Watch(
             poses=np.array(self._track).reshape(-1, 3),
-            range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m),
+            range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, dense),
             half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
         )
 

@@ -24,17 +24,20 @@ class FrontierConfig:
     """What counts as a frontier, and from where one is looked at."""
 
     min_extent_m: float = 0.3  # longer side of a cluster's bounding box
+    far_extent_m: float = 0.5  # the same for a cluster as far away as far_m or farther: in between in proportion
+    far_m: float = 5.0  # travel cost [weighted m]
     min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
+    min_unknown_width_m: float = 0.3  # thinner ones are the insides of walls
     min_clearance_m: float = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
     spacing_m: float = 0.6  # a long cluster is looked at in pieces of about this size
-    view_range_m: float = 2.5  # farthest place to look from, squarely; never beyond 0.8 of the lidar's range
+    view_range_m: float = 4.0  # farthest place to look from, squarely; never beyond 0.8 of the lidar's range
     beyond_m: float = 0.3  # how far behind the frontier a view point must see
 
     def __post_init__(self) -> None:
-        for name in ("min_extent_m", "min_unknown_m2", "min_clearance_m", "beyond_m"):
+        for name in ("min_extent_m", "min_unknown_m2", "min_unknown_width_m", "min_clearance_m", "beyond_m", "far_extent_m"):
             value = getattr(self, name)
             require(math.isfinite(value) and value >= 0, f"FrontierConfig.{name} must be ≥ 0, got {value}")
-        for name in ("spacing_m", "view_range_m"):
+        for name in ("spacing_m", "view_range_m", "far_m"):
             value = getattr(self, name)
             require(math.isfinite(value) and value > 0, f"FrontierConfig.{name} must be > 0, got {value}")
 
@@ -66,8 +69,8 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     With a ``watch``, so are the cells that were in good sight already and did not yield.
     """
     classes, resolution = cost_map.classes, cost_map.resolution
-    mask = frontier_mask(classes) & (cost_map.clearance >= np.float32(config.min_clearance_m))
-    mask &= _borders_a_large_pocket(classes, resolution, config.min_unknown_m2)
+    mask = (classes == FREE) & (cost_map.clearance >= np.float32(config.min_clearance_m))
+    mask &= ~cost_map.suspect & _borders_a_large_pocket(cost_map, config)
     cells = np.argwhere(mask)
     normals = _normals(classes, cells)
     if watch is not None:
@@ -88,14 +91,19 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     return Frontiers(points, own, extent[large], points[chosen], own[chosen], sizes, normals[chosen])
 
 
-def _borders_a_large_pocket(classes: NDArray[np.int8], resolution: float, min_area: float) -> NDArray[np.bool_]:
-    unknown = (classes == UNKNOWN).view(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(unknown, connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] * resolution**2 >= min_area
+def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArray[np.bool_]:
+    """Return the cells beside unknown regions that are neither thin (inside a wall) nor small."""
+    unknown = ((cost_map.classes == UNKNOWN) & ~cost_map.suspect).view(np.uint8)
+    span = max(1, round(config.min_unknown_width_m / cost_map.resolution))
+    opening = np.ones((span, span), dtype=np.uint8)
+    # Beyond the grid all is unknown.
+    thick = cv2.erode(unknown, opening, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    thick = cv2.dilate(thick, opening[::-1, ::-1], anchor=(span - 1 - span // 2,) * 2)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+    large = stats[:, cv2.CC_STAT_AREA] * cost_map.resolution**2 >= config.min_unknown_m2
     large[0] = False
     pockets = large[labels].astype(np.uint8)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    near: NDArray[np.bool_] = cv2.dilate(pockets, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) != 0
+    near: NDArray[np.bool_] = cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8)) != 0
     return near
 
 

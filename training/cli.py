@@ -164,7 +164,7 @@ def rooms(
 
 @app.command()
 def speed(
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to measure.")] = 10.0,
+    steps: Annotated[int, typer.Option(min=100, max=10_000_000, help="Steps to measure.")] = 10_000,
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
     beams: Annotated[int, typer.Option(min=8, help="Beams of the lidar.")] = 360,
@@ -176,16 +176,14 @@ def speed(
     \b
     Examples:
       mecanum speed
-      mecanum speed --slam odometry --beams 180 --seconds 5 --json
+      mecanum speed --slam odometry --beams 180 --steps 3000 --json
     """  # noqa: D301
-    if not math.isfinite(seconds):
-        raise BadInput(f"--seconds must be finite, got {seconds}")
     from mecanum_env.env import make_config
     from training.speed import run
 
     with bad_input():
         make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
-    run(seconds=seconds, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
+    run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
 
 
 # ---- running it ------------------------------------------------------------------------------------------------

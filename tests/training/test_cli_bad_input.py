@@ -185,8 +185,8 @@ def test_bad_rooms(argv: list[str], words: list[str], tmp_path: Path, capsys: py
         (["--rooms", "castle"], ["unknown rooms 'castle'", "apartment"]),
         (["--slam", "efk"], ["unknown SLAM backend 'efk'", "did you mean 'ekf'?"]),
         (["--beams", "2"], ["--beams"]),
-        (["--seconds", "nan"], ["--seconds"]),
-        (["--seconds", "inf"], ["--seconds", "finite"]),
+        (["--steps", "nan"], ["--steps"]),
+        (["--steps", "1"], ["--steps", "100"]),
     ],
 )
 def test_bad_speed(argv: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
