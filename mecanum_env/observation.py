@@ -142,57 +142,43 @@ def _fill_local(
     step = LOCAL_CELL_M / resolution
     c, s = math.cos(theta) * step, math.sin(theta) * step
     rows, cols = log_odds.shape
-    probability, observed, trail = out[0], out[1], out[2]
-    # Positions in cells as fixed-point numbers: sixteen bits of fraction, so that a shift is the floor.
+    # Flat arrays and unsigned indices: without them every access tests for a negative index.
+    cells, trail = log_odds.ravel(), visited.ravel()
+    # Positions in cells as fixed-point numbers with sixteen bits of fraction: a shift is the floor.
     one = 65536.0
     half = 0.5 * size - 0.5
-    col_left, row_left = np.int64(s * one), np.int64(-c * one)  # one pixel to the right
-    dcol_a, dcol_b = np.int64(0.25 * (c - s) * one), np.int64(0.25 * (c + s) * one)
-    drow_a, drow_b = np.int64(0.25 * (s + c) * one), np.int64(0.25 * (s - c) * one)
-    reach_col = abs(dcol_a) + abs(dcol_b)
-    reach_row = abs(drow_a) + abs(drow_b)
+    col_step, row_step = np.int64(s * one), np.int64(-c * one)  # one pixel to the right
+    col_a, col_b = np.int64(0.25 * (c - s) * one), np.int64(0.25 * (c + s) * one)  # to the four points
+    row_a, row_b = np.int64(0.25 * (s + c) * one), np.int64(0.25 * (s - c) * one)
+    col_reach, row_reach = abs(col_a) + abs(col_b), abs(row_a) + abs(row_b)
     for i in range(size):
         ahead = half - i
         col = np.int64((x / resolution - col0 + c * ahead - s * half) * one)
         row = np.int64((y / resolution - row0 + s * ahead + c * half) * one)
-        # A line of pixels whose two ends lie in the grid lies in it altogether.
-        last_col, last_row = col + (size - 1) * col_left, row + (size - 1) * row_left
-        inside = (
-            min(col, last_col) - reach_col >= 0
-            and min(row, last_row) - reach_row >= 0
-            and (max(col, last_col) + reach_col) >> 16 < cols
-            and (max(row, last_row) + reach_row) >> 16 < rows
-        )
+        probability_row, observed_row, trail_row = out[0, i], out[1, i], out[2, i]
         for j in range(size):
-            here_col, here_row = col, row
-            col += col_left
-            row += row_left
-            if not inside and (
-                here_col - reach_col < 0
-                or here_row - reach_row < 0
-                or (here_col + reach_col) >> 16 >= cols
-                or (here_row + reach_row) >> 16 >= rows
+            best = 0
+            if (
+                col >= col_reach
+                and row >= row_reach
+                and (col + col_reach) >> 16 < cols
+                and (row + row_reach) >> 16 < rows
             ):
-                probability[i, j] = UNKNOWN_BYTE
-                observed[i, j] = trail[i, j] = 0
-                continue
-            # Zero means never observed: it loses against every observed value.
-            v0 = log_odds[(here_row + drow_a) >> 16, (here_col + dcol_a) >> 16]
-            v1 = log_odds[(here_row + drow_b) >> 16, (here_col + dcol_b) >> 16]
-            v2 = log_odds[(here_row - drow_a) >> 16, (here_col - dcol_a) >> 16]
-            v3 = log_odds[(here_row - drow_b) >> 16, (here_col - dcol_b) >> 16]
-            best = max(max(v0, v1), max(v2, v3))
-            if best == 0:
-                best = -128
-                for v in (v0, v1, v2, v3):
-                    best = max(best, v if v != 0 else -128)
-            if best == -128:
-                probability[i, j] = UNKNOWN_BYTE
-                observed[i, j] = trail[i, j] = 0
-            else:
-                probability[i, j] = PROBABILITY_BYTE[best & 255]
-                observed[i, j] = 255
-                trail[i, j] = 255 * visited[here_row >> 16, here_col >> 16]
+                v0 = cells[np.uint64(((row + row_a) >> 16) * cols + ((col + col_a) >> 16))]
+                v1 = cells[np.uint64(((row + row_b) >> 16) * cols + ((col + col_b) >> 16))]
+                v2 = cells[np.uint64(((row - row_a) >> 16) * cols + ((col - col_a) >> 16))]
+                v3 = cells[np.uint64(((row - row_b) >> 16) * cols + ((col - col_b) >> 16))]
+                best = max(max(v0, v1), max(v2, v3))
+                if best == 0 and min(min(v0, v1), min(v2, v3)) != 0:
+                    # Zero means never observed: it gives way to whatever was.
+                    best = -128
+                    for v in (v0, v1, v2, v3):
+                        best = max(best, v if v != 0 else -128)
+            probability_row[j] = PROBABILITY_BYTE[np.uint64(best & 255)]  # of 0, one half
+            observed_row[j] = 255 if best != 0 else 0
+            trail_row[j] = 255 * trail[np.uint64((row >> 16) * cols + (col >> 16))] if best != 0 else 0
+            col += col_step
+            row += row_step
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, UNKNOWN_BYTE, _fill_global, _fill_local, map_frame
+from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
+from tests.slam.simulated import room_scan
+
+poses = st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.floats(-3.1, 3.1))
+
+
+def room_grid(resolution: float = 0.05) -> OccupancyGrid:
+    grid = OccupancyGrid(resolution)
+    for pose in ((1.0, 1.0, 0.0), (4.0, 3.0, 1.0)):
+        grid.integrate(np.array(pose), room_scan(np.array(pose)))
+        grid.mark_visited(pose[0], pose[1], 0.25)
+    return grid
+
+
+@given(poses, st.sampled_from([0.05, 0.1]))
+def test_local_map_against_the_simple_version(pose: tuple[float, float, float], resolution: float) -> None:
+    grid = room_grid(resolution)
+    x, y, theta = pose
+    out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, resolution, x, y, theta)
+    c, s = math.cos(theta), math.sin(theta)
+    differing = 0
+    for i in range(0, MAP_SIZE, 3):
+        for j in range(0, MAP_SIZE, 3):
+            values = []
+            for da in (-0.25, 0.25):
+                for dl in (-0.25, 0.25):
+                    ahead = (MAP_SIZE / 2 - i - 0.5 + da) * LOCAL_CELL_M
+                    left = (MAP_SIZE / 2 - j - 0.5 + dl) * LOCAL_CELL_M
+                    point = np.array([[x + c * ahead - s * left, y + s * ahead + c * left]])
+                    row, col = grid.to_cells(point)[0]
+                    if 0 <= row < grid.shape[0] and 0 <= col < grid.shape[1]:
+                        values.append(int(grid.log_odds[row, col]))
+            seen = [v for v in values if v != 0]
+            want = PROBABILITY_BYTE[max(seen) & 255] if seen and len(values) == 4 else UNKNOWN_BYTE
+            differing += int(out[0, i, j] != want)
+            assert (out[1, i, j] == 255) == (out[0, i, j] != UNKNOWN_BYTE)
+    assert differing <= 3  # fixed-point rounding at the edge of a cell, and of the grid
+
+
+def test_the_local_map_is_heading_up() -> None:
+    grid = OccupancyGrid()
+    pose = np.array([2.0, 2.5, math.pi / 2])  # facing +y: the wall ahead is 2.5 m away, the left one 2 m
+    grid.integrate(pose, room_scan(pose))
+    out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, 0.05, *pose)
+    middle = MAP_SIZE // 2
+    assert np.argmax(out[0, :middle, middle] > 170) in (6, 7)  # 2.5 m ahead is row 32 - 25
+    assert np.flatnonzero(out[0, middle, :middle] > 170)[-1] in (11, 12)  # 2 m to the left is column 32 - 20
+
+
+def test_the_global_map_puts_the_robot_where_the_pose_says() -> None:
+    grid = room_grid()
+    known, probability, visited = grid.overview()
+    out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    cx, cy, half = map_frame(grid)
+    x, y = 4.0, 3.0
+    _fill_global(out, known, probability, visited, grid.overview_block, (x - cx) / half, (y - cy) / half)
+    row, col = np.argwhere(out[2] == 255).mean(axis=0)
+    assert abs((MAP_SIZE / 2 - row - 0.5) / (MAP_SIZE / 2) * half + cy - y) <= half / MAP_SIZE * 2
+    assert abs((col + 0.5 - MAP_SIZE / 2) / (MAP_SIZE / 2) * half + cx - x) <= half / MAP_SIZE * 2
+    # The area that the map shows as observed is the area known.
+    pixel = (2 * half / MAP_SIZE) ** 2
+    assert abs(out[1].astype(float).sum() / 255 * pixel - grid.known_area_m2) < 0.3
+    # A point of the room is free where it should be on the picture.
+    i = MAP_SIZE - 1 - int(((1.0 - cy) / half + 1) / 2 * MAP_SIZE)
+    j = int(((1.0 - cx) / half + 1) / 2 * MAP_SIZE)
+    assert out[0, i, j] < 110
