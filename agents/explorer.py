@@ -97,6 +97,7 @@ class Explorer(Agent):
     ) -> None:
         super().__init__(robot=robot, lidar=lidar, step_s=step_s)
         self.config = from_mapping(ExplorerConfig, config)
+        self._frontier_config = self.config.frontiers.for_body(self._robot.width_m)
         self._follower = PathFollower(
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )
@@ -118,6 +119,7 @@ class Explorer(Agent):
         self._anchor = np.zeros(3)
         self._anchored_at = 0.0
         self._troubles: list[_Trouble] = []
+        self._gave_up = False  # something worth it is left that could not be driven to
         self._track: list[Array] = []  # sensor poses (3,) that frontiers were seen from
 
     # ---- choosing ------------------------------------------------------------------------------------------
@@ -132,7 +134,7 @@ class Explorer(Agent):
         self._frontiers = candidates.frontiers.points
         if not np.isfinite(candidates.costs).any():
             self._target = None
-            self._status = "stuck" if any(t.failures for t in self._troubles) else "covered"
+            self._status = "stuck" if self._gave_up else "covered"
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]
@@ -162,7 +164,7 @@ class Explorer(Agent):
         cost_map = cost_maps.build(belief, config.planner, self._robot)
         travel = travel_costs(cost_map)
         watch = self._watch_kept()
-        frontiers = find(cost_map, config.frontiers, watch)
+        frontiers = find(cost_map, self._frontier_config, watch)
         troubles = [self._trouble(point) for point in frontiers.targets]
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
         views = view_points(
@@ -175,12 +177,12 @@ class Explorer(Agent):
         )
         costs = views.costs.copy()
         # The farther the way, the more there must be to see.
-        settings = config.frontiers
-        share = np.minimum(costs / settings.far_m, 1.0)
-        wanted = settings.min_extent_m + share * (settings.far_extent_m - settings.min_extent_m)
-        costs[frontiers.extents[frontiers.target_labels] < wanted - 1e-9] = np.inf
+        worth = frontiers.extents[frontiers.target_labels] >= self._frontier_config.wanted_extent(costs) - 1e-9
+        costs[~worth] = np.inf
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
-        costs[(looks >= config.patience.looks) | (failures >= config.patience.attempts)] = np.inf
+        given_up = failures >= config.patience.attempts
+        self._gave_up = bool((given_up & worth & (looks < config.patience.looks)).any())
+        costs[(looks >= config.patience.looks) | given_up] = np.inf
         # What did not work out lately comes last, but comes before giving up.
         avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
         if np.isfinite(costs[~avoided]).any():
@@ -278,7 +280,7 @@ class Explorer(Agent):
             return True
         # The rim of the window is cut off: there the mask takes the outside for unknown.
         count = int(np.count_nonzero(frontier_mask(window)[1:-1, 1:-1]))
-        return count * grid.resolution >= 0.5 * self.config.frontiers.min_extent_m
+        return count * grid.resolution >= 0.5 * self._frontier_config.min_extent_m
 
     def _watch(self, belief: Belief) -> None:
         """Count looks taken, and notice when nothing moves or a goal takes too long."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 class FrontierConfig:
     """What counts as a frontier, and from where one is looked at."""
 
-    min_extent_m: float = 0.3  # longer side of a cluster's bounding box
-    far_extent_m: float = 0.5  # the same for a cluster as far away as far_m or farther: in between in proportion
-    far_m: float = 5.0  # travel cost [weighted m]
+    min_extent_m: float = 0.4  # longer side of a cluster's bounding box; at most the body's width
+    far_extent_m: float = 0.7  # the same at a travel cost of far_m and beyond; at most twice the body's width
+    far_m: float = 6.0  # [weighted m]; up to there in proportion
     min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
     min_unknown_width_m: float = 0.3  # thinner ones are the insides of walls
     min_clearance_m: float = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
@@ -34,12 +34,32 @@ class FrontierConfig:
     beyond_m: float = 0.3  # how far behind the frontier a view point must see
 
     def __post_init__(self) -> None:
-        for name in ("min_extent_m", "min_unknown_m2", "min_unknown_width_m", "min_clearance_m", "beyond_m", "far_extent_m"):
+        for name in (
+            "min_extent_m",
+            "far_extent_m",
+            "min_unknown_m2",
+            "min_unknown_width_m",
+            "min_clearance_m",
+            "beyond_m",
+        ):
             value = getattr(self, name)
             require(math.isfinite(value) and value >= 0, f"FrontierConfig.{name} must be ≥ 0, got {value}")
         for name in ("spacing_m", "view_range_m", "far_m"):
             value = getattr(self, name)
             require(math.isfinite(value) and value > 0, f"FrontierConfig.{name} must be > 0, got {value}")
+
+    def for_body(self, width_m: float) -> FrontierConfig:
+        """Return the same for a body of this width [m]: where a small one could pass is worth a look."""
+        return replace(
+            self,
+            min_extent_m=min(self.min_extent_m, width_m),
+            far_extent_m=min(self.far_extent_m, 2.0 * width_m),
+        )
+
+    def wanted_extent(self, costs: Array) -> Array:
+        """Return the extent [m] that makes a cluster worth going to at these travel costs ``(m,)``."""
+        share = np.minimum(costs / self.far_m, 1.0)
+        return np.asarray(self.min_extent_m + share * (self.far_extent_m - self.min_extent_m))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,16 +115,16 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     """Return the cells beside unknown regions that are neither thin (inside a wall) nor small."""
     unknown = ((cost_map.classes == UNKNOWN) & ~cost_map.suspect).view(np.uint8)
     span = max(1, round(config.min_unknown_width_m / cost_map.resolution))
+    # Beyond the grid all is unknown: with a rim of that, what reaches its edge is as thick as it is there.
+    padded = cv2.copyMakeBorder(unknown, span, span, span, span, cv2.BORDER_CONSTANT, value=1)
     opening = np.ones((span, span), dtype=np.uint8)
-    # Beyond the grid all is unknown.
-    thick = cv2.erode(unknown, opening, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    thick = cv2.dilate(thick, opening[::-1, ::-1], anchor=(span - 1 - span // 2,) * 2)
+    thick = cv2.morphologyEx(padded, cv2.MORPH_OPEN, opening)
     _, labels, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
     large = stats[:, cv2.CC_STAT_AREA] * cost_map.resolution**2 >= config.min_unknown_m2
     large[0] = False
     pockets = large[labels].astype(np.uint8)
     near: NDArray[np.bool_] = cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8)) != 0
-    return near
+    return near[span:-span, span:-span]
 
 
 def _pieces(

@@ -44,9 +44,7 @@ class ViewPoints:
     costs: Array  # (m,) travel cost, inf where there is none
 
 
-def in_good_sight(
-    cost_map: CostMap, cells: NDArray[np.int64], normals: Array, watch: Watch
-) -> NDArray[np.bool_]:
+def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, watch: Watch) -> NDArray[np.bool_]:
     """Return which frontier cells ``(n, 2)`` (row, column) were in good sight from any of the watch's poses.
 
     ``normals`` ``(n, 2)`` point from free to unknown; where one is zero, every direction is as good.

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
-from slam.backend import Backend
+from slam.backend import OBSERVED_LIMIT, Backend
 from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Scan
 
@@ -26,7 +26,6 @@ LOCAL_CELL_M = 0.1
 UNKNOWN_BYTE = 128
 _TWIST_LIMIT = 2.0
 _COV_LIMIT = 1e6  # m², m·rad, rad²: Gymnasium asks for finite bounds
-_DISTANCE_LIMIT_M = 1e4
 
 
 def observation_space(config: EnvConfig) -> spaces.Dict:
@@ -39,7 +38,7 @@ def observation_space(config: EnvConfig) -> spaces.Dict:
             "pose": spaces.Box(-1.0, 1.0, (4,), np.float32),
             "pose_cov": spaces.Box(-_COV_LIMIT, _COV_LIMIT, (6,), np.float32),
             "landmarks": spaces.Box(
-                -_DISTANCE_LIMIT_M, _DISTANCE_LIMIT_M, (config.max_landmarks_observed, 6), np.float32
+                -OBSERVED_LIMIT, OBSERVED_LIMIT, (config.max_landmarks_observed, 6), np.float32
             ),
             "twist": spaces.Box(-_TWIST_LIMIT, _TWIST_LIMIT, (3,), np.float32),
             "progress": spaces.Box(0.0, 1.0, (2,), np.float32),
@@ -91,7 +90,6 @@ def observe(
         float(twist[2]) / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2 / (4.0 * half * half),
     )  # fmt: skip
     backend.near_landmarks(landmarks)
-    np.clip(landmarks, -_DISTANCE_LIMIT_M, _DISTANCE_LIMIT_M, out=landmarks)
     return {
         "map_local": map_local,
         "map_global": map_global,

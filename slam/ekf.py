@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.association import innovation_blocks, nearest_neighbour
-from slam.backend import Backend, BackendConfig
+from slam.backend import OBSERVED_LIMIT, Backend, BackendConfig
 from slam.geometry import wrap_scalar
 from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
 from slam.motion import predict_robot
@@ -410,4 +410,6 @@ def near_landmarks(x: Array, p: Array, count: int, out: NDArray[np.float32]) -> 
         out[j, 5] = d2
         filled = min(filled + 1, out.shape[0])
     for j in range(filled):
+        for q in range(5):
+            out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
         out[j, 5] = 1.0

@@ -23,6 +23,19 @@ __all__ = ["Corners", "FeatureConfig", "FeatureExtractor", "Lines"]
 Array = NDArray[np.float64]
 
 _MAX_LINES = 128
+_MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
+
+# The config as the kernels take it.
+(
+    _SIGMA, _SPLIT_SIGMAS, _SPLIT_FLOOR, _MIN_POINTS, _MIN_LENGTH, _SIN_MIN_ANGLE, _MAX_GAP, _FLOOR,
+    _EDGE_LENGTH, _EDGE_JUMP, _EDGE_SPACING, _EDGE_POINTS, _EDGE_FACE, _EDGE_SIGMA,
+) = range(14)  # fmt: skip
+# A fitted line: its normal, away from the sensor, and distance; the points' centroid; the variances of offset (at
+# the centroid) and slope and their covariance; from where to where it reaches along (-ny, nx) from the centroid;
+# its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0 and 1).
+(
+    _NX, _NY, _R, _MX, _MY, _VAR_OFFSET, _VAR_SLOPE, _COV, _T0, _T1, _POINTS, _FIRST, _LAST, _ENDS,
+) = range(14)  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,8 +53,8 @@ class FeatureConfig:
     edge_length_m: float = 0.35  # of a surface whose visible end is taken for a corner
     edge_points: int = 8  # … and the points on it: fewer would let a piece of a round column pass for straight
     edge_face_m: float = 0.25  # thickest wall of which the end face may show
-    # 1σ of a visible end along the surface, as a share of the beams' spacing there. A uniform error would have 0.29,
-    # but it lasts while the robot stands: NEES over training seeds 0-9 is 1.09 with 0.45 and 0.94 with 1.0.
+    # 1σ of a visible end along the surface, as a share of the beams' spacing there. A uniform error would have
+    # 0.29, but it lasts while the robot stands: NEES over training seeds 0-9 is 1.09 with 0.45 and 0.94 with 1.0.
     edge_sigma: float = 1.0
     edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
@@ -93,8 +106,8 @@ class FeatureExtractor:
         c = self.config
         self._limits = np.array([
             c.range_sigma_m, c.split_sigmas, c.split_floor_m, c.min_points, c.min_length_m,
-            math.radians(c.grazing_deg), math.sin(math.radians(c.min_angle_deg)), c.max_gap_m,
-            c.sigma_floor_m, c.edge_length_m, c.edge_jump_m, c.edge_spacing_m, c.edge_points, c.edge_face_m, c.edge_sigma,
+            math.sin(math.radians(c.min_angle_deg)), c.max_gap_m, c.sigma_floor_m, c.edge_length_m, c.edge_jump_m,
+            c.edge_spacing_m, c.edge_points, c.edge_face_m, c.edge_sigma,
         ])  # fmt: skip
 
     def extract(self, scan: Scan) -> NDArray[np.float64]:
@@ -114,12 +127,23 @@ class FeatureExtractor:
             self._stack = np.zeros((n + 2, 2), np.int64)
             self._pieces = np.zeros((n + 2, 3), np.int64)
             self.surface = np.zeros(n, np.int16)
+            self._gaps = self._gap_table(scan.angle_increment)
             self._scan_of = key
         self._line_count, self._corner_count = _extract(
-            scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits, self._xy,
-            self._beam,            self._stack, self._pieces, self.surface, self._lines, self._corners,
+            scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits,
+            self._gaps, self._xy, self._beam, self._stack, self._pieces, self.surface, self._lines, self._corners,
         )  # fmt: skip
         return self._corners[: self._corner_count]
+
+    def _gap_table(self, increment: float) -> Array:
+        """Return, for neighbours 1, 2, … beams apart: how far apart they may be, and 2 − 2 cos of the angle.
+
+        The adaptive breakpoint of Borges and Aldon (2004): a surface at the flattest incidence that is still
+        accepted would put the next point at most sin Δ / sin(λ − Δ) times the nearer range away.
+        """
+        angles = increment * np.arange(1, _MAX_STEP + 1)
+        rest = np.maximum(math.radians(self.config.grazing_deg) - angles, 1e-6)
+        return np.column_stack([np.sin(angles) / np.sin(rest), 2.0 - 2.0 * np.cos(angles)])
 
     def corners(self) -> Corners:
         """Return the corners of the last scan as named arrays."""
@@ -147,13 +171,14 @@ class FeatureExtractor:
 
 @njit(cache=True, nogil=True)
 def _extract(
-    ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array, xy: Array,
+    ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array,
+    gaps: Array, xy: Array,
     beam: NDArray[np.int64], stack: NDArray[np.int64], pieces: NDArray[np.int64], surface: NDArray[np.int16],
     lines: Array, corners: Array,
 ) -> tuple[int, int]:  # fmt: skip
     surface[:] = -1
-    n = _points_in_order(ranges, rays, increment, range_min, limits, xy, beam)
-    pieces_count = _split(xy, beam, n, ranges, increment, limits, stack, pieces)
+    n = _points_in_order(ranges, rays, increment, range_min, limits, gaps, xy, beam)
+    pieces_count = _split(xy, beam, n, ranges, limits, gaps, stack, pieces)
     line_count = 0
     last_line = -1  # the surface that the scan has run on from without a break, else -1
     last_end = 0  # … and its last point
@@ -165,22 +190,22 @@ def _extract(
         if line_count == _MAX_LINES or not _fit(xy, first, last, limits, lines[line_count]):
             continue
         line = lines[line_count]
-        line[11], line[12] = beam[first], beam[last]
-        line[13] = 0.0
+        line[_FIRST], line[_LAST] = beam[first], beam[last]
+        line[_ENDS] = 0.0
         for i in range(first, last + 1):
             surface[beam[i]] = line_count
         # Noise near a corner may leave a sliver between its two surfaces; its points must lie on either.
         if last_line >= 0 and _all_on(xy, last_end, first, lines[last_line], line, limits):
             met = _meet(lines[last_line], line, increment, limits, corners[corner_count])
             corner_count += met
-            lines[last_line, 13] += 2.0 * met
-            line[13] += met
+            lines[last_line, _ENDS] += 2.0 * met
+            line[_ENDS] += met
         last_line, last_end = line_count, last
         line_count += 1
     for k in range(line_count):
         for side in range(2):
-            # Bit 0 or 1 of column 13: this end already makes a corner with the neighbouring surface.
-            if int(lines[k, 13]) & (1 << side) == 0:
+            # This end may already make a corner with the neighbouring surface.
+            if int(lines[k, _ENDS]) & (1 << side) == 0:
                 corner_count += _edge(
                     lines[k], side, ranges, rays, increment, range_max, limits, corners[corner_count]
                 )
@@ -188,24 +213,19 @@ def _extract(
 
 
 @njit(cache=True, nogil=True)
-def _breaks(r0: float, r1: float, angle: float, limits: Array) -> bool:
-    """Tell whether two neighbouring points, ``angle`` apart, cannot lie on one surface.
-
-    The adaptive breakpoint of Borges and Aldon (2004): a surface at the flattest incidence that is still
-    accepted would take the next range no farther than this.
-    """
-    near, far = min(r0, r1), max(r0, r1)
-    grazing = limits[5]
-    if angle >= grazing:
+def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
+    """Tell whether two points ``step`` beams apart cannot lie on one surface (see ``_gap_table``)."""
+    if step > _MAX_STEP:
         return True
-    limit = near * math.sin(angle) / math.sin(grazing - angle) + 4.0 * limits[0]
-    gap_squared = near * near + far * far - 2.0 * near * far * math.cos(angle)
-    return bool(gap_squared > limit * limit)
+    limit = min(r0, r1) * gaps[step - 1, 0] + 4.0 * sigma
+    # The law of cosines, by the difference of the ranges.
+    distance_squared = (r0 - r1) * (r0 - r1) + r0 * r1 * gaps[step - 1, 1]
+    return bool(distance_squared > limit * limit)
 
 
 @njit(cache=True, nogil=True)
 def _points_in_order(
-    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, xy: Array,
+    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
     beam: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π."""
@@ -218,7 +238,7 @@ def _points_in_order(
                 start = i
                 if r0 == np.inf or r1 == np.inf:
                     break
-            elif _breaks(r0, r1, increment, limits):
+            elif _breaks(r0, r1, 1, gaps, limits[_SIGMA]):
                 start = i
                 break
     count = 0
@@ -237,11 +257,11 @@ def _points_in_order(
 
 @njit(cache=True, nogil=True)
 def _split(
-    xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, increment: float, limits: Array,
+    xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, limits: Array, gaps: Array,
     stack: NDArray[np.int64], pieces: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number."""
-    threshold = max(limits[1] * limits[0], limits[2])
+    threshold = max(limits[_SPLIT_SIGMAS] * limits[_SIGMA], limits[_SPLIT_FLOOR])
     beams = ranges.shape[0]
     count = 0
     begin = 0
@@ -251,7 +271,7 @@ def _split(
             step = beam[end + 1] - beam[end]
             if step < 0:
                 step += beams
-            if step > 4 or _breaks(ranges[beam[end]], ranges[beam[end + 1]], step * increment, limits):
+            if _breaks(ranges[beam[end]], ranges[beam[end + 1]], step, gaps, limits[_SIGMA]):
                 break
             end += 1
         depth = 0
@@ -311,7 +331,7 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     # The end points are shared with what comes before and after, and may lie on that: the fit leaves them out.
     a, b = first + 1, last - 1
     n = b - a + 1
-    if n + 2 < limits[3] or n < 3:
+    if n + 2 < limits[_MIN_POINTS] or n < 3:
         return False
     mx = my = 0.0
     for i in range(a, b + 1):
@@ -333,7 +353,7 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
         nx, ny, r = -nx, -ny, -r
         tx, ty = -tx, -ty
     # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
-    sigma = limits[0]
+    sigma = limits[_SIGMA]
     var_offset = var_slope = cov = spread = residual = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
@@ -346,22 +366,22 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
         cov += t * variance
         spread += t * t
         residual += (d - r) * (d - r)
-    if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[2])) ** 2:
+    if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[_SPLIT_FLOOR])) ** 2:
         return False
-    line[0], line[1], line[2], line[3], line[4] = nx, ny, r, mx, my
-    line[5] = var_offset / (n * n)
-    line[6] = var_slope / (spread * spread)
-    line[7] = cov / (n * spread)
+    line[_NX], line[_NY], line[_R], line[_MX], line[_MY] = nx, ny, r, mx, my
+    line[_VAR_OFFSET] = var_offset / (n * n)
+    line[_VAR_SLOPE] = var_slope / (spread * spread)
+    line[_COV] = cov / (n * spread)
     if _is_curved(xy, a, b, line, sigma):
         return False
     # Along (-ny, nx), which is (tx, ty) up to sign.
     ax, ay = -ny, nx
     t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
     t1 = ax * (xy[last, 0] - mx) + ay * (xy[last, 1] - my)
-    line[8], line[9], line[10] = t0, t1, n
+    line[_T0], line[_T1], line[_POINTS] = t0, t1, n
     if ax * tx + ay * ty < 0.0:
-        line[7] = -line[7]
-    return bool(abs(t1 - t0) >= limits[4])
+        line[_COV] = -line[_COV]
+    return bool(abs(t1 - t0) >= limits[_MIN_LENGTH])
 
 
 @njit(cache=True, nogil=True)
@@ -371,7 +391,7 @@ def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
     Pieces of a round table are short enough to pass for straight ones, and would meet in corners that wander
     with the robot. The bulge is the coefficient of u² − mean(u²), u the position along the line.
     """
-    nx, ny, r, mx, my = line[0], line[1], line[2], line[3], line[4]
+    nx, ny, r, mx, my = line[_NX], line[_NY], line[_R], line[_MX], line[_MY]
     n = b - a + 1
     mean = 0.0
     for i in range(a, b + 1):
@@ -395,10 +415,10 @@ def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
 @njit(cache=True, nogil=True)
 def _all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
     """Tell whether every point from ``first`` to ``last`` lies on one of two lines."""
-    near = max(limits[1] * limits[0], limits[2])
+    near = max(limits[_SPLIT_SIGMAS] * limits[_SIGMA], limits[_SPLIT_FLOOR])
     for i in range(first, last + 1):
-        off_one = abs(one[0] * xy[i, 0] + one[1] * xy[i, 1] - one[2])
-        off_two = abs(two[0] * xy[i, 0] + two[1] * xy[i, 1] - two[2])
+        off_one = abs(one[_NX] * xy[i, 0] + one[_NY] * xy[i, 1] - one[_R])
+        off_two = abs(two[_NX] * xy[i, 0] + two[_NY] * xy[i, 1] - two[_R])
         if min(off_one, off_two) > near:
             return False
     return True
@@ -407,33 +427,33 @@ def _all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Ar
 @njit(cache=True, nogil=True)
 def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array) -> int:
     """Write the corner of two surfaces that follow each other in the scan; return 1 if there is one."""
-    cross = one[0] * two[1] - one[1] * two[0]
-    if abs(cross) < limits[6]:
+    cross = one[_NX] * two[_NY] - one[_NY] * two[_NX]
+    if abs(cross) < limits[_SIN_MIN_ANGLE]:
         return 0
-    x = (one[2] * two[1] - two[2] * one[1]) / cross
-    y = (two[2] * one[0] - one[2] * two[0]) / cross
-    s1 = -one[1] * (x - one[3]) + one[0] * (y - one[4])
-    s2 = -two[1] * (x - two[3]) + two[0] * (y - two[4])
+    x = (one[_R] * two[_NY] - two[_R] * one[_NY]) / cross
+    y = (two[_R] * one[_NX] - one[_R] * two[_NX]) / cross
+    s1 = -one[_NY] * (x - one[_MX]) + one[_NX] * (y - one[_MY])
+    s2 = -two[_NY] * (x - two[_MX]) + two[_NX] * (y - two[_MY])
     # The corner must lie where one surface ends and the other begins, up to the beams' own spacing.
     rho = math.sqrt(x * x + y * y)
-    gap = limits[7] + 4.0 * rho * increment
-    if abs(s1 - one[9]) > gap or abs(s2 - two[8]) > gap:
+    gap = limits[_MAX_GAP] + 4.0 * rho * increment
+    if abs(s1 - one[_T1]) > gap or abs(s2 - two[_T0]) > gap:
         return 0
     # Each line's offset at the corner: n·p = r there, with this variance.
-    v1 = one[5] + 2.0 * s1 * one[7] + s1 * s1 * one[6]
-    v2 = two[5] + 2.0 * s2 * two[7] + s2 * s2 * two[6]
+    v1 = one[_VAR_OFFSET] + 2.0 * s1 * one[_COV] + s1 * s1 * one[_VAR_SLOPE]
+    v2 = two[_VAR_OFFSET] + 2.0 * s2 * two[_COV] + s2 * s2 * two[_VAR_SLOPE]
     # p = N⁻¹ (r1, r2)  ⇒  cov p = N⁻¹ diag(v1, v2) N⁻ᵀ
-    a, b = two[1] / cross, -one[1] / cross
-    c, d = -two[0] / cross, one[0] / cross
-    floor = limits[8] ** 2
+    a, b = two[_NY] / cross, -one[_NY] / cross
+    c, d = -two[_NX] / cross, one[_NX] / cross
+    floor = limits[_FLOOR] ** 2
     cxx = a * a * v1 + b * b * v2 + floor
     cxy = a * c * v1 + b * d * v2
     cyy = c * c * v1 + d * d * v2 + floor
     # Unit vectors from the corner along both surfaces.
     f = math.copysign(1.0, -s1)
     g = math.copysign(1.0, -s2)
-    ax, ay = -one[1] * f, one[0] * f
-    bx, by = -two[1] * g, two[0] * g
+    ax, ay = -one[_NY] * f, one[_NX] * f
+    bx, by = -two[_NY] * g, two[_NX] * g
     # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
     # one that stands out into it.
     left = (-ax) * by - (-ay) * bx > 0.0
@@ -470,13 +490,13 @@ def _edge(
     line; hidden or not, it is taken to recede at a right angle. (Where a beam stops short of the line, something
     nearer hides the surface: the rim of a shadow, no landmark.)
     """
-    if line[9] - line[8] < limits[9] or line[10] < limits[12]:
+    if line[_T1] - line[_T0] < limits[_EDGE_LENGTH] or line[_POINTS] < limits[_EDGE_POINTS]:
         return 0
     n = ranges.shape[0]
     step = 1 if side == 1 else -1
-    index = int(line[12]) if side == 1 else int(line[11])
+    index = int(line[_LAST]) if side == 1 else int(line[_FIRST])
     full = n * increment > 2.0 * math.pi - 1.5 * increment
-    end = line[9] if side == 1 else line[8]
+    end = line[_T1] if side == 1 else line[_T0]
     t = missed = 0.0
     faces = 0
     while True:
@@ -488,38 +508,44 @@ def _edge(
         reach = ranges[index]
         if math.isnan(reach):
             continue
-        across = line[0] * rays[index, 0] + line[1] * rays[index, 1]
+        across = line[_NX] * rays[index, 0] + line[_NY] * rays[index, 1]
         if across < 0.05:
             return 0
-        missed = line[2] / across  # range at which the beam would meet the line
-        if missed > range_max - 0.1 or reach < missed - limits[1] * limits[0]:
+        missed = line[_R] / across  # range at which the beam would meet the line
+        if missed > range_max - 0.1 or reach < missed - limits[_SPLIT_SIGMAS] * limits[_SIGMA]:
             return 0
         if faces == 0:
-            t = -line[1] * (missed * rays[index, 0] - line[3]) + line[0] * (missed * rays[index, 1] - line[4])
-        if reach > missed + limits[10]:
+            t = -line[_NY] * (missed * rays[index, 0] - line[_MX]) + line[_NX] * (
+                missed * rays[index, 1] - line[_MY]
+            )
+        if reach > missed + limits[_EDGE_JUMP]:
             px, py = reach * rays[index, 0], reach * rays[index, 1]
-            depth = line[0] * px + line[1] * py - line[2]
-            beyond = (-line[1] * (px - line[3]) + line[0] * (py - line[4]) - end) * step
-            if not (depth < limits[13] and -limits[13] < beyond < limits[13]):
+            depth = line[_NX] * px + line[_NY] * py - line[_R]
+            beyond = (-line[_NY] * (px - line[_MX]) + line[_NX] * (py - line[_MY]) - end) * step
+            if not (depth < limits[_EDGE_FACE] and -limits[_EDGE_FACE] < beyond < limits[_EDGE_FACE]):
                 break  # past the end face, or there is none to see
         else:
             px, py = reach * rays[index, 0], reach * rays[index, 1]
-            beyond = (-line[1] * (px - line[3]) + line[0] * (py - line[4]) - end) * step
-            if beyond > limits[13]:
+            beyond = (-line[_NY] * (px - line[_MX]) + line[_NX] * (py - line[_MY]) - end) * step
+            if beyond > limits[_EDGE_FACE]:
                 return 0  # the surface goes on, a little off the line
         faces += 1
         if faces > 40:
             return 0
     spacing = abs(t - end)
-    if spacing > limits[11] or (t - end) * step < 0.0:
+    if spacing > limits[_EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
     s = 0.5 * (t + end)
-    x, y = line[3] - line[1] * s, line[4] + line[0] * s
+    x, y = line[_MX] - line[_NY] * s, line[_MY] + line[_NX] * s
     # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
     # An end face that shows may be bevelled: its first points still pass for the surface's.
-    along = (limits[14] * spacing) ** 2 + limits[8] ** 2 + (4.0 * limits[0] ** 2 if faces > 0 else 0.0)
-    off = line[5] + 2.0 * s * line[7] + s * s * line[6] + limits[8] ** 2
-    nx, ny, ax, ay = line[0], line[1], -line[1], line[0]
+    along = (
+        (limits[_EDGE_SIGMA] * spacing) ** 2
+        + limits[_FLOOR] ** 2
+        + (4.0 * limits[_SIGMA] ** 2 if faces > 0 else 0.0)
+    )
+    off = line[_VAR_OFFSET] + 2.0 * s * line[_COV] + s * s * line[_VAR_SLOPE] + limits[_FLOOR] ** 2
+    nx, ny, ax, ay = line[_NX], line[_NY], -line[_NY], line[_NX]
     direction = math.atan2(step * ay - ny, step * ax - nx)
     _to_polar(
         x, y, along * ax * ax + off * nx * nx, along * ax * ay + off * nx * ny, along * ay * ay + off * ny * ny,

@@ -201,6 +201,8 @@ class OccupancyGrid:
             ``(beams,)``: the straight surface each beam ended on (see :mod:`slam.features`), negative for
             none. Hits on one surface are joined, which closes walls seen at a flat angle.
         """
+        if surface is None:
+            surface = _NO_SURFACE
         n = len(scan.ranges)
         reach = math.ceil(scan.range_max / self.resolution) + 3
         if self._mask.shape[0] < 2 * reach + 1:
@@ -213,7 +215,7 @@ class OccupancyGrid:
         full_circle = n * scan.angle_increment > 2 * math.pi - 1.5 * scan.angle_increment
         polygon = np.empty((n + 1, 2), np.int32)
         count, r0, c0, r1, c1 = _outline(
-            polygon, scan.ranges, rays, x, y, theta, self.resolution, scan.range_max, mask_row, mask_col,
+            polygon, scan.ranges, rays, surface, x, y, theta, self.resolution, scan.range_max, mask_row, mask_col,
             full_circle,
         )  # fmt: skip
         if count < 3:
@@ -223,7 +225,7 @@ class OccupancyGrid:
         offset = (-c0 << _FIXED_POINT, -r0 << _FIXED_POINT)  # in the fixed-point units of the vertices
         cv2.fillPoly(mask, [polygon[:count]], _IN_FREE, cv2.LINE_8, _FIXED_POINT, offset)
         _mark_surfaces(
-            self._mask, scan.ranges, rays, surface if surface is not None else _NO_SURFACE,
+            self._mask, scan.ranges, rays, surface,
             x, y, theta, self.resolution, mask_row, mask_col,
         )  # fmt: skip
         self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
@@ -309,8 +311,8 @@ _NO_SURFACE = np.zeros(0, np.int16)
 
 @njit(cache=True, nogil=True)
 def _outline(
-    polygon: NDArray[np.int32], ranges: Array, rays: Array, x: float, y: float, theta: float, resolution: float,
-    range_max: float, mask_row: int, mask_col: int, full_circle: bool,
+    polygon: NDArray[np.int32], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
+    theta: float, resolution: float, range_max: float, mask_row: int, mask_col: int, full_circle: bool,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Write the scan's free polygon in fixed-point mask cells; return its length and the box it needs."""
     scale = float(1 << _FIXED_POINT)
@@ -321,8 +323,12 @@ def _outline(
     low_y = high_y = y0
     count = 0
     lost = 0
-    for i in range(ranges.shape[0]):
+    n = ranges.shape[0]
+    joined = surface.shape[0] == n
+    for i in range(n):
         r = ranges[i]
+        if joined and 0 < i < n - 1 and surface[i] >= 0 and surface[i - 1] == surface[i] == surface[i + 1]:
+            continue  # within a straight surface: its two ends say it all
         if math.isnan(r):
             # One or two lost beams are bridged by their neighbours; a run of them is not known to be free.
             lost += 1

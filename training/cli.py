@@ -169,6 +169,9 @@ def speed(
     slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
     beams: Annotated[int, typer.Option(min=8, help="Beams of the lidar.")] = 360,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
+    peer: Annotated[
+        str | None, typer.Option(help="Another simulator to measure in turn, in the same rooms: navground.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure the steps per second of one environment, and where the time goes.
@@ -177,13 +180,17 @@ def speed(
     Examples:
       mecanum speed
       mecanum speed --slam odometry --beams 180 --steps 3000 --json
+      mecanum speed --peer navground
     """  # noqa: D301
     from mecanum_env.env import make_config
+    from training.peers import require
     from training.speed import run
 
     with bad_input():
         make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
-    run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
+        if peer is not None:
+            require(peer)
+    run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json, peer=peer)
 
 
 # ---- running it ------------------------------------------------------------------------------------------------

@@ -30,8 +30,8 @@ Job = tuple[str, str, int]  # rooms, backend, seed
 Row = dict[str, Any]
 
 _MEDIANS = (
-    "coverage", "time_s", "time_to_95_s", "path_length_m", "map_iou", "corner_mean_m", "corner_max_m", "ate_rmse_m",
-    "final_position_error_m", "final_heading_error_rad", "anees", "landmarks",
+    "coverage", "time_s", "time_to_95_s", "path_length_m", "map_iou", "corner_mean_m", "corner_max_m",
+    "ate_rmse_m", "final_position_error_m", "final_heading_error_rad", "anees", "landmarks",
 )  # fmt: skip
 
 

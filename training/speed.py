@@ -18,6 +18,7 @@ import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
+from training import peers
 
 __all__ = ["measure", "run"]
 
@@ -130,17 +131,21 @@ def _replay(
     return times, landmarks
 
 
+def _make_env(rooms: str, slam: str, beams: int) -> gymnasium.Env[Observation, Any]:
+    return gymnasium.make(
+        "mecanum_env:mecanum_env/Explore-v0",
+        rooms=rooms, slam=slam, lidar={"beams": beams}, config={"coverage_target": 1.0},
+        max_episode_steps=mecanum_env.MAX_EPISODE_STEPS,
+    )  # fmt: skip
+
+
 def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
     """Return ``steps_per_second``, ``stages_us``, ``landmarks_mean``, ``rss_mb`` and ``config``.
 
     An agent explores first, and its actions are driven again: one seed is one episode, so these are the very
     steps of an exploration, with its map and landmarks, but without the agent's own work in between.
     """
-    env = gymnasium.make(
-        "mecanum_env:mecanum_env/Explore-v0",
-        rooms=rooms, slam=slam, lidar={"beams": beams}, config={"coverage_target": 1.0},
-        max_episode_steps=mecanum_env.MAX_EPISODE_STEPS,
-    )  # fmt: skip
+    env = _make_env(rooms, slam, beams)
     episodes = _record(env, min(steps, 20_000), seed)
     _replay(env, episodes[:1], None)
     rss_before = _rss_mb()
@@ -172,10 +177,33 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
     }
 
 
-def run(*, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool) -> dict[str, Any]:
-    """Measure, and print a table (or one JSON object) on standard output."""
+def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
+    """Measure ours and a peer in turn, over one exploration's rooms; see :func:`training.peers.compare`."""
+    env = _make_env(rooms, slam, beams)
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    episodes = _record(env, min(max(steps // peers.ROUNDS, 1), 20_000), seed)
+    drives = []
+    for episode_seed, actions in episodes:
+        env.reset(seed=episode_seed)
+        drives.append(peers.Drive(seed=episode_seed, steps=len(actions), plan=inner.truth.plan))
+
+    def ours() -> float:
+        times, _ = _replay(env, episodes, None)
+        return len(times) / sum(times)
+
+    return peers.compare(peer, inner.config, drives=drives, ours=ours)
+
+
+def run(
+    *, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None = None
+) -> dict[str, Any]:
+    """Measure, and print a table (or one JSON object) on standard output; ``peer`` adds a comparison."""
     print(f"measuring {rooms}, {slam}, {beams} beams, {steps:,} steps …", file=sys.stderr)
     result = measure(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
+    if peer is not None:
+        print(f"measuring {peer} in turn with it …", file=sys.stderr)
+        result["peer"] = _beside(peer, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
     if as_json:
         print(json.dumps(result))
         return result
@@ -188,7 +216,19 @@ def run(*, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bo
     print(f"{'stage':<14}{'median µs':>10}{'mean µs':>10}")
     for name, median in sorted(result["stages_us"].items(), key=lambda item: -item[1]):
         print(f"{name:<14}{median:>10.1f}{result['stages_us_mean'][name]:>10.1f}")
+    if peer is not None:
+        print(_against(result["peer"]))
     return result
+
+
+def _against(peer: dict[str, Any]) -> str:
+    rounds = len(peer["rounds"])
+    versions = ", ".join(f"{name} {number}" for name, number in peer["versions"].items())
+    return (
+        f"in turn with {versions}: ours {peer['ours_steps_per_second']:,.0f}, theirs "
+        f"{peer['steps_per_second']:,.0f} steps per second, ratio {peer['ratio']:.2f} (medians of {rounds} rounds "
+        f"of {peer['steps']:,} steps; theirs has no dynamics and no SLAM)"
+    )
 
 
 def _rss_mb() -> float:

@@ -47,7 +47,13 @@ def test_travel_costs_against_scipy(seed, rows, cols, share):
     start = (int(rng.integers(1, rows - 1)), int(rng.integers(1, cols - 1)))
     weight[start] = 1.0
     cost_map = CostMap(
-        np.where(weight > 0, FREE, OCCUPIED).astype(np.int8), weight, weight, 0.1, (0.0, 0.0), start
+        classes=np.where(weight > 0, FREE, OCCUPIED).astype(np.int8),
+        clearance=weight,
+        weight=weight,
+        resolution=0.1,
+        origin=(0.0, 0.0),
+        start=start,
+        suspect=np.zeros(weight.shape, dtype=np.bool_),
     )
     travel = travel_costs(cost_map)
     np.testing.assert_allclose(travel.cost, oracle(weight.astype(np.float64), start, 0.1), rtol=1e-4)
