@@ -132,7 +132,7 @@ def _look(
         while push > 0.0 and _at(classes, x + push * nx, y + push * ny) == OCCUPIED:
             push -= 1.0
         push = max(push, 0.0)
-        _sweep(classes, cost, x + push * nx, y + push * ny, nx, ny, reach, push, push + 2.0, i, cells, costs)
+        _sweep(classes, cost, x, y, nx, ny, reach, push, push + 2.0, i, cells, costs)
         if costs[i] == np.inf:
             _sweep(classes, cost, x, y, 0.0, 0.0, 0.4 * reach, 0.0, 1.0, i, cells, costs)
 
@@ -160,24 +160,29 @@ def _sweep(
     cells: NDArray[np.int64],
     costs: Array,
 ) -> None:
-    """Walk sight lines from (x, y): through anything but walls for ``blind`` cells, then through free ones."""
+    """Walk sight lines from ``push`` cells behind (x, y) and keep to the places that see it well.
+
+    They go through anything but walls for ``blind`` cells, then through free ones.
+    """
+    flat = nx == 0.0 and ny == 0.0
     directions = 96
     for k in range(directions):
         angle = 2.0 * math.pi * k / directions
         dx, dy = math.cos(angle), math.sin(angle)
-        cosine = 1.0 if nx == 0.0 and ny == 0.0 else -(dx * nx + dy * ny)
-        limit = reach * cosine + push
-        if cosine <= 0.0:
-            continue
         away = 0.0
-        while away <= limit:
-            px, py = x + away * dx, y + away * dy
+        while away <= reach + push:
+            px, py = x + push * nx + away * dx, y + push * ny + away * dy
+            away += 0.7  # less than a cell: no wall is stepped over, diagonal ones included
             kind = _at(classes, px, py)
-            if kind == OCCUPIED or (kind == UNKNOWN and away > blind):
+            if kind == OCCUPIED or (kind == UNKNOWN and away > blind + 0.7):
                 break
-            if kind == FREE:
-                row, col = math.floor(py), math.floor(px)
-                if cost[row, col] < costs[index]:
-                    costs[index] = cost[row, col]
-                    cells[index, 0], cells[index, 1] = row, col
-            away += 0.7
+            if kind != FREE:
+                continue
+            row, col = math.floor(py), math.floor(px)
+            if cost[row, col] >= costs[index]:
+                continue
+            ex, ey = x - (col + 0.5), y - (row + 0.5)
+            square = ex * ex + ey * ey
+            if square <= (reach * math.sqrt(square) if flat else reach * (ex * nx + ey * ny)):
+                costs[index] = cost[row, col]
+                cells[index, 0], cells[index, 1] = row, col

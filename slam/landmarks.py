@@ -36,7 +36,8 @@ class LandmarkPolicy:
     """When a corner becomes a landmark, and when it ceases to be one."""
 
     confirm_after: int = 3  # sightings …
-    edge_baseline_m: float = 0.2  # … a surface's visible end also from two places this far apart
+    edge_confirm_after: int = 8  # … of a surface's visible end, which a round table can feign, more of them …
+    edge_baseline_m: float = 0.2  # … and from two places this far apart
     forget_after: int = 20  # updates without a sighting, while tentative
     tentative_gate_m: float = 0.1  # two sightings farther apart are two corners
     new_distance_m: float = 0.2  # a new corner is at least this far from a landmark of its kind
@@ -127,7 +128,8 @@ class LandmarkBook:
             self._new = np.zeros(len(z), np.int64)
         count = _review(
             x, offset, z, match, self.marks, self._tentative, self._tentative_count,
-            p.tentative_gate_m, p.confirm_after, p.edge_baseline_m, p.forget_after, self._new,
+            p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
+            self._new,
         )  # fmt: skip
         return self._new[:count]
 
@@ -149,7 +151,8 @@ class LandmarkBook:
 @njit(cache=True, nogil=True)
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, tentative: Array,
-    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, baseline: float, forget_after: int,
+    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, edge_confirm_after: int, baseline: float,
+    forget_after: int,
     new: NDArray[np.int64],
 ) -> int:  # fmt: skip
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -188,7 +191,8 @@ def _review(
         t[_COUNT] += 1.0
         t[_AGE] = 0.0
         moved = (x[0] - t[_FROM_X]) ** 2 + (x[1] - t[_FROM_Y]) ** 2
-        if t[_COUNT] >= confirm_after and (z[k, EDGE] == 0.0 or moved >= baseline * baseline):
+        settled = t[_COUNT] >= edge_confirm_after and moved >= baseline * baseline
+        if settled or (z[k, EDGE] == 0.0 and t[_COUNT] >= confirm_after):
             new[found] = k
             found += 1
             t[_AGE] = forget_after + 1.0

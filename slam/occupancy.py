@@ -221,9 +221,12 @@ class OccupancyGrid:
         if count < 3:
             return
         c0, c1 = c0 & -_WORD, c1 | (_WORD - 1)
+        outline = [polygon[:count]]
+        cv2.fillPoly(self._mask, outline, _IN_FREE, cv2.LINE_8, _FIXED_POINT)
+        # The rim runs along surfaces: the cells under it are not known to be free. Without this, walls seen at a
+        # flat angle, where hits are sparse, would be erased between the hits.
+        cv2.polylines(self._mask, outline, True, 0, 1, cv2.LINE_8, _FIXED_POINT)
         mask = self._mask[r0 : r1 + 1, c0 : c1 + 1]
-        offset = (-c0 << _FIXED_POINT, -r0 << _FIXED_POINT)  # in the fixed-point units of the vertices
-        cv2.fillPoly(mask, [polygon[:count]], _IN_FREE, cv2.LINE_8, _FIXED_POINT, offset)
         _mark_surfaces(
             self._mask, scan.ranges, rays, surface,
             x, y, theta, self.resolution, mask_row, mask_col,
@@ -337,9 +340,7 @@ def _outline(
             reach = 0.0
         else:
             lost = 0
-            # The polygon's rim is drawn too and would eat into the surface: it ends half a cell short.
-            reach = (range_max if r > range_max else r) / resolution - 0.5
-            reach = max(reach, 0.0)
+            reach = (range_max if r > range_max else r) / resolution
         dx = (c * rays[i, 0] - s * rays[i, 1]) * reach
         dy = (s * rays[i, 0] + c * rays[i, 1]) * reach
         polygon[count, 0] = round((x0 + dx) * scale)

@@ -23,7 +23,7 @@ def test_a_meeting_of_two_surfaces_is_confirmed_after_three_sightings() -> None:
 
 
 def test_the_end_of_a_surface_is_confirmed_after_three_sightings_from_two_places() -> None:
-    book = LandmarkBook(LandmarkPolicy(confirm_after=3, edge_baseline_m=0.2))
+    book = LandmarkBook(LandmarkPolicy(edge_confirm_after=3, edge_baseline_m=0.2))
     new = np.array([UNMATCHED])
 
     def see(x: float, y: float, from_x: float = 0.0, kind: float = 1.0, match: np.ndarray = new) -> list[int]:
@@ -41,14 +41,14 @@ def test_the_end_of_a_surface_is_confirmed_after_three_sightings_from_two_places
 
 
 def test_what_wanders_with_the_robot_is_never_confirmed() -> None:
-    book = LandmarkBook(LandmarkPolicy(confirm_after=3))
+    book = LandmarkBook(LandmarkPolicy(edge_confirm_after=3))
     for k in range(20):
         x = 0.04 * k
         assert len(book.review(np.array([x, 0.0, 0.0]), 0.0, corner(2, 1)[None], np.array([UNMATCHED]))) == 0
 
 
 def test_a_tentative_corner_is_forgotten() -> None:
-    book = LandmarkBook(LandmarkPolicy(confirm_after=2, edge_baseline_m=0.0, forget_after=5))
+    book = LandmarkBook(LandmarkPolicy(edge_confirm_after=2, edge_baseline_m=0.0, forget_after=5))
     new = np.array([UNMATCHED])
     book.review(POSE, 0.0, corner(2, 1)[None], new)
     for _ in range(6):
