@@ -115,7 +115,7 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     """Return the cells beside unknown regions that are neither thin (inside a wall) nor small."""
     unknown = ((cost_map.classes == UNKNOWN) & ~cost_map.suspect).view(np.uint8)
     # Odd, or the opening would shift what it opens.
-    span = max(1, round(config.min_unknown_width_m / cost_map.resolution) - 1 | 1)
+    span = max(1, (round(config.min_unknown_width_m / cost_map.resolution) - 1) | 1)
     # Beyond the grid all is unknown: with a rim of that, what reaches its edge is as thick as it is there.
     padded = cv2.copyMakeBorder(unknown, span, span, span, span, cv2.BORDER_CONSTANT, value=1)
     opening = np.ones((span, span), dtype=np.uint8)
