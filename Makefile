@@ -17,7 +17,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo evaluate speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -63,6 +63,9 @@ other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo
+
+evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the test seeds
+	$(BIN)/python -m training.evaluate --workers $(WORKERS) --out out/evaluate
 
 speed: $(VENV)/core.stamp ## steps per second, and where the time goes
 	$(BIN)/mecanum speed
