@@ -195,6 +195,8 @@ class EnvConfig:
         require(abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s")
         require(0.01 <= self.grid_resolution_m <= 1, "EnvConfig.grid_resolution_m must be in [0.01, 1]")
         require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
+        require(self.time_limit_s > 0, "EnvConfig.time_limit_s must be > 0")
+        require(self.max_landmarks_observed >= 1, "EnvConfig.max_landmarks_observed must be at least 1")
         tables = isinstance(self.rooms_config, Mapping) and isinstance(self.slam_config, Mapping)
         require(tables, "EnvConfig.rooms_config and slam_config must be tables of settings")
 
@@ -224,6 +226,7 @@ LIDAR_PRESETS: dict[str, LidarConfig] = {
 }
 NOISE_PRESETS: dict[str, NoiseConfig] = {
     "nominal": NoiseConfig(),
+    "youbot": NoiseConfig(),
     "slippery": NoiseConfig(encoder=0.05, radius_error=0.03, base_error=0.03, slip=0.1, patch_share=0.25),
     "cavity": NoiseConfig(slip=0.1),
 }

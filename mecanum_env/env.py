@@ -36,6 +36,7 @@ from mecanum_env.observation import Observation, observation_space, observe
 from mecanum_env.reward import StepOutcome, reward_terms
 from mecanum_env.robot import action_to_wheels, twist_action_to_wheels
 from mecanum_env.rooms import FloorPlan
+from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensors import Lidar, WheelEncoders
 from mecanum_env.world import World
 from slam.backend import Backend
@@ -93,8 +94,9 @@ def make_config(
     base = from_toml(config) if isinstance(config, str | Path) else from_mapping(EnvConfig, config)
     changes: dict[str, Any] = {}
     if isinstance(robot, str) and robot in ROBOT_PRESETS:
-        lidar = robot if lidar is None and robot in LIDAR_PRESETS else lidar
-        noise = robot if noise is None and robot in NOISE_PRESETS else noise
+        given_parts = config if isinstance(config, Mapping) else {}
+        lidar = robot if lidar is None and "lidar" not in given_parts else lidar
+        noise = robot if noise is None and "noise" not in given_parts else noise
     for name, given in (("rooms", rooms), ("slam", slam)):
         if isinstance(given, Mapping):
             options = dict(given)
@@ -115,15 +117,13 @@ def make_config(
     if floor_plan is not None:
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
-    if made.rooms not in room_registry.names():
-        raise unknown_name("rooms", made.rooms, room_registry.names())
-    slam_config_type(made.slam)
+    check_rooms(made.rooms, made.rooms_config)
+    _check_backend(made)
     return made
 
 
-def slam_config_type(name: str) -> Any:
-    """Return a backend's config type; ``ValueError`` lists the valid names."""
-    return slam.config_type(name)
+def _check_backend(config: EnvConfig) -> None:
+    from_mapping(slam.config_type(config.slam), backend_settings(config))
 
 
 class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):

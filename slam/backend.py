@@ -48,9 +48,6 @@ class Backend(abc.ABC):
     Subclasses estimate; this class draws the grid from the estimated poses.
     """
 
-    takes_pose = False
-    """Whether the backend must be given the pose (``truth``); no estimator does."""
-
     def __init__(self, config: BackendConfig) -> None:
         self.config = config
         self.extractor = FeatureExtractor(config.features)

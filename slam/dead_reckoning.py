@@ -6,11 +6,13 @@ each other, so each has its own two-dimensional Kalman filter.
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.ekf import EkfSlam
-from slam.types import Odometry
+from slam.types import Belief, Odometry
 
 __all__ = ["OdometrySlam", "TruthSlam"]
 
@@ -43,16 +45,22 @@ class OdometrySlam(EkfSlam):
         super()._correct(z, match)
         self._x[:3] = pose
 
+    def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
+        return False  # the pose is not for the scan to doubt
+
     @property
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
         return self._robot_cov.copy()
 
+    @property
+    def belief(self) -> Belief:
+        """Pose, landmarks and grid; there is no joint covariance."""
+        return dataclasses.replace(super().belief, pose_cov=self.pose_cov, joint_cov=None)
+
 
 class TruthSlam(OdometrySlam):
     """Mapping with the true pose given: the bound on what an estimator can reach."""
-
-    takes_pose = True
 
     def give_pose(self, pose: Array) -> None:
         """Set the pose ``(3,)``; to be called between ``predict`` and ``update``."""

@@ -63,7 +63,7 @@ class EkfSlam(Backend):
         self._h = np.zeros((_MAX_OBSERVATIONS, 2, 5))
         self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(_MAX_OBSERVATIONS)
-        self._last_match = self._match[:0]
+        self._twist, self._dt = (0.0, 0.0, 0.0), 0.0
         self.nis = 0.0
         self.nis_dof = 0
 
@@ -72,16 +72,20 @@ class EkfSlam(Backend):
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
         vx, vy, omega = (float(v) for v in odometry.twist)
-        var_v, var_w = self.config.odometry.variances(vx, vy, omega)
+        noise = self.config.odometry
+        slip = noise.slip(self._twist, (vx, vy, omega), odometry.dt)
+        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
+        self._twist, self._dt = (vx, vy, omega), odometry.dt
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self.extractor.extract(scan)[:_MAX_OBSERVATIONS]
         match = self._associate(z)
+        if self._out_of_sight(match):
+            match = self._allow_for_spinning_wheels(z)
         self._correct(z, match)
         self._manage(z, match, scan)
-        self._last_match = match
         self._draw(scan)
         self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
 
@@ -116,6 +120,32 @@ class EkfSlam(Backend):
             self._distance, self._h[0],
         )  # fmt: skip
         return match
+
+    def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
+        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
+        recent, still = self._book.recently_seen(match)
+        return recent >= 3 and still < 0.6 * recent
+
+    def _allow_for_spinning_wheels(self, z: Array) -> NDArray[np.int64]:
+        """Associate again as though the wheels had turned in vain; keep to that if it brings the landmarks back.
+
+        Against a wall, or pulling away too hard, the wheels turn and the robot does not follow. V knows nothing
+        of that, and a filter that trusts it has every gate closed within two steps and is lost for good. So the
+        pose may be off by as much as the wheels claim to have moved.
+        """
+        kept = self._p[:3, :3].copy()
+        vx, vy, omega = self._twist
+        lever = self.config.odometry.lever_m
+        moved = math.hypot(vx, vy, lever * omega) * self._dt
+        self._p[0, 0] += moved**2
+        self._p[1, 1] += moved**2
+        self._p[2, 2] += (moved / lever) ** 2
+        match = self._associate(z)
+        if not self._out_of_sight(match):
+            return match
+        # It is the view that changed: through a door, say.
+        self._p[:3, :3] = kept
+        return self._associate(z)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""
@@ -157,9 +187,7 @@ class EkfSlam(Backend):
         self._w = np.zeros((2 * _MAX_OBSERVATIONS + 2, size))
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        match = self._last_match
-        rows = match[match >= 0]
-        rows = rows[rows < self._book.count]  # one may just have been dropped
+        rows = self._book.just_seen()
         return self._book.ids[rows], self._points[rows]
 
     # ---- the belief ----------------------------------------------------------------------------------------

@@ -144,8 +144,10 @@ class FeatureExtractor:
         accepted would put the next point at most sin Δ / sin(λ − Δ) times the nearer range away.
         """
         angles = increment * np.arange(1, _MAX_STEP + 1)
-        rest = np.maximum(math.radians(self.config.grazing_deg) - angles, 1e-6)
-        return np.column_stack([np.sin(angles) / np.sin(rest), 2.0 - 2.0 * np.cos(angles)])
+        rest = math.radians(self.config.grazing_deg) - angles
+        # Neighbours as far apart as the flattest incidence never belong together: nothing is that near.
+        share = np.where(rest > 0, np.sin(angles) / np.sin(np.maximum(rest, 1e-6)), -np.inf)
+        return np.column_stack([share, 2.0 - 2.0 * np.cos(angles)])
 
     def corners(self) -> Corners:
         """Return the corners of the last scan as named arrays."""
@@ -222,7 +224,7 @@ def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
     limit = min(r0, r1) * gaps[step - 1, 0] + 4.0 * sigma
     # The law of cosines, by the difference of the ranges.
     distance_squared = (r0 - r1) * (r0 - r1) + r0 * r1 * gaps[step - 1, 1]
-    return bool(distance_squared > limit * limit)
+    return bool(limit < 0.0 or distance_squared > limit * limit)
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,8 @@ Array = NDArray[np.float64]
 KIND, DIRECTION, EDGE = 5, 6, 7  # columns of an observation row, see FeatureExtractor.extract
 
 # Columns of ``marks``, one row a landmark.
-_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN = range(5)
+_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN = range(6)
+_RECENT = 3  # updates
 # Columns of the tentative ones.
 _X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
 _TENTATIVE = 64
@@ -59,15 +60,16 @@ class LandmarkBook:
         self.count = 0
         self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
         self._next_id = 0
+        self._now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
-        self._marks = np.zeros((32, 5))
+        self._marks = np.zeros((32, 6))
         self._tentative = np.zeros((_TENTATIVE, 8))
         self._tentative_count = np.zeros(1, np.int64)
         self._new = np.zeros(256, np.int64)
 
     @property
     def marks(self) -> Array:
-        """Kind and direction, sightings, contradictions and times overlooked ``(n, 5)``. A view."""
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting ``(n, 6)``. A view."""
         return self._marks[: self.count]
 
     @property
@@ -104,7 +106,7 @@ class LandmarkBook:
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -118,16 +120,26 @@ class LandmarkBook:
         self.count = n - 1
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
+    def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
+        """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
+        recent, still = _recent(self.marks, match, self._now)
+        return int(recent), int(still)
+
+    def just_seen(self) -> NDArray[np.int64]:
+        """Return the rows ``(k,)`` of the landmarks that the last update showed."""
+        return np.flatnonzero(self.marks[:, _LAST_SEEN] == self._now)
+
     def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
         """Count sightings; return which observations are new landmarks by now.
 
         ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their landmarks.
         """
         p = self.policy
+        self._now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
         count = _review(
-            x, offset, z, match, self.marks, self._tentative, self._tentative_count,
+            x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count,
             p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
             self._new,
         )  # fmt: skip
@@ -137,7 +149,7 @@ class LandmarkBook:
         """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
         p = self.policy
         doubtful = _look_through(
-            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self.marks, p.clear_margin_m,
+            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks, p.clear_margin_m,
             p.drop_after, p.overlook_after, p.overlook_ratio,
         )  # fmt: skip
         if not doubtful:
@@ -149,8 +161,20 @@ class LandmarkBook:
 
 
 @njit(cache=True, nogil=True)
+def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
+    recent = still = 0
+    for i in range(marks.shape[0]):
+        if marks[i, _LAST_SEEN] > now - _RECENT:
+            recent += 1
+    for k in range(match.shape[0]):
+        if match[k] >= 0 and marks[match[k], _LAST_SEEN] > now - _RECENT:
+            still += 1
+    return recent, still
+
+
+@njit(cache=True, nogil=True)
 def _review(
-    x: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, tentative: Array,
+    x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
     tentative_count: NDArray[np.int64], gate: float, confirm_after: int, edge_confirm_after: int, baseline: float,
     forget_after: int,
     new: NDArray[np.int64],
@@ -163,7 +187,7 @@ def _review(
     for k in range(z.shape[0]):
         if match[k] >= 0:
             marks[match[k], _SEEN] += 1.0
-            marks[match[k], _UNSEEN] -= 1.0  # what the look through will add to every landmark in view
+            marks[match[k], _LAST_SEEN] = now
             continue
         if match[k] != UNMATCHED:
             continue
@@ -174,7 +198,9 @@ def _review(
         nearest, best = -1, gate * gate
         for i in range(n):
             d2 = (tentative[i, _X] - px) ** 2 + (tentative[i, _Y] - py) ** 2
-            same = tentative[i, _T_KIND] == z[k, 5] and abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
+            same = tentative[i, _T_KIND] == z[k, 5] and (
+                z[k, 5] == 0.0 or abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
+            )
             if same and d2 < best:
                 nearest, best = i, d2
         if nearest < 0:
@@ -208,7 +234,8 @@ def _review(
 
 @njit(cache=True, nogil=True)
 def _look_through(
-    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, marks: Array, margin: float,
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
+    margin: float,
     drop_after: float, overlook_after: float, overlook_ratio: float,
 ) -> bool:  # fmt: skip
     """Count, for each landmark near by, whether three beams pass it or one ends at it; tell if any is doubtful."""
@@ -219,6 +246,8 @@ def _look_through(
     full = beams >= circle
     doubtful = False
     for i in range(marks.shape[0]):
+        if marks[i, _LAST_SEEN] == now:
+            continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy
         # Farther away, an uncertain heading moves the beams past a corner that is there.

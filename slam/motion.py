@@ -21,9 +21,10 @@ Array = NDArray[np.float64]
 class OdometryNoise:
     """V, the covariance of the measured twist, diagonal: each σ is a floor plus a share of the wheels' speed.
 
-    The wheels' speed is √(vx² + vy² + (lω)²). The defaults are the simulated youBot's under nominal noise,
-    found by experiment on training seeds; they are larger than the encoders' white noise alone, since wheel
-    radius errors stay the same from step to step and wheels slip.
+    The wheels' speed is √(vx² + vy² + (lω)²). The shares are larger than the encoders' white noise alone, since
+    wheel radius errors stay the same from step to step; ``mecanum_env.calibration`` derives a robot's own from
+    its declared noise. A change of speed that the floor cannot pass on makes the wheels slip: what exceeds
+    ``grip_m_s2`` adds its own share.
     """
 
     lever_m: float = 0.3855  # l: half the wheelbase plus half the track
@@ -31,19 +32,34 @@ class OdometryNoise:
     speed_share: float = 0.012
     turn_floor_rad_s: float = 0.003
     turn_share_rad_m: float = 0.03
+    grip_m_s2: float = 2.5  # change of the wheels' speed over time from which they slip
+    slip_share: float = 0.3  # of the change beyond that
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
             require(getattr(self, name) >= 0, f"OdometryNoise.{name} must be ≥ 0")
         require(self.lever_m > 0, "OdometryNoise.lever_m must be > 0")
+        require(self.grip_m_s2 > 0, "OdometryNoise.grip_m_s2 must be > 0")
+        require(self.slip_share >= 0, "OdometryNoise.slip_share must be ≥ 0")
 
-    def variances(self, vx: float, vy: float, omega: float) -> tuple[float, float]:
-        """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²]."""
+    def variances(self, vx: float, vy: float, omega: float, *, slip: float = 0.0) -> tuple[float, float]:
+        """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²].
+
+        ``slip`` [m/s] is what :meth:`slip` says of the change since the step before.
+        """
         speed = math.sqrt(vx * vx + vy * vy + (self.lever_m * omega) ** 2)
+        lost = self.slip_share * slip
         return (
-            (self.speed_floor_m_s + self.speed_share * speed) ** 2,
-            (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2,
+            (self.speed_floor_m_s + self.speed_share * speed) ** 2 + lost**2,
+            (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2 + (lost / self.lever_m) ** 2,
         )
+
+    def slip(self, before: tuple[float, float, float], now: tuple[float, float, float], dt: float) -> float:
+        """Return by how much [m/s] the wheels' speed changed beyond what the floor passes on in ``dt`` [s]."""
+        change = math.sqrt(
+            (now[0] - before[0]) ** 2 + (now[1] - before[1]) ** 2 + (self.lever_m * (now[2] - before[2])) ** 2
+        )
+        return max(change - self.grip_m_s2 * dt, 0.0)
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:

@@ -42,6 +42,13 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_GENERATORS))
 
 
+def check(name: str, config: Mapping[str, Any] | Any | None = None) -> None:
+    """Raise the ``ValueError`` that :func:`make` would for an unknown name or key, without drawing a plan."""
+    if name not in _GENERATORS:
+        raise unknown_name("rooms", name, _GENERATORS)
+    from_mapping(_GENERATORS[name][1], config)
+
+
 def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None) -> FloorPlan:
     """Return the plan that a generator draws for a seed.
 

@@ -147,7 +147,7 @@ def test_ekf_agrees_with_batch_least_squares_on_a_small_world() -> None:
     rng = np.random.default_rng(5)
     landmarks = np.array([[3.0, 1.0], [1.5, -2.0], [-2.0, 2.5]])
     r = np.diag([1e-4, 1e-5])
-    backend = slam.make("ekf", config={"lidar_offset_m": OFFSET})
+    backend = slam.make("ekf", config={"lidar_offset_m": OFFSET, "odometry": {"slip_share": 0.0}})
     start_cov = np.diag([1e-4, 1e-4, 1e-4])
     backend.reset((0, 0, 0), pose_cov=start_cov)
     noise = backend.config.odometry
@@ -196,7 +196,7 @@ def test_pose_nees_is_consistent_where_the_heading_is_known_well() -> None:
     r = np.diag([4e-4, 4e-5])
     errors, covs = [], []
     for _ in range(30):
-        backend = slam.make("ekf", config={"lidar_offset_m": OFFSET})
+        backend = slam.make("ekf", config={"lidar_offset_m": OFFSET, "odometry": {"slip_share": 0.0}})
         backend.reset()
         pose = np.zeros(3)
         for k in range(60):
@@ -235,6 +235,35 @@ def test_scans_of_a_room_give_its_corners_and_keep_the_pose() -> None:
     error = compose(inverse(start), pose) - belief.pose
     assert np.hypot(*error[:2]) < 0.04
     assert abs(float(wrap(error[2]))) < 0.02
+
+
+def test_spinning_wheels_do_not_lose_the_filter() -> None:
+    """For two seconds the wheels drive on and turn while the robot stands against something."""
+    rng = np.random.default_rng(8)
+    backend = slam.make("ekf")
+    start = np.array([2.0, 2.0, 0.3])
+    backend.reset()
+    pose = start
+    for k in range(120):
+        backend.update(room_scan(compose(pose, np.array([OFFSET, 0, 0])), rng))
+        if 50 <= k < 70:
+            backend.predict(Odometry((0.7, 0.3, 0.8), 0.1))
+        else:
+            pose, odo = drive(pose, circle_twist(k), (0.01, 0.02), rng)
+            backend.predict(odo)
+    error = compose(inverse(start), pose) - backend.pose
+    assert np.hypot(*error[:2]) < 0.05
+    assert abs(float(wrap(error[2]))) < 0.03
+    assert backend.landmark_count == 4
+
+
+def test_a_hard_start_adds_to_the_noise_and_a_gentle_one_does_not() -> None:
+    noise = slam.config_type("ekf")().odometry
+    assert noise.slip((0.0, 0.0, 0.0), (0.2, 0.0, 0.0), 0.1) == 0.0
+    assert noise.slip((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), 0.1) == pytest.approx(0.55)
+    calm, hard = noise.variances(0.5, 0.0, 0.0), noise.variances(0.5, 0.0, 0.0, slip=0.5)
+    assert hard[0] - calm[0] == pytest.approx((0.3 * 0.5) ** 2)
+    assert hard[1] - calm[1] == pytest.approx((0.3 * 0.5 / noise.lever_m) ** 2)
 
 
 @pytest.mark.parametrize("name", slam.names())

@@ -141,3 +141,11 @@ def test_a_round_column_is_no_corner() -> None:
     for seed in range(20):
         extractor.extract(polygon_scan(pose, [ROOM, column], np.random.default_rng(seed)))
         assert not np.any(extractor.corners().kind == CONVEX)
+
+
+def test_few_beams_far_apart_are_never_joined() -> None:
+    angles = ANGLE_MIN + 2 * math.pi / 36 * np.arange(36)
+    ranges = np.full(36, 2.0)
+    extractor = FeatureExtractor()
+    assert len(extractor.extract(Scan(ranges, angles[0], angles[1] - angles[0], 8.0))) == 0
+    assert np.all(extractor.surface == -1)
