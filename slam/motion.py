@@ -32,8 +32,8 @@ class OdometryNoise:
     speed_share: float = 0.012
     turn_floor_rad_s: float = 0.003
     turn_share_rad_m: float = 0.03
-    grip_m_s2: float = 2.5  # change of the wheels' speed over time from which they slip
-    slip_share: float = 0.3  # of the change beyond that
+    grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
+    slip_share: float = 0.6  # of the change beyond that
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
