@@ -243,7 +243,6 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         coverage = self._coverage.update(self.backend.grid)
         terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
-        self._remember()
         info = self._info(coverage, np.asarray(self.truth.pose))
         info["reward_terms"] = terms
         success = coverage >= config.coverage_target
@@ -312,13 +311,14 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _outcome(self, collisions: int) -> StepOutcome:
         grid, config = self.backend.grid, self.config
         known, map_entropy, pose_entropy = self._before
+        self._remember()
         cell = grid.resolution**2
-        vx, vy, omega = (float(v) for v in self._odometry.twist)
+        vx, vy, omega = np.asarray(self._odometry.twist).tolist()
         robot = config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
         return StepOutcome(
             area_m2=(grid.known_cells - known) * cell,
-            pose_entropy_loss_nat=pose_entropy - _entropy(self.backend.pose_cov),
+            pose_entropy_loss_nat=pose_entropy - self._before[2],
             map_entropy_loss_bit_m2=(map_entropy - grid.entropy_bit) * cell,
             collisions=collisions,
             effort=min(speed, 1.0),

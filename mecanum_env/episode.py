@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +31,7 @@ class EpisodeRecord:
     def __init__(self) -> None:
         self._rows = np.empty((1024, 9))
         self._count = 0
+        self._last = (0.0, 0.0)
         self.path_length_m = 0.0
         self.collisions = 0
 
@@ -37,12 +39,11 @@ class EpisodeRecord:
         """Add one step; the first row is the start itself."""
         if self._count == len(self._rows):
             self._rows = np.vstack([self._rows, np.empty_like(self._rows)])
-        row = self._rows[self._count]
-        row[_TRUE], row[_ESTIMATE] = true_pose, estimate
-        row[_TIME], row[_COVERAGE], row[_NEES] = time_s, coverage, nees
+        x, y, theta = true_pose.tolist()
+        self._rows[self._count] = (x, y, theta, *estimate.tolist(), time_s, coverage, nees)
         if self._count:
-            before = self._rows[self._count - 1]
-            self.path_length_m += float(np.hypot(true_pose[0] - before[0], true_pose[1] - before[1]))
+            self.path_length_m += math.hypot(x - self._last[0], y - self._last[1])
+        self._last = (x, y)
         self._count += 1
 
     @property

@@ -56,7 +56,8 @@ class Lidar:
     def __init__(self, config: LidarConfig, noise: NoiseConfig) -> None:
         self.config = config
         self.noise = noise
-        self._directions = beam_directions(config.beams, config.angle_min, config.angle_increment)
+        self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
+        self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
 
     def true_ranges(self, segments: Array, circles: Array, pose: ArrayLike) -> Array:
         """Return the exact range of each beam ``(beams,)`` [m], ``inf`` beyond ``range_max_m``.
@@ -69,7 +70,7 @@ class Lidar:
             Of the robot's centre in the world frame ``(3,)``; the sensor is ``offset_m`` ahead of it.
         """
         config = self.config
-        x, y, theta = (float(v) for v in np.asarray(pose, dtype=np.float64))
+        x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
         out = np.empty(config.beams)
         cast_rays(
             segments,
@@ -78,8 +79,8 @@ class Lidar:
             y + config.offset_m * math.sin(theta),
             theta,
             self._directions,
-            config.angle_min,
-            config.angle_increment,
+            self._angle_min,
+            self._angle_increment,
             config.range_max_m,
             out,
         )
@@ -103,8 +104,8 @@ class Lidar:
         )
         return Scan(
             ranges=ranges,
-            angle_min=config.angle_min,
-            angle_increment=config.angle_increment,
+            angle_min=self._angle_min,
+            angle_increment=self._angle_increment,
             range_max=config.range_max_m,
             range_min=config.range_min_m,
         )
@@ -153,6 +154,7 @@ class WheelEncoders:
         rng
             Yields four normal numbers: a measured increment is the true one times 1 + ``encoder`` · N(0, 1).
         """
-        factors = 1.0 + self.noise.encoder * rng.standard_normal(4)
-        measured = np.asarray(wheel_increments, dtype=np.float64) * factors
-        return Odometry(twist=self._forward @ (measured / dt), dt=dt)
+        factors = (self.noise.encoder / dt) * rng.standard_normal(4)
+        factors += 1.0 / dt
+        factors *= wheel_increments
+        return Odometry(twist=self._forward @ factors, dt=dt)

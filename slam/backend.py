@@ -131,13 +131,12 @@ class Backend(abc.ABC):
 
     def _draw(self, scan: Scan) -> None:
         """Draw a scan from the believed pose, and keep it where the sensor has moved on."""
-        sensor = self.sensor_pose()
-        x, y, theta = sensor.tolist()
-        self.grid.integrate(sensor, scan, self.extractor.surface)
+        body_x, body_y, theta = self.pose.tolist()
         offset = self.config.lidar_offset_m
-        self.grid.mark_visited(
-            x - offset * math.cos(theta), y - offset * math.sin(theta), self.config.body_radius_m
-        )
+        x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
+        sensor = np.array([x, y, theta])
+        self.grid.integrate(sensor, scan, self.extractor.surface)
+        self.grid.mark_visited(body_x, body_y, self.config.body_radius_m)
         if self.key_scans.wants(x, y, theta):
             ids, points = self._landmarks_in_view()
             self.key_scans.keep(sensor, scan, self.extractor.surface, ids, points)

@@ -71,7 +71,7 @@ class EkfSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega = (float(v) for v in odometry.twist)
+        vx, vy, omega = np.asarray(odometry.twist, dtype=np.float64).tolist()
         noise = self.config.odometry
         slip = noise.slip(self._twist, (vx, vy, omega), odometry.dt)
         var_v, var_w = noise.variances(vx, vy, omega, slip=slip)

@@ -28,8 +28,8 @@ UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Cell classes, with the values of a ROS ``nav_msgs/OccupancyGrid``."""
 
 UNIT_NAT = 0.05  # log-odds of one unit of a cell
-HIT, MISS = 17, -8  # 0.85 and -0.4 nat: p = 0.70 and 0.40
-MAX_LOG_ODDS, MIN_LOG_ODDS = 70, -40  # p = 0.97 and 0.12
+HIT, MISS = 17, -13  # 0.85 and -0.65 nat: p = 0.70 and 0.34
+MAX_LOG_ODDS, MIN_LOG_ODDS = 70, -39  # p = 0.97 and 0.12
 OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 
 _WORD = 8  # cells that the kernel looks at together
@@ -53,6 +53,7 @@ def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]
 PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
 _NO_MARKS = np.uint64(0)
 _ALL_FREE = np.full(_WORD, _IN_FREE, np.uint8).view(np.uint64)[0]
+_EVERY_BYTE = np.full(_WORD, 1, np.uint8).view(np.uint64)[0]
 _ALL_SURELY_FREE = np.full(_WORD, MIN_LOG_ODDS, np.int8).view(np.uint64)[0]
 
 
@@ -410,15 +411,45 @@ def _fuse(
             if marks == _NO_MARKS:
                 continue
             mask_words[i, word] = _NO_MARKS
-            if marks == _ALL_FREE and log_odds_words[row0 + i, word0 + word] == _ALL_SURELY_FREE:
-                continue
+            row, first = row0 + i, col0 + _WORD * word
+            if marks == _ALL_FREE:
+                cells = log_odds_words[row, word0 + word]
+                if cells == _ALL_SURELY_FREE:
+                    continue
+                value = cells & np.uint64(255)
+                if cells == value * _EVERY_BYTE:
+                    # Eight cells alike, as in a room just seen: reckon once.
+                    old = int(log_odds[row, first])
+                    new: int = max(old + MISS, MIN_LOG_ODDS)
+                    if new == 0:
+                        new = -1
+                    log_odds_words[row, word0 + word] = np.uint64(new & 255) * _EVERY_BYTE
+                    entropy += _WORD * (ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255])
+                    delta = int(PROBABILITY_BYTE[new & 255]) - (
+                        int(PROBABILITY_BYTE[old & 255]) if old != 0 else 0
+                    )
+                    width = min(block, _WORD)
+                    for c in range(first // block, (first + _WORD - 1) // block + 1):
+                        overview_probability[row // block, c] += width * delta
+                        if old == 0:
+                            overview_known[row // block, c] += width
+                    if old == 0:
+                        known += _WORD
+                    if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
+                        for col in range(first, first + _WORD):
+                            changes[count, 0] = lattice_row + row
+                            changes[count, 1] = lattice_col + col
+                            changes[count, 2] = CLASS_OF[old & 255]
+                            changes[count, 3] = CLASS_OF[new & 255]
+                            count += 1
+                    continue
             for k in range(_WORD):
                 mark = (marks >> np.uint64(8 * k)) & np.uint64(255)  # little-endian, as x86 and ARM are
                 if mark == 0:
                     continue
-                row, col = row0 + i, col0 + _WORD * word + k
+                col = first + k
                 old = int(log_odds[row, col])
-                new: int = min(old + HIT, MAX_LOG_ODDS) if mark == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
+                new = min(old + HIT, MAX_LOG_ODDS) if mark == _IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
                 if new == old:
                     continue
                 if new == 0:
