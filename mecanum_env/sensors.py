@@ -156,5 +156,5 @@ class WheelEncoders:
         """
         factors = (self.noise.encoder / dt) * rng.standard_normal(4)
         factors += 1.0 / dt
-        factors *= wheel_increments
+        factors *= np.asarray(wheel_increments, dtype=np.float64)
         return Odometry(twist=self._forward @ factors, dt=dt)

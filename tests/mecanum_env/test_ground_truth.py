@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from mecanum_env import rooms
+from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.episode import score_map
+from mecanum_env.ground_truth import Coverage, GroundTruth, on_lattice
+from slam.geometry import transform_points
+from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+
+
+def truth_of(name: str, seed: int) -> GroundTruth:
+    plan = rooms.make(name, seed=seed)
+    return GroundTruth(plan, np.array(plan.start), robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+
+
+@pytest.mark.parametrize("name", rooms.names())
+def test_all_but_hidden_nooks_of_the_free_space_is_mappable(name: str) -> None:
+    for seed in (0, 1):
+        truth = truth_of(name, seed)
+        area = truth.mappable_cells * truth.resolution**2
+        assert 0.95 * truth.plan.area_m2 < area <= truth.plan.area_m2
+
+
+def test_mappable_cells_are_free_and_walls_are_near_surfaces() -> None:
+    truth = truth_of("apartment", 3)
+    row0, col0 = truth.lattice_origin
+
+    def in_world(mask: np.ndarray) -> np.ndarray:
+        cells = np.argwhere(mask) + np.array([row0, col0])
+        return transform_points(truth.start, (cells[:, ::-1] + 0.5) * truth.resolution)
+
+    assert np.all(truth.plan.is_free(in_world(truth.mappable)))
+    walls = in_world(truth.walls)
+    assert np.max(truth.plan.distance_to_surfaces(walls)) < 0.06
+    assert np.max(truth.plan.distance_to_surfaces(transform_points(truth.start, truth.corners))) < 1e-6
+
+
+def test_coverage_follows_changes_and_starts_over_after_a_redraw() -> None:
+    truth = truth_of("rectangular", 1)
+    rows, cols = truth.mappable.shape
+    row0, col0 = truth.lattice_origin
+    classes = np.full((rows, cols), UNKNOWN, np.int8)
+    classes[truth.mappable] = FREE
+    classes[: rows // 2] = UNKNOWN
+    grid = OccupancyGrid.from_classes(classes, 0.05, (col0 * 0.05, row0 * 0.05))
+    share = np.count_nonzero(truth.mappable[rows // 2 :]) / truth.mappable_cells
+    coverage = Coverage(truth)
+    assert coverage.update(grid) == pytest.approx(share)
+    grid.clear()
+    assert coverage.update(grid) == 0.0
+
+
+def test_a_perfect_map_scores_one_and_a_shifted_one_less() -> None:
+    truth = truth_of("apartment", 1)
+    rows, cols = truth.walls.shape
+    row0, col0 = truth.lattice_origin
+    classes = np.where(truth.walls, OCCUPIED, UNKNOWN).astype(np.int8)
+    env = gym.make("mecanum_env:mecanum_env/Explore-v0", rooms="rectangular")
+    env.reset(seed=0)
+    scores = []
+    for shift in (0, 1, 8):
+        grid = OccupancyGrid.from_classes(classes, 0.05, ((col0 + shift) * 0.05, row0 * 0.05))
+        env.unwrapped.backend.grid = grid
+        scores.append(score_map(truth, env.unwrapped.belief).iou)
+    assert scores[0] == 1.0
+    assert scores[1] > 0.95  # within the tolerance of two cells
+    assert scores[2] < 0.7
+    assert on_lattice(truth.walls, truth.lattice_origin, truth, 3).shape == (rows + 6, cols + 6)
