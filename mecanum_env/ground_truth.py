@@ -177,7 +177,7 @@ def occupied(grid: OccupancyGrid, truth: GroundTruth, margin: int) -> NDArray[np
     return on_lattice(grid.classes() == OCCUPIED, grid.lattice_origin, truth, margin)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _count_right(changes: NDArray[np.int32], mappable: NDArray[np.bool_], row0: int, col0: int) -> int:
     total = 0
     for k in range(changes.shape[0]):

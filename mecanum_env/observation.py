@@ -102,7 +102,7 @@ def observe(
     }
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_numbers(
     out: NDArray[np.float32], scan_out: NDArray[np.float32], ranges: Array, range_max: float, pose: Array,
     cov: Array, centre_x: float, centre_y: float, half: float, vx: float, vy: float, omega: float,
@@ -127,7 +127,7 @@ def _fill_numbers(
     out[14] = min(max(known, 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_local(
     out: NDArray[np.uint8], log_odds: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int,
     resolution: float, x: float, y: float, theta: float,
@@ -179,7 +179,7 @@ def _fill_local(
             row += row_step
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_global(
     out: NDArray[np.uint8], known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32],
     block: int, x: float, y: float,

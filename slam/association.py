@@ -21,7 +21,7 @@ UNMATCHED, IGNORED = -1, -2
 """An observation of something new; one too near to a landmark to be new, yet not surely that landmark."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float, float]:
     """Write H of landmark ``i`` ``(2, 5)``: by x, y, θ, xi, yi; return the predicted range and bearing.
 
@@ -41,7 +41,7 @@ def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float,
     return rho, wrap_scalar(math.atan2(-dy, -dx) - x[2])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from landmark ``i``."""
     rho, bearing = innovation_blocks(x, i, offset, h)
@@ -61,7 +61,7 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
     return float((s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
     max_turn: float, match: NDArray[np.int64], distance: Array, h: Array,

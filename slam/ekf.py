@@ -248,7 +248,7 @@ class EkfSlam(Backend):
         )
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def stacked_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
 ) -> tuple[int, float]:  # fmt: skip
@@ -303,7 +303,7 @@ def stacked_update(
     return rows, nis
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _h_times_p(p: Array, n: int, m: int, h: Array, out0: Array, out1: Array) -> None:
     """Write both rows of H P for the landmark at state index ``m``, reading P's upper triangle."""
     # Left of the landmark its part of P stands in the columns m and m + 1.
@@ -328,7 +328,7 @@ def _h_times_p(p: Array, n: int, m: int, h: Array, out0: Array, out1: Array) -> 
         map1[j] += h[1, 0] * p0[j] + h[1, 1] * p1[j] + h[1, 2] * p2[j]
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _cholesky_solve(s: Array, rows: int, column: int, w: Array, n: int) -> None:
     """Factor S in place (lower triangle), and turn its last column and the rows of w into L⁻¹ times them."""
     for i in range(rows):
@@ -354,7 +354,7 @@ def _cholesky_solve(s: Array, rows: int, column: int, w: Array, n: int) -> None:
             wi[q] *= inverse
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _downdate(p: Array, n: int, w: Array, rows: int) -> None:
     """Subtract Wᵀ W from the upper triangle of p.
 
@@ -381,7 +381,7 @@ def _downdate(p: Array, n: int, w: Array, rows: int) -> None:
         p[last, last] -= w[k, last] * w[k, last]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
     """Append a landmark seen at (ρ, φ) = z[:2] with covariance z[2:5] (theory.md A, add a landmark)."""
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -405,7 +405,7 @@ def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
     p[n + 1, n + 1] = p[1, n + 1] + rx * p[2, n + 1] + r11
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _symmetric(p: Array, out: Array) -> None:
     """Write the leading block of an upper triangle as the full symmetric matrix."""
     for i in range(out.shape[0]):
@@ -413,7 +413,7 @@ def _symmetric(p: Array, out: Array) -> None:
             out[i, j] = out[j, i] = p[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def near_landmarks(x: Array, p: Array, count: int, out: NDArray[np.float32]) -> None:
     """Write the nearest landmarks in the robot frame, by insertion into a list sorted by distance."""
     out[:] = 0.0

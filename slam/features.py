@@ -173,7 +173,7 @@ class FeatureExtractor:
         return Lines(hesse, ends, rows[:, 10].astype(np.int64))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _extract(
     ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array,
     gaps: Array, xy: Array,
@@ -216,7 +216,7 @@ def _extract(
     return line_count, corner_count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
     """Tell whether two points ``step`` beams apart cannot lie on one surface (see ``_gap_table``)."""
     if step > _MAX_STEP:
@@ -227,7 +227,7 @@ def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
     return bool(limit < 0.0 or distance_squared > limit * limit)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _points_in_order(
     ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
     beam: NDArray[np.int64],
@@ -259,7 +259,7 @@ def _points_in_order(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _split(
     xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, limits: Array, gaps: Array,
     stack: NDArray[np.int64], pieces: NDArray[np.int64],
@@ -302,7 +302,7 @@ def _split(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
     x0, y0 = xy[first, 0], xy[first, 1]
@@ -316,7 +316,7 @@ def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     return where
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -> bool:
     """Tell whether two pieces that share ``middle`` are one after all (the merge of split and merge)."""
     if last - first < 3 or middle - first < 2 or last - middle < 2:
@@ -324,7 +324,7 @@ def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -
     return _farthest(xy, first, last, 0.75 * threshold) < 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     """Fit a line to a piece by total least squares; tell whether it is a surface.
 
@@ -388,7 +388,7 @@ def _fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     return bool(abs(t1 - t0) >= limits[_MIN_LENGTH])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
     """Tell whether points bulge away from their line by more than noise would have them do.
 
@@ -416,7 +416,7 @@ def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
     return abs(coefficient) > 2.5 * deviation and abs(coefficient) * largest > 0.5 * sigma
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
     """Tell whether every point from ``first`` to ``last`` lies on one of two lines."""
     near = max(limits[_SPLIT_SIGMAS] * limits[_SIGMA], limits[_SPLIT_FLOOR])
@@ -428,7 +428,7 @@ def _all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Ar
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array) -> int:
     """Write the corner of two surfaces that follow each other in the scan; return 1 if there is one."""
     cross = one[_NX] * two[_NY] - one[_NY] * two[_NX]
@@ -467,7 +467,7 @@ def _meet(one: Array, two: Array, increment: float, limits: Array, corner: Array
     return 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _to_polar(
     x: float, y: float, cxx: float, cxy: float, cyy: float, kind: int, direction: float, edge: int, corner: Array
 ) -> None:
@@ -482,7 +482,7 @@ def _to_polar(
     corner[5], corner[6], corner[7] = kind, direction, edge
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _edge(
     line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
     corner: Array,

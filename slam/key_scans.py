@@ -32,7 +32,7 @@ class KeyScanConfig:
 
     spacing_m: float = 0.2
     spacing_rad: float = 0.25
-    check_every: int = 10  # updates between two looks at the landmarks
+    check_every: int = 20  # updates between two looks at the landmarks
     lever_m: float = 4.0  # distance at which a turn of a key scan counts as a shift [m]
 
 
@@ -111,7 +111,7 @@ class KeyScans:
         return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _corrected_poses(
     poses: Array, ids: NDArray[np.int64], local: Array, landmarks: Array, row_of_id: NDArray[np.int64],
     lever: float, out: Array,

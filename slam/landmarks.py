@@ -160,7 +160,7 @@ class LandmarkBook:
         return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
     recent = still = 0
     for i in range(marks.shape[0]):
@@ -172,7 +172,7 @@ def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]
     return recent, still
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
     tentative_count: NDArray[np.int64], gate: float, confirm_after: int, edge_confirm_after: int, baseline: float,
@@ -232,7 +232,7 @@ def _review(
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _look_through(
     x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
     margin: float,

@@ -86,7 +86,7 @@ def jacobians(pose: Array, twist: Array, dt: float) -> tuple[Array, Array]:
     return fx, fu
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _move(pose: Array, vx: float, vy: float, omega: float, dt: float) -> None:
     middle = pose[2] + 0.5 * omega * dt
     c, s = math.cos(middle), math.sin(middle)
@@ -95,7 +95,7 @@ def _move(pose: Array, vx: float, vy: float, omega: float, dt: float) -> None:
     pose[2] = wrap_scalar(pose[2] + omega * dt)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def predict_robot(
     x: Array, p: Array, n: int, vx: float, vy: float, omega: float, dt: float, var_v: float, var_w: float
 ) -> None:

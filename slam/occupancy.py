@@ -240,7 +240,7 @@ class OccupancyGrid:
         self._change_count, known, entropy = _fuse(
             self.log_odds, self.log_odds.view(np.uint64), mask, mask.view(np.uint64),
             mask_row + r0 - self._row0, mask_col + c0 - self._col0,
-            self._overview_probability, self._overview_known, self.overview_block,
+            self._overview_probability, self._overview_known, self.overview_block.bit_length() - 1,
             self._changes, self._change_count, self._row0, self._col0,
         )  # fmt: skip
         self.known_cells += known
@@ -313,7 +313,7 @@ class OccupancyGrid:
 _NO_SURFACE = np.zeros(0, np.int16)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _outline(
     polygon: NDArray[np.int32], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
     theta: float, resolution: float, range_max: float, mask_row: int, mask_col: int, full_circle: bool,
@@ -359,7 +359,7 @@ def _outline(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mark_surfaces(
     mask: NDArray[np.uint8], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
     theta: float, resolution: float, mask_row: int, mask_col: int,
@@ -390,11 +390,11 @@ def _mark_surfaces(
         last_x, last_y, last_surface = px, py, here
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fuse(
     log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], mask: NDArray[np.uint8],
     mask_words: NDArray[np.uint64], row0: int, col0: int, overview_probability: NDArray[np.int32],
-    overview_known: NDArray[np.int32], block: int, changes: NDArray[np.int32], count: int, lattice_row: int,
+    overview_known: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, lattice_row: int,
     lattice_col: int,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Add a scan's mask to the grid and wipe it.
@@ -405,6 +405,7 @@ def _fuse(
     known = 0
     entropy = 0.0
     word0 = col0 // _WORD
+    width = min(1 << shift, _WORD)  # cells of a word within one block of the overview
     for i in range(mask.shape[0]):
         for word in range(mask_words.shape[1]):
             marks = mask_words[i, word]
@@ -428,11 +429,10 @@ def _fuse(
                     delta = int(PROBABILITY_BYTE[new & 255]) - (
                         int(PROBABILITY_BYTE[old & 255]) if old != 0 else 0
                     )
-                    width = min(block, _WORD)
-                    for c in range(first // block, (first + _WORD - 1) // block + 1):
-                        overview_probability[row // block, c] += width * delta
+                    for c in range(first >> shift, ((first + _WORD - 1) >> shift) + 1):
+                        overview_probability[row >> shift, c] += width * delta
                         if old == 0:
-                            overview_known[row // block, c] += width
+                            overview_known[row >> shift, c] += width
                     if old == 0:
                         known += _WORD
                     if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
@@ -455,7 +455,7 @@ def _fuse(
                 if new == 0:
                     new = -1  # zero means never observed
                 log_odds[row, col] = new
-                r, c = row // block, col // block
+                r, c = row >> shift, col >> shift
                 delta = int(PROBABILITY_BYTE[new & 255])
                 entropy += ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255]
                 if old == 0:
@@ -473,7 +473,7 @@ def _fuse(
     return count, known, entropy
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mark_disc(
     visited: NDArray[np.uint8], overview: NDArray[np.int32], block: int, y: float, x: float, radius: float
 ) -> None:

@@ -1,7 +1,8 @@
 """The README's accuracy table: episodes over seeds, rooms and backends, one row each, and their medians.
 
 ``python -m training.evaluate --seeds 10000:10049 --out results/episodes`` runs what is missing in
-``episodes.jsonl`` (a killed run goes on where it stopped), then writes ``summary.json`` and prints the tables.
+``episodes.jsonl`` (a killed run goes on where it stopped), then writes ``episodes.csv`` and ``summary.json`` and
+prints the table.
 """
 
 from __future__ import annotations
@@ -141,6 +142,20 @@ def _consistency(profiles: list[list[float]]) -> Row:
     }
 
 
+def _csv(rows: list[Row]) -> str:
+    """Return every episode's metrics as a table, one row each, without the NEES over time."""
+    names = [
+        name for name in rows[0] if name not in ("nees_each_s", "floor_plan", "wall_time_s", "decision_ms_median")
+    ]
+
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.6g}"
+        return "" if value is None else str(value)
+
+    return "\n".join([",".join(names), *(",".join(cell(row[name]) for name in names) for row in rows)]) + "\n"
+
+
 def _table(summaries: list[Row]) -> str:
     lines = [
         "| rooms | backend | coverage ≥ 0.95 | no collision | final position error, median (max) [m] "
@@ -185,6 +200,7 @@ def main(argv: list[str] | None = None) -> int:
     versions = {name: version(name) for name in ("mecanum-slam", "numpy", "numba", "pymunk", "gymnasium")}
     text = json.dumps({"versions": versions, "summaries": summaries}, indent=1)
     atomic_write(options.out / "summary.json", text + "\n")
+    atomic_write(options.out / "episodes.csv", _csv(rows))
     print(_table(summaries))
     return 0
 
