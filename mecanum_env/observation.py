@@ -10,7 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
-from slam.backend import OBSERVED_LIMIT, Backend
+from slam.backend import Backend
+from slam.joint_gaussian import OBSERVED_LIMIT
 from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Scan
 

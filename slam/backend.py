@@ -16,12 +16,9 @@ from slam.occupancy import OccupancyGrid
 from slam.settings import require
 from slam.types import Belief, Observations, Odometry, Scan
 
-__all__ = ["OBSERVED_LIMIT", "Backend", "BackendConfig"]
+__all__ = ["Backend", "BackendConfig"]
 
 Array = NDArray[np.float64]
-
-OBSERVED_LIMIT = 1e4
-"""Bound of what ``near_landmarks`` writes, m and m²: Gymnasium asks for finite spaces."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +117,7 @@ class Backend(abc.ABC):
         """Write the nearest landmarks in the robot frame, nearest first.
 
         Rows of ``(k, 6)``: x, y [m], σxx, σxy, σyy [m²] of the landmark's own covariance, 1; zeros where
-        there are fewer. Nothing exceeds :data:`OBSERVED_LIMIT`.
+        there are fewer. Nothing exceeds :data:`slam.joint_gaussian.OBSERVED_LIMIT`.
         """
 
     def sensor_pose(self) -> Array:

@@ -12,8 +12,8 @@ import slam
 from slam import Observations, Odometry
 from slam.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
 from slam.chi_square import chi2_quantile
-from slam.ekf import add_landmark, near_landmarks, stacked_update
 from slam.geometry import compose, inverse, wrap
+from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update
 from slam.metrics import nees
 from slam.motion import move
 from tests.slam.numerics import numerical_jacobian, random_covariance

@@ -1,0 +1,226 @@
+"""Scan → straight surfaces: split and merge over the points, total least squares on the pieces (kernels)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MAX_LINES = 128
+MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
+
+# The config as the kernels take it.
+(
+    SIGMA, SPLIT_SIGMAS, SPLIT_FLOOR, MIN_POINTS, MIN_LENGTH, SIN_MIN_ANGLE, MAX_GAP, FLOOR,
+    EDGE_LENGTH, EDGE_JUMP, EDGE_SPACING, EDGE_POINTS, EDGE_FACE, EDGE_SIGMA,
+) = range(14)  # fmt: skip
+# A fitted line: its normal, away from the sensor, and distance; the points' centroid; the variances of offset (at
+# the centroid) and slope and their covariance; from where to where it reaches along (-ny, nx) from the centroid;
+# its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0 and 1).
+(
+    NX, NY, R, MX, MY, VAR_OFFSET, VAR_SLOPE, COV, T0, T1, POINTS, FIRST, LAST, ENDS,
+) = range(14)  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
+    """Tell whether two points ``step`` beams apart cannot lie on one surface (see ``_gap_table``)."""
+    if step > MAX_STEP:
+        return True
+    limit = min(r0, r1) * gaps[step - 1, 0] + 4.0 * sigma
+    # The law of cosines, by the difference of the ranges.
+    distance_squared = (r0 - r1) * (r0 - r1) + r0 * r1 * gaps[step - 1, 1]
+    return bool(limit < 0.0 or distance_squared > limit * limit)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def points_in_order(
+    ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
+    beam: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π."""
+    n = ranges.shape[0]
+    start = 0
+    if n * increment > 2.0 * math.pi - 1.5 * increment:
+        for i in range(n):
+            r0, r1 = ranges[i - 1], ranges[i]
+            if not (r0 < np.inf and r1 < np.inf):
+                start = i
+                if r0 == np.inf or r1 == np.inf:
+                    break
+            elif _breaks(r0, r1, 1, gaps, limits[SIGMA]):
+                start = i
+                break
+    count = 0
+    for k in range(n):
+        i = start + k
+        if i >= n:
+            i -= n
+        r = ranges[i]
+        if r >= range_min and r < np.inf:
+            xy[count, 0] = r * rays[i, 0]
+            xy[count, 1] = r * rays[i, 1]
+            beam[count] = i
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def split(
+    xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, limits: Array, gaps: Array,
+    stack: NDArray[np.int64], pieces: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number."""
+    threshold = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
+    beams = ranges.shape[0]
+    count = 0
+    begin = 0
+    while begin < n:
+        end = begin
+        while end + 1 < n:
+            step = beam[end + 1] - beam[end]
+            if step < 0:
+                step += beams
+            if _breaks(ranges[beam[end]], ranges[beam[end + 1]], step, gaps, limits[SIGMA]):
+                break
+            end += 1
+        depth = 0
+        stack[0, 0], stack[0, 1] = begin, end
+        depth = 1
+        goes_on = 0
+        while depth > 0:
+            depth -= 1
+            first, last = stack[depth, 0], stack[depth, 1]
+            middle = _farthest(xy, first, last, threshold)
+            if middle > 0:
+                # Depth first, left part on top: the pieces come out in order.
+                stack[depth, 0], stack[depth, 1] = middle, last
+                stack[depth + 1, 0], stack[depth + 1, 1] = first, middle
+                depth += 2
+                continue
+            if goes_on == 1 and _one_line(xy, pieces[count - 1, 0], first, last, threshold):
+                pieces[count - 1, 1] = last
+            else:
+                pieces[count, 0], pieces[count, 1], pieces[count, 2] = first, last, goes_on
+                count += 1
+            goes_on = 1
+        begin = end + 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
+    """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
+    x0, y0 = xy[first, 0], xy[first, 1]
+    dx, dy = xy[last, 0] - x0, xy[last, 1] - y0
+    length = math.sqrt(dx * dx + dy * dy)
+    best, where = threshold * length, -1
+    for i in range(first + 1, last):
+        d = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
+        if d > best:
+            best, where = d, i
+    return where
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -> bool:
+    """Tell whether two pieces that share ``middle`` are one after all (the merge of split and merge)."""
+    if last - first < 3 or middle - first < 2 or last - middle < 2:
+        return False
+    return _farthest(xy, first, last, 0.75 * threshold) < 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
+    """Fit a line to a piece by total least squares; tell whether it is a surface.
+
+    ``line``: normal (2), distance r, centroid (2), then the variance of the offset at the centroid, of the
+    slope, and their covariance, the extent along the line from the centroid (2), the number of points; then
+    (by the caller) the first and last beam, and which ends make a corner.
+    """
+    # The end points are shared with what comes before and after, and may lie on that: the fit leaves them out.
+    a, b = first + 1, last - 1
+    n = b - a + 1
+    if n + 2 < limits[MIN_POINTS] or n < 3:
+        return False
+    mx = my = 0.0
+    for i in range(a, b + 1):
+        mx += xy[i, 0]
+        my += xy[i, 1]
+    mx /= n
+    my /= n
+    sxx = sxy = syy = 0.0
+    for i in range(a, b + 1):
+        dx, dy = xy[i, 0] - mx, xy[i, 1] - my
+        sxx += dx * dx
+        sxy += dx * dy
+        syy += dy * dy
+    angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)  # of the line itself
+    tx, ty = math.cos(angle), math.sin(angle)
+    nx, ny = -ty, tx
+    r = nx * mx + ny * my
+    if r < 0.0:
+        nx, ny, r = -nx, -ny, -r
+        tx, ty = -tx, -ty
+    # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
+    sigma = limits[SIGMA]
+    var_offset = var_slope = cov = spread = residual = 0.0
+    for i in range(a, b + 1):
+        x, y = xy[i, 0], xy[i, 1]
+        t = tx * (x - mx) + ty * (y - my)
+        d = nx * x + ny * y
+        across = sigma * d / math.sqrt(x * x + y * y)
+        variance = across * across
+        var_offset += variance
+        var_slope += t * t * variance
+        cov += t * variance
+        spread += t * t
+        residual += (d - r) * (d - r)
+    if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[SPLIT_FLOOR])) ** 2:
+        return False
+    line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, r, mx, my
+    line[VAR_OFFSET] = var_offset / (n * n)
+    line[VAR_SLOPE] = var_slope / (spread * spread)
+    line[COV] = cov / (n * spread)
+    if _is_curved(xy, a, b, line, sigma):
+        return False
+    # Along (-ny, nx), which is (tx, ty) up to sign.
+    ax, ay = -ny, nx
+    t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
+    t1 = ax * (xy[last, 0] - mx) + ay * (xy[last, 1] - my)
+    line[T0], line[T1], line[POINTS] = t0, t1, n
+    if ax * tx + ay * ty < 0.0:
+        line[COV] = -line[COV]
+    return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
+    """Tell whether points bulge away from their line by more than noise would have them do.
+
+    Pieces of a round table are short enough to pass for straight ones, and would meet in corners that wander
+    with the robot. The bulge is the coefficient of u² − mean(u²), u the position along the line.
+    """
+    nx, ny, r, mx, my = line[NX], line[NY], line[R], line[MX], line[MY]
+    n = b - a + 1
+    mean = 0.0
+    for i in range(a, b + 1):
+        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
+        mean += t * t
+    mean /= n
+    bulge = norm = largest = 0.0
+    for i in range(a, b + 1):
+        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
+        q = t * t - mean
+        bulge += q * (nx * xy[i, 0] + ny * xy[i, 1] - r)
+        norm += q * q
+        largest = max(largest, t * t)
+    if norm <= 0.0:
+        return False
+    coefficient, deviation = bulge / norm, sigma / math.sqrt(norm)
+    # As a sagitta: what the curve departs by between the middle and the ends.
+    return abs(coefficient) > 2.5 * deviation and abs(coefficient) * largest > 0.5 * sigma
