@@ -220,6 +220,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._ready = True
         self._give_truth()
         self.backend.update(scan)
+        self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
         self._remember()
         info = self._info(self._coverage.update(self.backend.grid), np.zeros(3))
         return self._observe(), info
@@ -239,6 +240,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.backend.predict(self._odometry)
         self._give_truth()
         self.backend.update(self.scan)
+        self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
         self._steps += 1
 
         coverage = self._coverage.update(self.backend.grid)
@@ -306,7 +308,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _remember(self) -> None:
         """Keep what the next step's reward compares with."""
         grid = self.backend.grid
-        self._before = (grid.known_cells, grid.entropy_bit, _entropy(self.backend.pose_cov))
+        self._before = (grid.known_cells, grid.entropy_bit, _entropy(self._pose_cov))
 
     def _outcome(self, collisions: int) -> StepOutcome:
         grid, config = self.backend.grid, self.config
@@ -326,7 +328,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
 
     def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
-        estimate, cov = self.backend.pose, self.backend.pose_cov
+        estimate, cov = self._pose, self._pose_cov
         nees = float(nees_pose(estimate, cov, true_pose))
         x, y, theta = estimate.tolist()
         true_x, true_y, true_theta = true_pose.tolist()
@@ -348,7 +350,13 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _observe(self) -> Observation:
         limit = self._step_limit or self.config.time_limit_s / self.config.step_s
         return observe(
-            self.config, self.backend, self.scan, twist=self._odometry.twist, time_used=self._steps / limit
+            self.config,
+            self.backend,
+            self.scan,
+            pose=self._pose,
+            pose_cov=self._pose_cov,
+            twist=self._odometry.twist,
+            time_used=self._steps / limit,
         )
 
     def _find_step_limit(self) -> int | None:

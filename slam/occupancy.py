@@ -34,6 +34,7 @@ from slam.scan_drawing import (
     mark_disc,
     mark_surfaces,
     outline,
+    sum_blocks,
 )
 from slam.types import Scan
 
@@ -278,20 +279,14 @@ class OccupancyGrid:
             # Beyond 2048 cells a side: the last block of a row may be short, which the padding stands for.
             rows, cols = -(-rows // block) * block, -(-cols // block) * block
         self.overview_block = block
-        known = np.zeros((rows, cols), np.int32)
-        probability, visited = known.copy(), known.copy()
-        r, c = self.shape
-        known[:r, :c] = self.log_odds != 0
-        probability[:r, :c] = np.where(known[:r, :c], PROBABILITY_BYTE[self.log_odds.view(np.uint8)], 0)
-        visited[:r, :c] = self.visited
-
-        def blocks(cells: NDArray[np.int32]) -> NDArray[np.int32]:
-            split = cells.reshape(rows // block, block, cols // block, block)
-            return np.ascontiguousarray(split.sum(axis=(1, 3), dtype=np.int32))
-
-        self._overview_known = blocks(known)
-        self._overview_probability = blocks(probability)
-        self._overview_visited = blocks(visited)
+        shape = (rows // block, cols // block)
+        self._overview_known = np.zeros(shape, np.int32)
+        self._overview_probability = np.zeros(shape, np.int32)
+        self._overview_visited = np.zeros(shape, np.int32)
+        sum_blocks(
+            self.log_odds, self.visited, block.bit_length() - 1, self._overview_known, self._overview_probability,
+            self._overview_visited,
+        )  # fmt: skip
 
     def overview(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
         """Return per block: observed cells, the sum of their probability × 255, visited cells. Live arrays."""

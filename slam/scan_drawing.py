@@ -208,6 +208,23 @@ def fuse(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def sum_blocks(
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], shift: int, known: NDArray[np.int32],
+    probability: NDArray[np.int32], trail: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Add up blocks of 2^shift cells a side: observed cells, their probability × 255, visited cells."""
+    for i in range(log_odds.shape[0]):
+        r = i >> shift
+        for j in range(log_odds.shape[1]):
+            v = log_odds[i, j]
+            if v != 0:
+                known[r, j >> shift] += 1
+                probability[r, j >> shift] += PROBABILITY_BYTE[np.uint64(v & 255)]
+            if visited[i, j] != 0:
+                trail[r, j >> shift] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def mark_disc(
     visited: NDArray[np.uint8], overview: NDArray[np.int32], block: int, y: float, x: float, radius: float
 ) -> None:
