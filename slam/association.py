@@ -1,4 +1,4 @@
-"""Which landmark was seen: Mahalanobis gating and nearest neighbour over a joint Gaussian.
+"""Which landmark was seen: Mahalanobis gating, nearest neighbour and joint compatibility over a joint Gaussian.
 
 The joint covariance is passed as its upper triangle; landmark ``i`` stands at state index 3 + 2i.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 
-__all__ = ["IGNORED", "UNMATCHED", "innovation_blocks", "nearest_neighbour"]
+__all__ = ["IGNORED", "UNMATCHED", "innovation_blocks", "joint_compatibility", "nearest_neighbour"]
 
 Array = NDArray[np.float64]
 
@@ -62,6 +62,14 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
+    """Tell whether an observation has a landmark's kind and direction, as far as both are known."""
+    if z[5] == 0.0 or mark[0] == 0.0:
+        return True
+    return bool(z[5] == mark[0] and abs(wrap_scalar(z[6] + theta - mark[1])) <= max_turn)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
     max_turn: float, match: NDArray[np.int64], distance: Array, h: Array,
@@ -96,9 +104,7 @@ def nearest_neighbour(
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if abs(dx) > window or abs(dy) > window:
                 continue
-            if z[k, 5] != 0.0 and marks[i, 0] != 0.0 and (
-                z[k, 5] != marks[i, 0] or abs(wrap_scalar(z[k, 6] + x[2] - marks[i, 1])) > max_turn
-            ):  # fmt: skip
+            if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
             d2 = _gate(x, p, i, offset, z[k], h)
             if d2 < gate and d2 < distance[k]:
@@ -110,3 +116,164 @@ def nearest_neighbour(
         for j in range(k):
             if match[k] >= 0 and match[k] == match[j]:
                 match[k if distance[k] >= distance[j] else j] = IGNORED
+
+
+_CANDIDATES = 8  # landmarks considered for one observation, the nearest first
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def joint_compatibility(
+    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gates: Array, near: float,
+    max_turn: float, most_nodes: int, match: NDArray[np.int64],
+) -> float:  # fmt: skip
+    """Match as many observations as one pose can explain together; return their joint squared distance.
+
+    Joint compatibility branch and bound (Neira and Tardós 2001): the innovations of all pairings at once, with
+    their cross-covariances, must lie within the gate. Among the largest such sets, the nearest one. S is factored
+    row by row as the search goes down, so that a pairing costs its own two rows only.
+
+    Parameters
+    ----------
+    z, marks, near, max_turn, match
+        As in :func:`nearest_neighbour`.
+    gates : Array
+        ``(> m,)`` largest squared Mahalanobis distance of k pairings at index k.
+    most_nodes : int
+        The search stops here with the best set so far; it is exponential at worst.
+    """
+    m = z.shape[0]
+    candidate, count = np.zeros((m, _CANDIDATES), np.int64), np.zeros(m + 1, np.int64)
+    distance = np.zeros((m, _CANDIDATES))
+    for k in range(m):
+        match[k] = UNMATCHED
+        count[k] = _compatible(x, p, landmarks, offset, z[k], marks, gates[1], max_turn, candidate[k], distance[k])
+    left = np.zeros(m + 1, np.int64)  # observations from k on that any landmark could be
+    for k in range(m - 1, -1, -1):
+        left[k] = left[k + 1] + (count[k] > 0)
+
+    h = np.zeros((m, 2, 5))  # one entry a pairing, down the present branch
+    landmark = np.zeros(m, np.int64)
+    factor, y = np.zeros((2 * m, 2 * m)), np.zeros(2 * m)
+    nis = np.zeros(m + 1)
+    option, paired = np.zeros(m + 1, np.int64), np.zeros(m + 1, np.bool_)
+    chosen = np.full(m, UNMATCHED)
+    pairs = best_pairs = 0
+    best_nis = 0.0
+    k = 0
+    for _ in range(most_nodes):
+        if paired[k]:  # come back from below
+            paired[k] = False
+            chosen[k] = UNMATCHED
+            pairs -= 1
+        hope = pairs + left[k]
+        hopeless = hope < best_pairs or (hope == best_pairs and nis[pairs] >= best_nis)
+        if k == m and not hopeless:
+            best_pairs, best_nis = pairs, nis[pairs]
+            match[:] = chosen
+        if k == m or hopeless or option[k] > count[k]:
+            if k == 0:
+                break
+            k -= 1
+            continue
+        o = option[k]
+        option[k] += 1
+        if o < count[k]:
+            i = candidate[k, o]
+            if np.any(landmark[:pairs] == i):
+                continue
+            landmark[pairs] = i
+            _extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
+            more = nis[pairs] + y[2 * pairs] ** 2 + y[2 * pairs + 1] ** 2
+            if more > gates[pairs + 1]:
+                continue
+            pairs += 1
+            nis[pairs] = more
+            paired[k] = True
+            chosen[k] = i
+        k += 1
+        option[k] = 0
+    _set_aside(x, landmarks, offset, z, marks, near, max_turn, count, match)
+    return float(best_nis)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _compatible(
+    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, max_turn: float,
+    candidate: NDArray[np.int64], distance: Array,
+) -> int:  # fmt: skip
+    """List the landmarks that one observation could be, nearest first; return how many."""
+    h = np.zeros((2, 5))
+    found = 0
+    for i in range(landmarks):
+        if not _alike(z, marks[i], x[2], max_turn):
+            continue
+        d2 = _gate(x, p, i, offset, z, h)
+        if d2 >= gate or (found == _CANDIDATES and d2 >= distance[found - 1]):
+            continue
+        j = found if found < _CANDIDATES else found - 1
+        while j > 0 and distance[j - 1] > d2:
+            candidate[j], distance[j] = candidate[j - 1], distance[j - 1]
+            j -= 1
+        candidate[j], distance[j] = i, d2
+        found = min(found + 1, _CANDIDATES)
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _extend(
+    x: Array, p: Array, offset: float, z: Array, landmark: NDArray[np.int64], pairs: int, h: Array, factor: Array,
+    y: Array,
+) -> None:  # fmt: skip
+    """Add a pairing's two rows to the Cholesky factor L of S and to y = L⁻¹ ν."""
+    i = landmark[pairs]
+    rho, bearing = innovation_blocks(x, i, offset, h[pairs])
+    row = 2 * pairs
+    y[row], y[row + 1] = z[0] - rho, wrap_scalar(z[1] - bearing)
+    for e in range(2):
+        r = row + e
+        for j in range(r + 1):
+            v = _cross(p, i, h[pairs, e], landmark[j // 2], h[j // 2, j % 2])
+            if j >= row:
+                v += z[2 + e + (j - row)]  # R's terms: ρρ, ρφ, φφ
+            for q in range(j):
+                v -= factor[r, q] * factor[j, q]
+            if j < r:
+                factor[r, j] = v / factor[j, j]
+                y[r] -= factor[r, j] * y[j]
+            else:
+                factor[r, r] = math.sqrt(v)
+                y[r] /= factor[r, r]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cross(p: Array, i: int, hi: Array, j: int, hj: Array) -> float:
+    """Return Hi P Hjᵀ for a row of either landmark's H, from P's upper triangle."""
+    total = 0.0
+    for a in range(5):
+        ia = a if a < 3 else 3 + 2 * i + a - 3
+        for b in range(5):
+            jb = b if b < 3 else 3 + 2 * j + b - 3
+            total += hi[a] * hj[b] * (p[ia, jb] if ia <= jb else p[jb, ia])
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _set_aside(
+    x: Array, landmarks: int, offset: float, z: Array, marks: Array, near: float, max_turn: float,
+    count: NDArray[np.int64], match: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Mark as IGNORED what is unmatched, yet could be a landmark or is too near to one to be new."""
+    c, s = math.cos(x[2]), math.sin(x[2])
+    for k in range(z.shape[0]):
+        if match[k] != UNMATCHED:
+            continue
+        if count[k] > 0:
+            match[k] = IGNORED
+            continue
+        bearing = x[2] + z[k, 1]
+        px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
+        py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
+        for i in range(landmarks):
+            dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
+            if dx * dx + dy * dy < near * near and _alike(z[k], marks[i], x[2], max_turn):
+                match[k] = IGNORED

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.association import nearest_neighbour
+from slam.association import joint_compatibility, nearest_neighbour
 from slam.backend import Backend, BackendConfig
+from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update, symmetric_block
 from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
 from slam.motion import predict_robot
@@ -25,6 +26,10 @@ __all__ = ["EkfConfig", "EkfSlam"]
 Array = NDArray[np.float64]
 
 _MAX_OBSERVATIONS = 64
+_MOST_NODES = 4000
+_FEWEST_BACK = 2  # landmarks; one alone says nothing about the heading
+# Of k pairings together: 99 % of chi-square with 2k degrees of freedom.
+_JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, _MAX_OBSERVATIONS + 1)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +67,8 @@ class EkfSlam(Backend):
         self._h = np.zeros((_MAX_OBSERVATIONS, 2, 5))
         self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(_MAX_OBSERVATIONS)
-        self._twist, self._dt = (0.0, 0.0, 0.0), 0.0
+        self._twist = (0.0, 0.0, 0.0)
+        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
         self.nis = 0.0
         self.nis_dof = 0
 
@@ -75,14 +81,19 @@ class EkfSlam(Backend):
         slip = noise.slip(self._twist, (vx, vy, omega), odometry.dt)
         var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
-        self._twist, self._dt = (vx, vy, omega), odometry.dt
+        self._twist = (vx, vy, omega)
+        way = math.hypot(vx, vy, noise.lever_m * omega) * odometry.dt
+        moved, turned = self._unseen_motion
+        self._unseen_motion = (moved + way, turned + way / noise.lever_m)
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self.extractor.extract(scan)[:_MAX_OBSERVATIONS]
         match = self._associate(z)
         if self._out_of_sight(match):
-            match = self._allow_for_spinning_wheels(z)
+            match = self._allow_for_spinning_wheels(z, match, scan)
+        if np.count_nonzero(match >= 0) >= _FEWEST_BACK:
+            self._unseen_motion = (0.0, 0.0)
         self._correct(z, match)
         self._manage(z, match, scan)
         self._draw(scan)
@@ -125,26 +136,42 @@ class EkfSlam(Backend):
         recent, still = self._book.recently_seen(match)
         return recent >= 3 and still < 0.6 * recent
 
-    def _allow_for_spinning_wheels(self, z: Array) -> NDArray[np.int64]:
-        """Associate again as though the wheels had turned in vain; keep to that if it brings the landmarks back.
+    def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
+        """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
 
         Against a wall, or pulling away too hard, the wheels turn and the robot does not follow. V knows nothing
         of that, and a filter that trusts it has every gate closed within two steps and is lost for good. So the
-        pose may be off by as much as the wheels claim to have moved.
+        pose may be off by as much as the wheels claim to have moved since the landmarks were last in sight.
+        Gates as wide as that would take any corner near by for a landmark. So one pose must explain them all, and
+        the scan must fit the map better from there: what changed may be the view, through a door, say.
         """
-        kept = self._p[:3, :3].copy()
-        vx, vy, omega = self._twist
-        lever = self.config.odometry.lever_m
-        moved = math.hypot(vx, vy, lever * omega) * self._dt
+        n, policy, offset = self._n, self.config.landmarks, self.config.lidar_offset_m
+        x, p = self._x[:n].copy(), self._p[:n, :n].copy()
+        usual = usual.copy()
+        fit = self._fit(z, usual, scan)
+        self._x[:n], self._p[:n, :n] = x, p
+        moved, turned = self._unseen_motion
         self._p[0, 0] += moved**2
         self._p[1, 1] += moved**2
-        self._p[2, 2] += (moved / lever) ** 2
-        match = self._associate(z)
-        if not self._out_of_sight(match):
-            return match
-        # It is the view that changed: through a door, say.
-        self._p[:3, :3] = kept
-        return self._associate(z)
+        self._p[2, 2] += turned**2
+        match = self._match[: len(z)]
+        joint_compatibility(
+            self._x, self._p, self._book.count, offset, z, self._book.marks, _JOINT_GATES, policy.new_distance_m,
+            math.radians(self.config.max_turn_deg), _MOST_NODES, match,
+        )  # fmt: skip
+        found = np.count_nonzero(match >= 0)
+        back = found >= _FEWEST_BACK and found > np.count_nonzero(usual >= 0)
+        p_wide = self._p[:3, :3].copy()
+        if back and self._fit(z, match, scan) > fit:
+            p[:3, :3] = p_wide
+            usual = match
+        self._x[:n], self._p[:n, :n] = x, p
+        return usual
+
+    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
+        """Correct by a match; return how well the scan fits the map from there."""
+        self._correct(z, match)
+        return self.grid.agreement(self.sensor_pose(), scan)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""

@@ -30,6 +30,7 @@ from slam.scan_drawing import (
     UNIT_NAT,
     UNKNOWN,
     WORD,
+    ends_on,
     fuse,
     mark_disc,
     mark_surfaces,
@@ -151,6 +152,19 @@ class OccupancyGrid:
         changes = self._changes[: self._change_count].copy()
         self._change_count = 0
         return changes
+
+    def agreement(self, sensor_pose: Array, scan: Scan) -> float:
+        """Return the sum of the log-odds [nat] of the cells that a scan's beams end in, seen from a pose ``(3,)``.
+
+        It compares poses of one scan by how well each fits the map; unknown cells count for nothing.
+        """
+        rays = self._ray_table(len(scan.ranges), scan.angle_min, scan.angle_increment)
+        x, y, theta = np.asarray(sensor_pose).tolist()
+        units = ends_on(
+            self.log_odds, scan.ranges, rays, x / self.resolution - self._col0, y / self.resolution - self._row0,
+            theta, self.resolution, scan.range_max,
+        )  # fmt: skip
+        return UNIT_NAT * units
 
     # ---- drawing -------------------------------------------------------------------------------------------
 

@@ -234,3 +234,22 @@ def mark_disc(
             if (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius and visited[i, j] == 0:
                 visited[i, j] = 1
                 overview[i // block, j // block] += 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def ends_on(
+    log_odds: NDArray[np.int8], ranges: Array, rays: Array, x: float, y: float, theta: float, resolution: float,
+    range_max: float,
+) -> int:  # fmt: skip
+    """Return the sum of the cells in which beams end; ``x`` and ``y`` in cells of the array."""
+    c, s = math.cos(theta), math.sin(theta)
+    total = 0
+    for i in range(ranges.shape[0]):
+        r = ranges[i]
+        if not r < range_max:  # lost (nan) and without return
+            continue
+        col = math.floor(x + (c * rays[i, 0] - s * rays[i, 1]) * r / resolution)
+        row = math.floor(y + (s * rays[i, 0] + c * rays[i, 1]) * r / resolution)
+        if 0 <= row < log_odds.shape[0] and 0 <= col < log_odds.shape[1]:
+            total += log_odds[row, col]
+    return total

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from slam import Scan
 from slam.features import FeatureExtractor
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from tests.slam.simulated import ANGLE_MIN, INCREMENT, room_scan
+from tests.slam.simulated import ANGLE_MIN, BEAMS, INCREMENT, room_scan
 
 inside = st.tuples(st.floats(1, 5), st.floats(1, 4), st.floats(-3.1, 3.1)).map(np.array)
 
@@ -130,3 +130,17 @@ def test_from_classes_round_trips_and_bad_resolution_is_refused() -> None:
     np.testing.assert_array_equal(grid.classes()[r : r + 37, c : c + 51], classes)
     with pytest.raises(ValueError, match="resolution"):
         OccupancyGrid(0.0)
+
+
+def test_agreement_is_greatest_where_the_scan_was_taken() -> None:
+    grid = OccupancyGrid(0.05)
+    pose = np.array([2.0, 2.0, 0.3])
+    scan = room_scan(pose)
+    for _ in range(3):
+        grid.integrate(pose, scan)
+    best = grid.agreement(pose, scan)
+    for shift in ([0.2, 0.0, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, 0.1]):
+        assert grid.agreement(pose + shift, scan) < 0.5 * best
+    nothing = Scan(np.full(BEAMS, np.inf), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=20.0)
+    assert grid.agreement(pose, nothing) == 0.0
+    assert OccupancyGrid(0.05).agreement(pose, scan) == 0.0

@@ -1,0 +1,120 @@
+"""Joint compatibility: against exhaustive search, and where gates one by one are fooled."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+import slam
+from slam import Odometry
+from slam.association import IGNORED, innovation_blocks, joint_compatibility, nearest_neighbour
+from slam.chi_square import chi2_quantile
+from slam.geometry import compose, inverse, wrap
+from tests.slam.numerics import random_covariance
+from tests.slam.simulated import circle_twist, drive, room_scan
+
+OFFSET = 0.2
+GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, 65)])
+
+
+def observe(x: np.ndarray, i: int, *, sigma: float = 1e-4) -> np.ndarray:
+    """Return the observation row of landmark ``i`` as predicted, of unknown kind."""
+    row = np.zeros(8)
+    row[:2] = innovation_blocks(x, i, OFFSET, np.zeros((2, 5)))
+    row[2], row[4] = sigma**2, sigma**2
+    return row
+
+
+def joint_distance(x: np.ndarray, p: np.ndarray, z: np.ndarray, pairs: list[tuple[int, int]]) -> float:
+    """Return νᵀ S⁻¹ ν of the pairings (observation, landmark), from dense matrices."""
+    h = np.zeros((2 * len(pairs), len(x)))
+    r = np.zeros((2 * len(pairs), 2 * len(pairs)))
+    nu = np.zeros(2 * len(pairs))
+    for q, (k, i) in enumerate(pairs):
+        block = np.zeros((2, 5))
+        nu[2 * q : 2 * q + 2] = z[k, :2] - np.array(innovation_blocks(x, i, OFFSET, block))
+        nu[2 * q + 1] = wrap(nu[2 * q + 1])
+        h[2 * q : 2 * q + 2, :3] = block[:, :3]
+        h[2 * q : 2 * q + 2, 3 + 2 * i : 5 + 2 * i] = block[:, 3:]
+        r[2 * q : 2 * q + 2, 2 * q : 2 * q + 2] = [[z[k, 2], z[k, 3]], [z[k, 3], z[k, 4]]]
+    return float(nu @ np.linalg.solve(h @ p @ h.T + r, nu))
+
+
+def exhaustive(x: np.ndarray, p: np.ndarray, z: np.ndarray, landmarks: int) -> tuple[int, float]:
+    """Return the number of pairings and the distance of the best jointly compatible set, by trying all."""
+    best = (0, 0.0)
+    for choice in itertools.product(range(-1, landmarks), repeat=len(z)):
+        taken = [i for i in choice if i >= 0]
+        if len(set(taken)) < len(taken) or len(taken) < best[0]:
+            continue
+        pairs = [(k, i) for k, i in enumerate(choice) if i >= 0]
+        steps = [joint_distance(x, p, z, pairs[: n + 1]) for n in range(len(pairs))]
+        if any(d > GATES[n + 1] for n, d in enumerate(steps)):
+            continue
+        if pairs and (len(pairs) > best[0] or steps[-1] < best[1]):
+            best = (len(pairs), steps[-1])
+    return best
+
+
+@given(st.integers(0, 10_000))
+def test_joint_compatibility_finds_the_best_set_of_all(seed: int) -> None:
+    """Four landmarks near one another, three observations that may be any of them, an uncertain pose."""
+    rng = np.random.default_rng(seed)
+    x = np.concatenate([rng.uniform(-1, 1, 3), (np.array([3.0, 0.0]) + rng.uniform(-0.6, 0.6, (4, 2))).ravel()])
+    p = 0.002 * random_covariance(len(x), rng) + np.diag([0.02, 0.02, 0.002] + [1e-4] * 8)
+    z = np.array([observe(x, int(i), sigma=0.02) for i in rng.integers(0, 4, 3)])
+    z[:, :2] += rng.normal(0, 0.08, (3, 2))
+    match = np.zeros(3, np.int64)
+    distance = joint_compatibility(x, np.triu(p), 4, OFFSET, z, np.zeros((4, 2)), GATES, 0.2, 0.6, 100_000, match)
+    pairs = [(k, int(i)) for k, i in enumerate(match) if i >= 0]
+    count, nearest = exhaustive(x, p, z, 4)
+    assert len(pairs) == count
+    np.testing.assert_allclose(distance, nearest, rtol=1e-6, atol=1e-12)
+    if pairs:
+        np.testing.assert_allclose(joint_distance(x, p, z, pairs), nearest, rtol=1e-6)
+
+
+def test_joint_compatibility_holds_where_nearest_neighbour_is_fooled() -> None:
+    """A row of equal posts, and a pose that is off by more than half their distance along it."""
+    x = np.zeros(3 + 2 * 5)
+    x[3:] = np.array([[2.0, 0.0], [2.0, 0.2], [2.0, 0.4], [2.0, 0.6], [3.0, 0.3]]).ravel()
+    p = np.diag([1e-6, 0.01, 1e-6] + [1e-6] * 10)
+    truth = x.copy()
+    truth[1] = 0.12
+    z = np.array([observe(truth, i, sigma=0.01) for i in (1, 2, 3, 4)])
+    nearest, joint = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    marks = np.zeros((5, 2))
+    nearest_neighbour(x, p, 5, OFFSET, z, marks, GATES[1], 0.1, 0.6, nearest, np.zeros(4), np.zeros((2, 5)))
+    joint_compatibility(x, p, 5, OFFSET, z, marks, GATES, 0.1, 0.6, 10_000, joint)
+    assert nearest[:3].tolist() == [0, 1, 2]
+    assert joint.tolist() == [1, 2, 3, 4]
+
+
+def test_what_could_be_a_landmark_but_is_not_jointly_is_not_new() -> None:
+    x = np.array([0.0, 0.0, 0.0, 2.0, 1.0, 2.0, -1.0, 3.0, 0.0])
+    p = np.diag([0.01, 0.01, 1e-4] + [1e-6] * 6)
+    z = np.array([observe(x, i, sigma=0.002) for i in range(3)])
+    z[2, 0] += 0.1  # within the pose's own gate, not together with the other two
+    match = np.zeros(3, np.int64)
+    joint_compatibility(x, p, 3, OFFSET, z, np.zeros((3, 2)), GATES, 0.1, 0.6, 10_000, match)
+    assert match.tolist() == [0, 1, IGNORED]
+
+
+def test_a_changed_view_is_not_taken_for_wheels_that_spin() -> None:
+    """Corners that give way to others near by, as at a door, must not move a filter that knows where it is."""
+    rng = np.random.default_rng(3)
+    backend = slam.make("ekf")
+    backend.reset()
+    start = pose = np.array([2.0, 2.0, 0.3])
+    for k in range(60):
+        sensor = compose(pose, np.array([OFFSET, 0, 0]))
+        backend.update(room_scan(sensor, rng) if k < 50 else room_scan(sensor, rng, width=6.08, height=5.09))
+        error = compose(inverse(start), pose) - backend.pose
+        assert math.hypot(error[0], error[1]) < 0.03
+        assert abs(float(wrap(error[2]))) < 0.02
+        pose, odometry = drive(pose, circle_twist(k), (0.01, 0.02), rng)
+        backend.predict(Odometry(odometry.twist, odometry.dt))
