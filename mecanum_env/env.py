@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
+from numba import njit
 from numpy.typing import NDArray
 
 import slam
@@ -178,6 +179,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS[action],), np.float32)
         self.observation_space = cast("spaces.Space[Observation]", observation_space(self.config))
         self.backend = make_backend(self.config)
+        self._knows_truth = isinstance(self.backend, TruthSlam)
         self.lidar = Lidar(self.config.lidar, self.config.noise)
         self._ready = False
 
@@ -218,7 +220,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._step_limit = self._find_step_limit()
         self._odometry = Odometry((0.0, 0.0, 0.0), config.step_s)
         self._ready = True
-        self._give_truth()
+        if self._knows_truth:
+            cast("TruthSlam", self.backend).give_pose(np.zeros(3))
         self.backend.update(scan)
         self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
         self._remember()
@@ -229,23 +232,25 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Act for one control step; see :mod:`mecanum_env.reward` for the reward."""
         if not self._ready:
             raise RuntimeError("call reset() before step()")
-        config, world = self.config, self.truth.world
-        wheels = self._wheel_targets(action)
+        config, truth, backend = self.config, self.truth, self.backend
+        world, ground, plan = truth.world, truth.ground, truth.ground.plan
         collisions = world.collisions
-        world.step(wheels, config.step_s, config.physics_step_s)
-        self._odometry = self._encoders.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
-        plan = self.truth.plan
-        self.scan = self.lidar.scan(plan.segments, plan.circles, world.pose, self._sensor_rng)
-        self.truth.scan = self.scan
-        self.backend.predict(self._odometry)
-        self._give_truth()
-        self.backend.update(self.scan)
-        self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
+        world.step(self._wheel_targets(action), config.step_s, config.physics_step_s)
+        odometry = self._encoders.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
+        world_pose = world.pose
+        scan = self.lidar.scan(plan.segments, plan.circles, world_pose, self._sensor_rng)
+        self._odometry, self.scan, truth.scan = odometry, scan, scan
+        true_pose = ground.in_start_frame(world_pose)
+        backend.predict(odometry)
+        if self._knows_truth:
+            cast("TruthSlam", backend).give_pose(true_pose)
+        backend.update(scan)
+        self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._steps += 1
 
-        coverage = self._coverage.update(self.backend.grid)
+        coverage = self._coverage.update(backend.grid)
         terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
-        info = self._info(coverage, np.asarray(self.truth.pose))
+        info = self._info(coverage, true_pose)
         info["reward_terms"] = terms
         success = coverage >= config.coverage_target
         terminated = success or (config.terminate_on_collision and world.collisions > 0)
@@ -301,44 +306,39 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             return action_to_wheels(self.config.robot, action)
         return twist_action_to_wheels(self.config.robot, action)
 
-    def _give_truth(self) -> None:
-        if isinstance(self.backend, TruthSlam):
-            self.backend.give_pose(self.truth.pose)
-
     def _remember(self) -> None:
         """Keep what the next step's reward compares with."""
         grid = self.backend.grid
-        self._before = (grid.known_cells, grid.entropy_bit, _entropy(self._pose_cov))
+        self._before = (grid.known_cells, grid.entropy_bit, float(_entropy(self._pose_cov)))
 
     def _outcome(self, collisions: int) -> StepOutcome:
-        grid, config = self.backend.grid, self.config
-        known, map_entropy, pose_entropy = self._before
+        known_before, map_entropy_before, pose_entropy_before = self._before
         self._remember()
-        cell = grid.resolution**2
+        known, map_entropy, pose_entropy = self._before
+        cell = self.backend.grid.resolution ** 2
         vx, vy, omega = np.asarray(self._odometry.twist).tolist()
-        robot = config.robot
+        robot = self.config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
         return StepOutcome(
-            area_m2=(grid.known_cells - known) * cell,
-            pose_entropy_loss_nat=pose_entropy - self._before[2],
-            map_entropy_loss_bit_m2=(map_entropy - grid.entropy_bit) * cell,
+            area_m2=(known - known_before) * cell,
+            pose_entropy_loss_nat=pose_entropy_before - pose_entropy,
+            map_entropy_loss_bit_m2=(map_entropy_before - map_entropy) * cell,
             collisions=collisions,
             effort=min(speed, 1.0),
-            dt=config.step_s,
+            dt=self.config.step_s,
         )
 
     def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
-        estimate, cov = self._pose, self._pose_cov
-        nees = float(nees_pose(estimate, cov, true_pose))
-        x, y, theta = estimate.tolist()
-        true_x, true_y, true_theta = true_pose.tolist()
-        record, world = self.truth.record, self.truth.world
+        nees = nees_pose(self._pose, self._pose_cov, true_pose)
+        x, y, theta = estimate = self._pose.tolist()
+        true_x, true_y, true_theta = truth = true_pose.tolist()
+        record, collisions = self.truth.record, self.truth.world.collisions
         time_s = self._steps * self.config.step_s
-        record.append(time_s, true_pose, estimate, coverage, nees)
-        record.collisions = world.collisions
+        record.append(time_s, truth, estimate, coverage, nees)
+        record.collisions = collisions
         return {
             "coverage": coverage,
-            "collisions": world.collisions,
+            "collisions": collisions,
             "path_length_m": record.path_length_m,
             "time_s": time_s,
             "true_pose": true_pose,
@@ -386,8 +386,9 @@ def make_backend(config: EnvConfig) -> Backend:
     return slam.make(config.slam, config=backend_settings(config))
 
 
+@njit(cache=True, nogil=True)
 def _entropy(cov: Array) -> float:
     """Return the pose's differential entropy up to a constant: ½ log |Σ| [nat]."""
-    (a, b, c), (_, d, e), (_, _, f) = cov.tolist()
+    a, b, c, d, e, f = cov[0, 0], cov[0, 1], cov[0, 2], cov[1, 1], cov[1, 2], cov[2, 2]
     det = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
     return 0.5 * math.log(max(det, 1e-60))

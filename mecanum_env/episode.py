@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,12 +36,14 @@ class EpisodeRecord:
         self.path_length_m = 0.0
         self.collisions = 0
 
-    def append(self, time_s: float, true_pose: Array, estimate: Array, coverage: float, nees: float) -> None:
-        """Add one step; the first row is the start itself."""
+    def append(
+        self, time_s: float, true_pose: Sequence[float], estimate: Sequence[float], coverage: float, nees: float
+    ) -> None:
+        """Add one step (poses x, y, θ); the first row is the start itself."""
         if self._count == len(self._rows):
             self._rows = np.vstack([self._rows, np.empty_like(self._rows)])
-        x, y, theta = true_pose.tolist()
-        self._rows[self._count] = (x, y, theta, *estimate.tolist(), time_s, coverage, nees)
+        x, y = true_pose[0], true_pose[1]
+        self._rows[self._count] = (*true_pose, *estimate, time_s, coverage, nees)
         if self._count:
             self.path_length_m += math.hypot(x - self._last[0], y - self._last[1])
         self._last = (x, y)

@@ -78,38 +78,52 @@ def observe(
     time_used : float
         Fraction of the episode's time used.
     """
-    grid = backend.grid
+    grid, robot = backend.grid, config.robot
     centre_x, centre_y, half = map_frame(grid)
-    x, y, theta = pose.tolist()
-    map_local = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
-    map_global = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
-    scan_out = np.empty(len(scan.ranges), np.float32)
-    numbers = np.empty(15, np.float32)
-    landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
     row0, col0 = grid.lattice_origin
     known, probability, visited = grid.overview()
-    _fill_local(map_local, grid.log_odds, grid.visited, row0, col0, grid.resolution, x, y, theta)
-    _fill_global(
-        map_global, known, probability, visited, grid.overview_block, (x - centre_x) / half, (y - centre_y) / half
-    )
-    robot = config.robot
     vx, vy, omega = np.asarray(twist).tolist()
-    _fill_numbers(
-        numbers, scan_out, scan.ranges, scan.range_max, pose, pose_cov, centre_x, centre_y, half,
+    maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
+    ranges = np.empty(len(scan.ranges), np.float32)
+    numbers = np.empty(15, np.float32)
+    landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
+    _fill(
+        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution,
+        known, probability, visited, grid.overview_block, centre_x, centre_y, half,
+        scan.ranges, scan.range_max, pose, pose_cov,
         vx / robot.max_speed_m_s, vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s,
         time_used, grid.known_area_m2 / (4.0 * half * half),
     )  # fmt: skip
     backend.near_landmarks(landmarks)
     return {
-        "map_local": map_local,
-        "map_global": map_global,
-        "scan": scan_out,
-        "pose": numbers[:4].copy(),
-        "pose_cov": numbers[4:10].copy(),
+        "map_local": maps[0],
+        "map_global": maps[1],
+        "scan": ranges,
+        "pose": numbers[:4],
+        "pose_cov": numbers[4:10],
         "landmarks": landmarks,
-        "twist": numbers[10:13].copy(),
-        "progress": numbers[13:15].copy(),
+        "twist": numbers[10:13],
+        "progress": numbers[13:15],
     }
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill(
+    maps: NDArray[np.uint8], ranges_out: NDArray[np.float32], numbers: NDArray[np.float32],
+    log_odds: NDArray[np.int8], trail: NDArray[np.uint8], row0: int, col0: int, resolution: float,
+    known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32], block: int,
+    centre_x: float, centre_y: float, half: float, ranges: Array, range_max: float, pose: Array, cov: Array,
+    vx: float, vy: float, omega: float, time_used: float, known_share: float,
+) -> None:  # fmt: skip
+    """Fill everything but the landmarks, in one call."""
+    _fill_local(maps[0], log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
+    _fill_global(
+        maps[1], known, probability, visited, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half
+    )
+    _fill_numbers(
+        numbers, ranges_out, ranges, range_max, pose, cov, centre_x, centre_y, half, vx, vy, omega, time_used,
+        known_share,
+    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -149,44 +163,42 @@ def _fill_local(
     """
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
-    c, s = math.cos(theta) * step, math.sin(theta) * step
+    c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
     rows, cols = log_odds.shape
-    # Flat arrays and unsigned indices: without them every access tests for a negative index.
     cells, trail = log_odds.ravel(), visited.ravel()
-    # Positions in cells as fixed-point numbers with sixteen bits of fraction: a shift is the floor.
-    one = 65536.0
     half = 0.5 * size - 0.5
-    col_step, row_step = np.int64(s * one), np.int64(-c * one)  # one pixel to the right
-    col_a, col_b = np.int64(0.25 * (c - s) * one), np.int64(0.25 * (c + s) * one)  # to the points
-    row_a, row_b = np.int64(0.25 * (s + c) * one), np.int64(0.25 * (s - c) * one)
-    col_reach, row_reach = abs(col_a) + abs(col_b), abs(row_a) + abs(row_b)
+    quarter = np.float32(0.25)
+    ax, ay = quarter * (c - s), quarter * (s + c)  # from the middle to the points, in cells
+    bx, by = quarter * (c + s), quarter * (s - c)
+    low_x, low_y = max(abs(ax), abs(bx)), max(abs(ay), abs(by))
+    high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
+    width = np.int32(cols)
+    # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
+    first, second, middle = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     for i in range(size):
-        ahead = half - i
-        col = np.int64((x / resolution - col0 + c * ahead - s * half) * one)
-        row = np.int64((y / resolution - row0 + s * ahead + c * half) * one)
+        x0 = np.float32(x / resolution - col0 + c * (half - i) - s * half)
+        y0 = np.float32(y / resolution - row0 + s * (half - i) + c * half)
+        for j in range(size):
+            px, py = x0 + np.float32(j) * s, y0 - np.float32(j) * c
+            one_way = (i + j) & 1 == 1
+            dx, dy = ax if one_way else bx, ay if one_way else by
+            inside = (px >= low_x) & (py >= low_y) & (px < high_x) & (py < high_y)
+            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else -1
+            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else -1
+            middle[j] = np.int32(py) * width + np.int32(px) if inside else -1
         probability_row, observed_row, trail_row = out[0, i], out[1, i], out[2, i]
         for j in range(size):
-            best = 0
-            if (
-                col >= col_reach
-                and row >= row_reach
-                and (col + col_reach) >> 16 < cols
-                and (row + row_reach) >> 16 < rows
-            ):
-                if (i + j) & 1:
-                    drow, dcol = row_a, col_a
-                else:
-                    drow, dcol = row_b, col_b
-                v0 = cells[np.uint64(((row + drow) >> 16) * cols + ((col + dcol) >> 16))]
-                v1 = cells[np.uint64(((row - drow) >> 16) * cols + ((col - dcol) >> 16))]
-                best = max(v0, v1)
-                if best == 0:  # zero means never observed: it gives way to what was
-                    best = min(v0, v1)
+            # Without branches, which the processor would guess wrongly all along a map's edge. Unsigned indices:
+            # others are tested for being negative.
+            there = np.int64(first[j] >= 0)
+            v0 = cells[np.uint32(max(first[j], 0))] * there
+            v1 = cells[np.uint32(max(second[j], 0))] * there
+            # Zero means never observed: it gives way to what was.
+            best = max(v0, v1) + min(v0, v1) * np.int64(max(v0, v1) == 0)
+            observed = 255 * np.int64(best != 0)
             probability_row[j] = PROBABILITY_BYTE[np.uint64(best & 255)]  # of 0, one half
-            observed_row[j] = 255 if best != 0 else 0
-            trail_row[j] = 255 * trail[np.uint64((row >> 16) * cols + (col >> 16))] if best != 0 else 0
-            col += col_step
-            row += row_step
+            observed_row[j] = observed
+            trail_row[j] = observed * trail[np.uint32(max(middle[j], 0))]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -198,7 +210,9 @@ def _fill_global(
     size = out.shape[1]
     rows, cols = known.shape
     top, left = (size - rows) // 2, (size - cols) // 2
-    area = block * block
+    area, shift = block * block, 0
+    while 1 << shift < area:  # a power of two: whole blocks divide by shifting, at a twentieth of the cost
+        shift += 1
     out[0] = UNKNOWN_BYTE
     out[1] = 0
     out[2] = 0
@@ -208,10 +222,10 @@ def _fill_global(
             n = known[r, c]
             if n > 0:
                 j = left + c
-                out[0, i, j] = probability[r, c] // n
-                out[1, i, j] = 255 * n // area
+                out[0, i, j] = probability[r, c] >> shift if n == area else probability[r, c] // n
+                out[1, i, j] = 255 * n >> shift
                 # The trail stays below 128, above it is the robot itself.
-                out[2, i, j] = 127 * visited[r, c] // area
+                out[2, i, j] = 127 * visited[r, c] >> shift
     i = size - 1 - math.floor((y + 1.0) * 0.5 * size)
     j = math.floor((x + 1.0) * 0.5 * size)
     for di in range(-1, 2):

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from mecanum_env.config import RewardConfig
 
 __all__ = ["StepOutcome", "reward_terms"]
 
 
-@dataclass(frozen=True, slots=True)
-class StepOutcome:
+class StepOutcome(NamedTuple):
     """What one step changed, as far as the reward is concerned."""
 
     area_m2: float  # newly mapped

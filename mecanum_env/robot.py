@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -107,7 +108,7 @@ def twist_action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
     vx, vy = fx * robot.max_speed_m_s * scale, fy * robot.max_speed_m_s * scale
     turn = fw * robot.max_turn_rate_rad_s * robot.lever_m * scale
     wheels = (vx - vy - turn, vx + vy + turn, vx + vy - turn, vx - vy + turn)
-    excess = max(abs(w) for w in wheels) / robot.max_wheel_speed_rad_s
+    excess = max(max(wheels), -min(wheels)) / robot.max_wheel_speed_rad_s
     return np.array([w / excess for w in wheels] if excess > 1.0 else wheels)
 
 
@@ -117,11 +118,17 @@ def action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
 
 
 def _fractions(action: ArrayLike, size: int) -> list[float]:
-    values = np.asarray(action, dtype=np.float64)
-    numbers: list[float] = values.tolist()
-    if values.shape != (size,) or not math.isfinite(sum(numbers)):
+    numbers = action.tolist() if isinstance(action, np.ndarray) else np.asarray(action, np.float64).tolist()
+    if not isinstance(numbers, list) or len(numbers) != size or not _all_finite(numbers):
         raise ValueError(f"an action must be {size} finite numbers in [-1, 1], got {action!r}")
-    return [min(max(v, -1.0), 1.0) for v in numbers]
+    return [-1.0 if v < -1.0 else 1.0 if v > 1.0 else v for v in numbers]
+
+
+def _all_finite(numbers: list[Any]) -> bool:
+    try:
+        return math.isfinite(sum(numbers))
+    except TypeError:  # lists within: an array of more dimensions
+        return False
 
 
 @lru_cache(maxsize=32)

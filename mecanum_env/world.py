@@ -9,6 +9,7 @@ which a distance field and then the exact geometry tell, pymunk is left out: the
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -104,6 +105,9 @@ def _drive_clear(
     state: Array,
     targets: Array,
     radii: Array,
+    lost: Array,
+    slip: float,
+    ground_radii: Array,
     wheels_body: Array,
     friction: NDArray[np.float32],
     clearance: NDArray[np.float32],
@@ -121,15 +125,19 @@ def _drive_clear(
 
     pymunk looks for contacts each time it has moved the body. Where nothing is within a step's travel of the
     body at the step's end, it would have found none. Returns the number of steps taken; the one in which
-    something may be touched is undone.
+    something may be touched is undone. ``ground_radii`` is filled for whoever goes on: ``radii``, each less
+    what is lost to slip.
     """
+    state[INCREMENTS] = 0.0
+    for i in range(4):
+        ground_radii[i] = radii[i] * (1.0 - 2.0 * slip * lost[i])
     rows, cols = clearance.shape
     before = np.empty(state.shape[0])
     half_x, half_y = half_size[0], half_size[1]
     circumscribed = math.sqrt(half_x * half_x + half_y * half_y)
     for step in range(steps):
         before[:] = state
-        _wheel_step(state, targets, radii, wheels_body, friction, raster, constants, dt, substeps, motion)
+        _wheel_step(state, targets, ground_radii, wheels_body, friction, raster, constants, dt, substeps, motion)
         # As pymunk does it: mean velocity first, then velocity times time.
         x, y = state[0] + motion[0] / dt * dt, state[1] + motion[1] / dt * dt
         theta = state[2] + motion[2] / dt * dt
@@ -142,6 +150,14 @@ def _drive_clear(
             return step
         state[0], state[1], state[2] = x, y, theta
     return steps
+
+
+@lru_cache(maxsize=16)
+def _divide(step_s: float, physics_step_s: float) -> tuple[int, float, int]:
+    """Return how many physics steps a control step has, their length [s], and the substeps of each."""
+    steps = max(1, round(step_s / physics_step_s))
+    dt = step_s / steps
+    return steps, dt, max(1, math.ceil(dt / SUBSTEP_S - 1e-9))
 
 
 class World:
@@ -229,27 +245,26 @@ class World:
         step_s, physics_step_s
             Length of the control step and of the physics steps it consists of [s].
         """
-        steps = max(1, round(step_s / physics_step_s))
-        dt = step_s / steps
-        substeps = max(1, math.ceil(dt / SUBSTEP_S - 1e-9))
+        steps, dt, substeps = _divide(step_s, physics_step_s)
         self._targets[:] = wheel_targets
-        self._state[INCREMENTS] = 0.0
         lost = self._rng.random(4)  # drawn even where slip is zero: the stream must not depend on it
-        np.multiply(self._radii, 1.0 - (2.0 * self.noise.slip) * lost, out=self._ground_radii)
         clear = self._shortcut and self._forgotten >= _PERSISTENCE
-        done = self._drive_clear(dt, substeps, steps) if clear else 0
+        done = self._drive_clear(lost, dt, substeps, steps if clear else 0)
         if done:
             self._body_is_behind = True
             self._contacts.pass_clear(done * dt)
         for _ in range(steps - done):
             self._drive_near(dt, substeps)
 
-    def _drive_clear(self, dt: float, substeps: int, steps: int) -> int:
+    def _drive_clear(self, lost: Array, dt: float, substeps: int, steps: int) -> int:
         floor = self.floor
         return int(
             _drive_clear(
                 self._state,
                 self._targets,
+                self._radii,
+                lost,
+                self.noise.slip,
                 self._ground_radii,
                 self._wheels_body,
                 floor.friction,

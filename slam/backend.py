@@ -128,15 +128,15 @@ class Backend(abc.ABC):
 
     def _draw(self, scan: Scan) -> None:
         """Draw a scan from the believed pose, and keep it where the sensor has moved on."""
+        config, grid, surface = self.config, self.grid, self.extractor.surface
         body_x, body_y, theta = self.pose.tolist()
-        offset = self.config.lidar_offset_m
+        offset = config.lidar_offset_m
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
-        sensor = np.array([x, y, theta])
-        self.grid.integrate(sensor, scan, self.extractor.surface)
-        self.grid.mark_visited(body_x, body_y, self.config.body_radius_m)
+        grid.integrate((x, y, theta), scan, surface)
+        grid.mark_visited(body_x, body_y, config.body_radius_m)
         if self.key_scans.wants(x, y, theta):
             ids, points = self._landmarks_in_view()
-            self.key_scans.keep(sensor, scan, self.extractor.surface, ids, points)
+            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, points)
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
         """Return ids ``(k,)`` and estimates ``(k, 2)`` of the landmarks that the last scan showed."""

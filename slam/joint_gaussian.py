@@ -193,26 +193,29 @@ def near_landmarks(x: Array, p: Array, count: int, out: NDArray[np.float32]) -> 
     """Write the nearest landmarks in the robot frame, by insertion into a list sorted by distance."""
     out[:] = 0.0
     c, s = math.cos(x[2]), math.sin(x[2])
+    size = out.shape[0]
+    nearest, distance = np.empty(size, np.int64), np.empty(size)
     filled = 0
     for i in range(count):
-        k = 3 + 2 * i
-        dx, dy = x[k] - x[0], x[k + 1] - x[1]
+        dx, dy = x[3 + 2 * i] - x[0], x[4 + 2 * i] - x[1]
         d2 = dx * dx + dy * dy
-        j = filled if filled < out.shape[0] else out.shape[0] - 1
-        if filled == out.shape[0] and d2 >= out[j, 5]:
+        j = filled if filled < size else size - 1
+        if filled == size and d2 >= distance[j]:
             continue
-        while j > 0 and out[j - 1, 5] > d2:
-            out[j] = out[j - 1]
+        while j > 0 and distance[j - 1] > d2:
+            nearest[j], distance[j] = nearest[j - 1], distance[j - 1]
             j -= 1
+        nearest[j], distance[j] = i, d2
+        filled = min(filled + 1, size)
+    for j in range(filled):
+        k = 3 + 2 * nearest[j]
+        dx, dy = x[k] - x[0], x[k + 1] - x[1]
         a, b, d = p[k, k], p[k, k + 1], p[k + 1, k + 1]
         out[j, 0] = c * dx + s * dy
         out[j, 1] = -s * dx + c * dy
         out[j, 2] = c * c * a + 2.0 * c * s * b + s * s * d
         out[j, 3] = -c * s * a + (c * c - s * s) * b + c * s * d
         out[j, 4] = s * s * a - 2.0 * c * s * b + c * c * d
-        out[j, 5] = d2
-        filled = min(filled + 1, out.shape[0])
-    for j in range(filled):
         for q in range(5):
             out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
         out[j, 5] = 1.0

@@ -46,6 +46,8 @@ class KeyScans:
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 2))  # in the frame of that pose
         self._since_check = 0
+        self._last = (0.0, 0.0, 0.0)
+        self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -60,10 +62,11 @@ class KeyScans:
         n = len(self._scans)
         if n == 0:
             return True
-        last = self._poses[n - 1]
-        return bool(
-            math.hypot(x - last[0], y - last[1]) >= self.config.spacing_m
-            or abs(wrap_scalar(theta - last[2])) >= self.config.spacing_rad
+        last_x, last_y, last_theta = self._last
+        config = self.config
+        return (
+            math.hypot(x - last_x, y - last_y) >= config.spacing_m
+            or math.cos(theta - last_theta) <= self._cos_spacing
         )
 
     def keep(
@@ -75,14 +78,8 @@ class KeyScans:
             self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
             self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
             self._anchor_local = np.vstack([self._anchor_local, np.zeros_like(self._anchor_local)])
-        k = min(len(ids), _ANCHORS)
-        c, s = math.cos(sensor_pose[2]), math.sin(sensor_pose[2])
-        offset = points[:k] - sensor_pose[:2]
-        self._poses[n] = sensor_pose
-        self._anchor_ids[n, :k] = ids[:k]
-        self._anchor_local[n, :k] = np.column_stack(
-            [c * offset[:, 0] + s * offset[:, 1], -s * offset[:, 0] + c * offset[:, 1]]
-        )
+        _hang(sensor_pose, ids, points, self._poses[n], self._anchor_ids[n], self._anchor_local[n])
+        self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan, surface.copy()))
 
     def redraw_if_moved(self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64]) -> bool:
@@ -104,11 +101,26 @@ class KeyScans:
         if largest <= 0.5 * grid.resolution:
             return False
         self._poses[:n] = corrected
+        self._last = tuple(corrected[-1].tolist())
         grid.clear()
         for pose, (scan, surface) in zip(corrected, self._scans, strict=True):
             grid.integrate(pose, scan, surface)
         grid.take_changes()  # the revision has gone up: followers start over
         return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hang(
+    sensor_pose: Array, ids: NDArray[np.int64], points: Array, pose: Array, anchor_ids: NDArray[np.int64],
+    anchor_local: Array,
+) -> None:  # fmt: skip
+    """Write a key scan's pose, and its landmarks in that pose's frame."""
+    pose[:] = sensor_pose
+    c, s = math.cos(sensor_pose[2]), math.sin(sensor_pose[2])
+    for k in range(min(ids.shape[0], anchor_ids.shape[0])):
+        dx, dy = points[k, 0] - sensor_pose[0], points[k, 1] - sensor_pose[1]
+        anchor_ids[k] = ids[k]
+        anchor_local[k, 0], anchor_local[k, 1] = c * dx + s * dy, -s * dx + c * dy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

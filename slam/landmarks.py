@@ -122,12 +122,12 @@ class LandmarkBook:
 
     def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
         """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
-        recent, still = _recent(self.marks, match, self._now)
-        return int(recent), int(still)
+        recent, still = _recent(self._marks[: self.count], match, self._now)
+        return recent, still
 
     def just_seen(self) -> NDArray[np.int64]:
         """Return the rows ``(k,)`` of the landmarks that the last update showed."""
-        return np.flatnonzero(self.marks[:, _LAST_SEEN] == self._now)
+        return (self._marks[: self.count, _LAST_SEEN] == self._now).nonzero()[0]
 
     def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
         """Count sightings; return which observations are new landmarks by now.
@@ -139,7 +139,7 @@ class LandmarkBook:
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
         count = _review(
-            x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count,
+            x, offset, z, match, self._now, self._marks[: self.count], self._tentative, self._tentative_count,
             p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
             self._new,
         )  # fmt: skip
@@ -147,14 +147,13 @@ class LandmarkBook:
 
     def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
         """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
-        p = self.policy
+        p, marks = self.policy, self._marks[: self.count]
         doubtful = _look_through(
-            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks, p.clear_margin_m,
+            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, marks, p.clear_margin_m,
             p.drop_after, p.overlook_after, p.overlook_ratio,
         )  # fmt: skip
         if not doubtful:
             return []
-        marks = self.marks
         passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
         overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
         return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]

@@ -31,9 +31,8 @@ from slam.scan_drawing import (
     UNKNOWN,
     WORD,
     ends_on,
-    fuse,
+    mark_and_fuse,
     mark_disc,
-    mark_surfaces,
     outline,
     sum_blocks,
 )
@@ -80,7 +79,10 @@ class OccupancyGrid:
         self.known_cells = 0
         self.entropy_bit = 0.0
         self.revision = 0
-        self._mask = np.zeros((1, 1), np.uint8)
+        self._mask = np.zeros((1, WORD), np.uint8)
+        self._mask_words = self._mask.view(np.uint64)
+        self._polygon = np.zeros((1, 2), np.int32)
+        self._full_circle = True
         self._changes = np.zeros((1024, 4), np.int32)
         self._change_count = 0
         self._rays = np.zeros((0, 2))
@@ -179,24 +181,23 @@ class OccupancyGrid:
 
     def mark_visited(self, x: float, y: float, radius: float) -> None:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
-        reach = math.ceil(radius / self.resolution) + 1
-        row, col = math.floor(y / self.resolution), math.floor(x / self.resolution)
+        cell = self.resolution
+        x, y, radius = x / cell, y / cell, radius / cell
+        row, col, reach = math.floor(y), math.floor(x), math.ceil(radius) + 1
         self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
         mark_disc(
-            self.visited,
-            self._overview_visited,
-            self.overview_block,
-            y / self.resolution - self._row0,
-            x / self.resolution - self._col0,
-            radius / self.resolution,
+            self.visited, self._overview_visited, self._overview_shift, y - self._row0, x - self._col0, radius
         )
 
-    def integrate(self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16] | None = None) -> None:
+    def integrate(
+        self, sensor_pose: Array | tuple[float, float, float], scan: Scan,
+        surface: NDArray[np.int16] | None = None,
+    ) -> None:  # fmt: skip
         """Draw one scan taken from ``sensor_pose`` ``(3,)`` in the grid's frame.
 
         Parameters
         ----------
-        sensor_pose : Array
+        sensor_pose : Array or tuple
             Where the sensor was: x [m], y [m], θ [rad].
         scan : Scan
             The ranges; lost beams (``nan``) say nothing, free space beyond a beam without return (``inf``)
@@ -207,44 +208,40 @@ class OccupancyGrid:
         """
         if surface is None:
             surface = NO_SURFACE
-        n = len(scan.ranges)
-        reach = math.ceil(scan.range_max / self.resolution) + 3
-        if self._mask.shape[0] < 2 * reach + 1:
-            self._mask = np.zeros((2 * reach + 1, (2 * reach // WORD + 3) * WORD), np.uint8)
-        rays = self._ray_table(n, scan.angle_min, scan.angle_increment)
+        ranges, range_max, resolution = scan.ranges, scan.range_max, self.resolution
+        rays = self._ray_table(len(ranges), scan.angle_min, scan.angle_increment)
+        reach = math.ceil(range_max / resolution) + 3
+        mask, polygon = self._mask, self._polygon
+        if mask.shape[0] < 2 * reach + 1:
+            mask = self._mask = np.zeros((2 * reach + 1, (2 * reach // WORD + 3) * WORD), np.uint8)
+            self._mask_words = mask.view(np.uint64)
         x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
         # The sensor is near the mask's middle; its columns lie eight cells to a word of the grid's.
-        mask_row = math.floor(y / self.resolution) - reach
-        mask_col = (math.floor(x / self.resolution) - reach) & -WORD
-        full_circle = n * scan.angle_increment > 2 * math.pi - 1.5 * scan.angle_increment
-        polygon = np.empty((n + 1, 2), np.int32)
+        mask_row = math.floor(y / resolution) - reach
+        mask_col = (math.floor(x / resolution) - reach) & -WORD
         count, r0, c0, r1, c1 = outline(
-            polygon, scan.ranges, rays, surface, x, y, theta, self.resolution, scan.range_max, mask_row, mask_col,
-            full_circle,
+            polygon, ranges, rays, surface, x, y, theta, resolution, range_max, mask_row, mask_col,
+            self._full_circle,
         )  # fmt: skip
         if count < 3:
             return
         c0, c1 = c0 & -WORD, c1 | (WORD - 1)
         rim = [polygon[:count]]
-        cv2.fillPoly(self._mask, rim, IN_FREE, cv2.LINE_8, FIXED_POINT)
+        cv2.fillPoly(mask, rim, IN_FREE, cv2.LINE_8, FIXED_POINT)
         # The rim runs along surfaces: the cells under it are not known to be free. Without this, walls seen at a
         # flat angle, where hits are sparse, would be erased between the hits.
-        cv2.polylines(self._mask, rim, True, 0, 1, cv2.LINE_8, FIXED_POINT)
-        mask = self._mask[r0 : r1 + 1, c0 : c1 + 1]
-        mark_surfaces(
-            self._mask, scan.ranges, rays, surface,
-            x, y, theta, self.resolution, mask_row, mask_col,
-        )  # fmt: skip
+        cv2.polylines(mask, rim, True, 0, 1, cv2.LINE_8, FIXED_POINT)
         self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
-        if self._changes.shape[0] < self._change_count + mask.size:
-            grown = np.zeros((2 * (self._change_count + mask.size), 4), np.int32)
+        most = self._change_count + (r1 + 1 - r0) * (c1 + 1 - c0)
+        if len(self._changes) < most:
+            grown = np.zeros((2 * most, 4), np.int32)
             grown[: self._change_count] = self._changes[: self._change_count]
             self._changes = grown
-        self._change_count, known, entropy = fuse(
-            self.log_odds, self.log_odds.view(np.uint64), mask, mask.view(np.uint64),
-            mask_row + r0 - self._row0, mask_col + c0 - self._col0,
-            self._overview_probability, self._overview_known, self.overview_block.bit_length() - 1,
-            self._changes, self._change_count, self._row0, self._col0,
+        self._change_count, known, entropy = mark_and_fuse(
+            ranges, rays, surface, x, y, theta, resolution, mask, self._mask_words, mask_row, mask_col,
+            r0, c0, r1, c1, self.log_odds, self._log_odds_words, self._row0, self._col0,
+            self._overview_probability, self._overview_known, self._overview_shift, self._changes,
+            self._change_count,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
@@ -254,6 +251,8 @@ class OccupancyGrid:
         if key != self._rays_of:
             angles = angle_min + angle_increment * np.arange(n)
             self._rays = np.column_stack([np.cos(angles), np.sin(angles)])
+            self._polygon = np.empty((n + 1, 2), np.int32)
+            self._full_circle = n * angle_increment > 2 * math.pi - 1.5 * angle_increment
             self._rays_of = key
         return self._rays
 
@@ -292,13 +291,14 @@ class OccupancyGrid:
         if block > _CHUNK:
             # Beyond 2048 cells a side: the last block of a row may be short, which the padding stands for.
             rows, cols = -(-rows // block) * block, -(-cols // block) * block
-        self.overview_block = block
+        self.overview_block, self._overview_shift = block, block.bit_length() - 1
+        self._log_odds_words = self.log_odds.view(np.uint64)
         shape = (rows // block, cols // block)
         self._overview_known = np.zeros(shape, np.int32)
         self._overview_probability = np.zeros(shape, np.int32)
         self._overview_visited = np.zeros(shape, np.int32)
         sum_blocks(
-            self.log_odds, self.visited, block.bit_length() - 1, self._overview_known, self._overview_probability,
+            self.log_odds, self.visited, self._overview_shift, self._overview_known, self._overview_probability,
             self._overview_visited,
         )  # fmt: skip
 

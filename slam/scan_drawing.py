@@ -41,7 +41,9 @@ PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
 _NO_MARKS = np.uint64(0)
 _ALL_FREE = np.full(WORD, IN_FREE, np.uint8).view(np.uint64)[0]
 _EVERY_BYTE = np.full(WORD, 1, np.uint8).view(np.uint64)[0]
+_FULL_BYTE, _ONE = np.uint64(255), np.uint64(1)
 _ALL_SURELY_FREE = np.full(WORD, MIN_LOG_ODDS, np.int8).view(np.uint64)[0]
+_ALL_SURELY_OCCUPIED = np.full(WORD, MAX_LOG_ODDS, np.int8).view(np.uint64)[0]
 
 
 NO_SURFACE = np.zeros(0, np.int16)
@@ -126,31 +128,44 @@ def mark_surfaces(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fuse(
-    log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], mask: NDArray[np.uint8],
-    mask_words: NDArray[np.uint64], row0: int, col0: int, overview_probability: NDArray[np.int32],
-    overview_known: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, lattice_row: int,
-    lattice_col: int,
+    mask_words: NDArray[np.uint64], mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
+    log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], lattice_row: int, lattice_col: int,
+    overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], shift: int,
+    changes: NDArray[np.int32], count: int,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Add a scan's mask to the grid and wipe it.
+    """Add the box [top, bottom] × [left, right] of a scan's mask to the grid and wipe it.
 
     Return the number of changes, and by how much the known cells and the entropy went up. Eight cells at a time
-    are passed over where the scan says nothing, or only that surely free cells are free: most of a known map.
+    are passed over where the scan says nothing, or nothing new of cells at their limits: most of a known map.
     """
     known = 0
     entropy = 0.0
-    word0 = col0 // WORD
+    first_word, end_word = left // WORD, (right + 1) // WORD
+    words_ahead = (mask_col - lattice_col) // WORD  # from a word of the mask to its place in the grid
     width = min(1 << shift, WORD)  # cells of a word within one block of the overview
-    for i in range(mask.shape[0]):
-        for word in range(mask_words.shape[1]):
-            marks = mask_words[i, word]
+    for i in range(top, bottom + 1):
+        line = mask_words[i]
+        row = mask_row + i - lattice_row
+        word = first_word - 1
+        while True:
+            word += 1
+            while word + 4 <= end_word and (line[word] | line[word + 1]) | (line[word + 2] | line[word + 3]) == 0:
+                word += 4
+            if word >= end_word:
+                break
+            marks = line[word]
             if marks == _NO_MARKS:
                 continue
-            mask_words[i, word] = _NO_MARKS
-            row, first = row0 + i, col0 + WORD * word
+            line[word] = _NO_MARKS
+            at = words_ahead + word
+            first = WORD * at
+            cells = log_odds_words[row, at]
+            free = (marks & _EVERY_BYTE) * _FULL_BYTE
+            surface = ((marks >> _ONE) & _EVERY_BYTE) * _FULL_BYTE
+            unsettled = (cells ^ _ALL_SURELY_FREE) & free | (cells ^ _ALL_SURELY_OCCUPIED) & surface
+            if unsettled == _NO_MARKS:
+                continue
             if marks == _ALL_FREE:
-                cells = log_odds_words[row, word0 + word]
-                if cells == _ALL_SURELY_FREE:
-                    continue
                 value = cells & np.uint64(255)
                 if cells == value * _EVERY_BYTE:
                     # Eight cells alike, as in a room just seen: reckon once.
@@ -158,7 +173,7 @@ def fuse(
                     new: int = max(old + MISS, MIN_LOG_ODDS)
                     if new == 0:
                         new = -1
-                    log_odds_words[row, word0 + word] = np.uint64(new & 255) * _EVERY_BYTE
+                    log_odds_words[row, at] = np.uint64(new & 255) * _EVERY_BYTE
                     entropy += WORD * (ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255])
                     delta = int(PROBABILITY_BYTE[new & 255]) - (
                         int(PROBABILITY_BYTE[old & 255]) if old != 0 else 0
@@ -208,6 +223,22 @@ def fuse(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def mark_and_fuse(
+    ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float, theta: float, resolution: float,
+    mask: NDArray[np.uint8], mask_words: NDArray[np.uint64], mask_row: int, mask_col: int, top: int, left: int,
+    bottom: int, right: int, log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], lattice_row: int,
+    lattice_col: int, overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], shift: int,
+    changes: NDArray[np.int32], count: int,
+) -> tuple[int, int, float]:  # fmt: skip
+    """Mark a scan's surfaces in its mask, then add the mask to the grid: all that follows OpenCV, in one call."""
+    mark_surfaces(mask, ranges, rays, surface, x, y, theta, resolution, mask_row, mask_col)
+    return fuse(
+        mask_words, mask_row, mask_col, top, left, bottom, right, log_odds, log_odds_words, lattice_row,
+        lattice_col, overview_probability, overview_known, shift, changes, count,
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def sum_blocks(
     log_odds: NDArray[np.int8], visited: NDArray[np.uint8], shift: int, known: NDArray[np.int32],
     probability: NDArray[np.int32], trail: NDArray[np.int32],
@@ -226,14 +257,14 @@ def sum_blocks(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_disc(
-    visited: NDArray[np.uint8], overview: NDArray[np.int32], block: int, y: float, x: float, radius: float
+    visited: NDArray[np.uint8], overview: NDArray[np.int32], shift: int, y: float, x: float, radius: float
 ) -> None:
     """Mark the cells whose centre lies within ``radius`` of (x, y), all in cells of the grid."""
     for i in range(int(y - radius), int(y + radius) + 1):
         for j in range(int(x - radius), int(x + radius) + 1):
             if (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius and visited[i, j] == 0:
                 visited[i, j] = 1
-                overview[i // block, j // block] += 1
+                overview[i >> shift, j >> shift] += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

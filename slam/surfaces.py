@@ -112,18 +112,21 @@ def split(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
 def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
     x0, y0 = xy[first, 0], xy[first, 1]
     dx, dy = xy[last, 0] - x0, xy[last, 1] - y0
-    length = math.sqrt(dx * dx + dy * dy)
-    best, where = threshold * length, -1
+    # The largest distance first, in a loop that vectorises; which point it was, only where that matters.
+    largest = 0.0
     for i in range(first + 1, last):
-        d = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
-        if d > best:
-            best, where = d, i
-    return where
+        largest = max(largest, abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0)))
+    if largest <= threshold * math.sqrt(dx * dx + dy * dy):
+        return -1
+    for i in range(first + 1, last):
+        if abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0)) == largest:
+            return i
+    return -1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -147,78 +150,67 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     n = b - a + 1
     if n + 2 < limits[MIN_POINTS] or n < 3:
         return False
-    mx = my = 0.0
-    for i in range(a, b + 1):
-        mx += xy[i, 0]
-        my += xy[i, 1]
-    mx /= n
-    my /= n
-    sxx = sxy = syy = 0.0
-    for i in range(a, b + 1):
-        dx, dy = xy[i, 0] - mx, xy[i, 1] - my
+    # Sums about the first point: about the origin they would lose digits.
+    x0, y0 = xy[a, 0], xy[a, 1]
+    sx = sy = sxx = sxy = syy = 0.0
+    for i in range(a + 1, b + 1):
+        dx, dy = xy[i, 0] - x0, xy[i, 1] - y0
+        sx += dx
+        sy += dy
         sxx += dx * dx
         sxy += dx * dy
         syy += dy * dy
+    mx, my = x0 + sx / n, y0 + sy / n
+    sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
     angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)  # of the line itself
     tx, ty = math.cos(angle), math.sin(angle)
     nx, ny = -ty, tx
     r = nx * mx + ny * my
     if r < 0.0:
         nx, ny, r = -nx, -ny, -r
-        tx, ty = -tx, -ty
+    ax, ay = -ny, nx
     # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
     sigma = limits[SIGMA]
-    var_offset = var_slope = cov = spread = residual = 0.0
+    var_offset = var_slope = cov = spread = residual = off = curve = fourth = largest = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
-        t = tx * (x - mx) + ty * (y - my)
+        t = ax * (x - mx) + ay * (y - my)
         d = nx * x + ny * y
-        across = sigma * d / math.sqrt(x * x + y * y)
-        variance = across * across
+        variance = d * d / (x * x + y * y)  # in units of σ²
+        e, tt = d - r, t * t
         var_offset += variance
-        var_slope += t * t * variance
+        var_slope += tt * variance
         cov += t * variance
-        spread += t * t
-        residual += (d - r) * (d - r)
+        spread += tt
+        residual += e * e
+        off += e
+        curve += tt * e
+        fourth += tt * tt
+        largest = max(largest, tt)
     if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[SPLIT_FLOOR])) ** 2:
         return False
+    mean = spread / n
+    if _is_curved(curve - mean * off, fourth - mean * spread, largest, sigma):
+        return False
+    var_offset, var_slope, cov = sigma * sigma * var_offset, sigma * sigma * var_slope, sigma * sigma * cov
     line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, r, mx, my
     line[VAR_OFFSET] = var_offset / (n * n)
     line[VAR_SLOPE] = var_slope / (spread * spread)
     line[COV] = cov / (n * spread)
-    if _is_curved(xy, a, b, line, sigma):
-        return False
-    # Along (-ny, nx), which is (tx, ty) up to sign.
-    ax, ay = -ny, nx
     t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
     t1 = ax * (xy[last, 0] - mx) + ay * (xy[last, 1] - my)
     line[T0], line[T1], line[POINTS] = t0, t1, n
-    if ax * tx + ay * ty < 0.0:
-        line[COV] = -line[COV]
     return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _is_curved(xy: Array, a: int, b: int, line: Array, sigma: float) -> bool:
+def _is_curved(bulge: float, norm: float, largest: float, sigma: float) -> bool:
     """Tell whether points bulge away from their line by more than noise would have them do.
 
     Pieces of a round table are short enough to pass for straight ones, and would meet in corners that wander
-    with the robot. The bulge is the coefficient of u² − mean(u²), u the position along the line.
+    with the robot. With t the position along the line and q = t² − mean(t²), ``bulge`` is Σ q · (offset from the
+    line) and ``norm`` Σ q²: the coefficient of q is their ratio. ``largest`` is max t².
     """
-    nx, ny, r, mx, my = line[NX], line[NY], line[R], line[MX], line[MY]
-    n = b - a + 1
-    mean = 0.0
-    for i in range(a, b + 1):
-        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
-        mean += t * t
-    mean /= n
-    bulge = norm = largest = 0.0
-    for i in range(a, b + 1):
-        t = -ny * (xy[i, 0] - mx) + nx * (xy[i, 1] - my)
-        q = t * t - mean
-        bulge += q * (nx * xy[i, 0] + ny * xy[i, 1] - r)
-        norm += q * q
-        largest = max(largest, t * t)
     if norm <= 0.0:
         return False
     coefficient, deviation = bulge / norm, sigma / math.sqrt(norm)
