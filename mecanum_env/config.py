@@ -7,6 +7,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -61,27 +62,27 @@ class RobotConfig:
             if f.name not in ("wheel_friction", "motor_lag_s"):
                 require(value > 0, f"RobotConfig.{f.name} must be > 0, got {value}")
 
-    @property
+    @cached_property
     def lever_m(self) -> float:
         """Half the wheelbase plus half the track: the arm l of the mecanum kinematics [m]."""
         return 0.5 * (self.wheelbase_m + self.track_m)
 
-    @property
+    @cached_property
     def max_wheel_speed_rad_s(self) -> float:
         """Wheel speed limit: what straight driving at full speed asks for [rad/s]."""
         return self.max_speed_m_s / self.wheel_radius_m
 
-    @property
+    @cached_property
     def inscribed_radius_m(self) -> float:
         """Largest disc within the footprint [m]."""
         return 0.5 * min(self.length_m, self.width_m)
 
-    @property
+    @cached_property
     def circumscribed_radius_m(self) -> float:
         """Smallest disc around the footprint [m]."""
         return 0.5 * math.hypot(self.length_m, self.width_m)
 
-    @property
+    @cached_property
     def inertia_kg_m2(self) -> float:
         """Moment of inertia of the body about its centre: a uniform rectangle [kg·m²]."""
         return self.mass_kg * (self.length_m**2 + self.width_m**2) / 12.0

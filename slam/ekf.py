@@ -76,13 +76,12 @@ class EkfSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega = np.asarray(odometry.twist, dtype=np.float64).tolist()
-        noise = self.config.odometry
-        slip = noise.slip(self._twist, (vx, vy, omega), odometry.dt)
-        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
-        predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
-        self._twist = (vx, vy, omega)
-        way = math.hypot(vx, vy, noise.lever_m * omega) * odometry.dt
+        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
+        noise, dt = self.config.odometry, odometry.dt
+        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
+        predict_robot(self._x, self._p, self._n, vx, vy, omega, dt, var_v, var_w)
+        self._twist = twist
+        way = math.hypot(vx, vy, noise.lever_m * omega) * dt
         moved, turned = self._unseen_motion
         self._unseen_motion = (moved + way, turned + way / noise.lever_m)
 
@@ -92,9 +91,9 @@ class EkfSlam(Backend):
         match = self._associate(z)
         if self._out_of_sight(match):
             match = self._allow_for_spinning_wheels(z, match, scan)
-        if np.count_nonzero(match >= 0) >= _FEWEST_BACK:
-            self._unseen_motion = (0.0, 0.0)
         self._correct(z, match)
+        if self.nis_dof >= 2 * _FEWEST_BACK:
+            self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
         self._draw(scan)
         self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)

@@ -127,7 +127,7 @@ class LandmarkBook:
 
     def just_seen(self) -> NDArray[np.int64]:
         """Return the rows ``(k,)`` of the landmarks that the last update showed."""
-        return (self._marks[: self.count, _LAST_SEEN] == self._now).nonzero()[0]
+        return np.flatnonzero(self._marks[: self.count, _LAST_SEEN] == self._now)
 
     def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
         """Count sightings; return which observations are new landmarks by now.
