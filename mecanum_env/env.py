@@ -43,7 +43,6 @@ from mecanum_env.world import World
 from slam.backend import Backend
 from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
-from slam.metrics import nees_pose
 from slam.settings import from_mapping, unknown_name
 from slam.types import Belief, Odometry, Scan
 
@@ -329,7 +328,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
 
     def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
-        nees = nees_pose(self._pose, self._pose_cov, true_pose)
+        nees = self.backend.pose_nees(true_pose)
         x, y, theta = estimate = self._pose.tolist()
         true_x, true_y, true_theta = truth = true_pose.tolist()
         record, collisions = self.truth.record, self.truth.world.collisions

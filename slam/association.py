@@ -72,7 +72,7 @@ def _alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
-    max_turn: float, match: NDArray[np.int64], distance: Array, h: Array,
+    max_turn: float, only_sure: bool, match: NDArray[np.int64], distance: Array, h: Array,
 ) -> None:  # fmt: skip
     """Match each observation to the nearest landmark of its kind within the gate, each landmark once.
 
@@ -88,6 +88,8 @@ def nearest_neighbour(
         An unmatched observation this near [m] to a landmark of its kind is IGNORED, not taken for new.
     max_turn : float
         Largest difference in direction [rad]. Kind 0 matches any kind and direction.
+    only_sure : bool
+        Take no match where more than one landmark is within the gate (individual gating).
     match, distance : NDArray
         ``(m,)`` filled: landmark index, UNMATCHED or IGNORED; squared Mahalanobis distance.
     """
@@ -100,6 +102,7 @@ def nearest_neighbour(
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
+        candidates = 0
         for i in range(landmarks):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if abs(dx) > window or abs(dy) > window:
@@ -107,10 +110,13 @@ def nearest_neighbour(
             if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
             d2 = _gate(x, p, i, offset, z[k], h)
+            candidates += d2 < gate
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2
             elif match[k] == UNMATCHED and dx * dx + dy * dy < near * near:
                 match[k] = IGNORED
+        if only_sure and candidates > 1:
+            match[k] = IGNORED
     # Two observations cannot be one landmark: the farther gives way.
     for k in range(z.shape[0]):
         for j in range(k):

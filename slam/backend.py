@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from slam.features import FeatureConfig, FeatureExtractor
 from slam.key_scans import KeyScanConfig, KeyScans
+from slam.metrics import nees_pose
 from slam.motion import OdometryNoise
 from slam.occupancy import OccupancyGrid
 from slam.settings import require
@@ -97,6 +98,10 @@ class Backend(abc.ABC):
     @abc.abstractmethod
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``. A copy."""
+
+    def pose_nees(self, true_pose: Array) -> float:
+        """Return the NEES of the pose against the truth ``(3,)``, in the error that the covariance speaks of."""
+        return float(nees_pose(self.pose, self.pose_cov, np.asarray(true_pose, dtype=np.float64)))
 
     @property
     @abc.abstractmethod

@@ -18,12 +18,16 @@ from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update, symmetric_block
 from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
 from slam.motion import predict_robot
-from slam.settings import require
+from slam.settings import require, unknown_name
 from slam.types import Belief, Observations, Odometry, Scan
 
-__all__ = ["EkfConfig", "EkfSlam"]
+__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfSlam"]
 
 Array = NDArray[np.float64]
+
+ASSOCIATIONS = ("nearest", "individual", "joint")
+"""How observations are matched: each to the nearest landmark within its gate; only where a single landmark is within
+the gate; or as many as one pose can explain together (JCBB)."""
 
 _MAX_OBSERVATIONS = 64
 _MOST_NODES = 4000
@@ -36,6 +40,7 @@ _JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, _M
 class EkfConfig(BackendConfig):
     """EKF-SLAM: gating and landmark management."""
 
+    association: str = "nearest"  # or "individual", "joint": see ASSOCIATIONS
     gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     max_turn_deg: float = 35.0  # difference in a corner's direction
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
@@ -43,6 +48,8 @@ class EkfConfig(BackendConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.gate > 0, "EkfConfig.gate must be > 0")
+        if self.association not in ASSOCIATIONS:
+            raise unknown_name("EkfConfig.association", self.association, ASSOCIATIONS)
 
 
 class EkfSlam(Backend):
@@ -121,12 +128,22 @@ class EkfSlam(Backend):
                     self._add(part[k], int(ids[k]))
 
     def _associate(self, z: Array) -> NDArray[np.int64]:
+        config = self.config
+        if config.association == "joint":
+            return self._associate_jointly(z)
         match = self._match[: len(z)]
-        policy = self.config.landmarks
         nearest_neighbour(
-            self._x, self._p, self._book.count, self.config.lidar_offset_m, z, self._book.marks,
-            self.config.gate, policy.new_distance_m, math.radians(self.config.max_turn_deg), match,
-            self._distance, self._h[0],
+            self._x, self._p, self._book.count, config.lidar_offset_m, z, self._book.marks,
+            config.gate, config.landmarks.new_distance_m, math.radians(config.max_turn_deg),
+            config.association == "individual", match, self._distance, self._h[0],
+        )  # fmt: skip
+        return match
+
+    def _associate_jointly(self, z: Array) -> NDArray[np.int64]:
+        config, match = self.config, self._match[: len(z)]
+        joint_compatibility(
+            self._x, self._p, self._book.count, config.lidar_offset_m, z, self._book.marks, _JOINT_GATES,
+            config.landmarks.new_distance_m, math.radians(config.max_turn_deg), _MOST_NODES, match,
         )  # fmt: skip
         return match
 
@@ -144,7 +161,7 @@ class EkfSlam(Backend):
         Gates as wide as that would take any corner near by for a landmark. So one pose must explain them all, and
         the scan must fit the map better from there: what changed may be the view, through a door, say.
         """
-        n, policy, offset = self._n, self.config.landmarks, self.config.lidar_offset_m
+        n = self._n
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
         usual = usual.copy()
         fit = self._fit(z, usual, scan)
@@ -153,11 +170,7 @@ class EkfSlam(Backend):
         self._p[0, 0] += moved**2
         self._p[1, 1] += moved**2
         self._p[2, 2] += turned**2
-        match = self._match[: len(z)]
-        joint_compatibility(
-            self._x, self._p, self._book.count, offset, z, self._book.marks, _JOINT_GATES, policy.new_distance_m,
-            math.radians(self.config.max_turn_deg), _MOST_NODES, match,
-        )  # fmt: skip
+        match = self._associate_jointly(z)
         found = np.count_nonzero(match >= 0)
         back = found >= _FEWEST_BACK and found > np.count_nonzero(usual >= 0)
         p_wide = self._p[:3, :3].copy()

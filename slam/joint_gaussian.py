@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 from slam.association import innovation_blocks
 from slam.geometry import wrap_scalar
 
-__all__ = ["OBSERVED_LIMIT", "add_landmark", "near_landmarks", "stacked_update", "symmetric_block"]
+__all__ = [
+    "OBSERVED_LIMIT",
+    "add_landmark",
+    "downdate",
+    "near_landmarks",
+    "stacked_update",
+    "symmetric_block",
+    "whiten",
+]
 
 Array = NDArray[np.float64]
 
@@ -32,6 +40,25 @@ def stacked_update(
     S = H P Hᵀ + R = L Lᵀ, W = L⁻¹ H P, x += Wᵀ L⁻¹ ν, P ← P − Wᵀ W (theory.md A, observe; the same as
     P − K S Kᵀ). ``p`` is an upper triangle; ``h``, ``w``, ``s`` are work space.
     """
+    rows = whiten(x, p, n, z, match, offset, h, w, s)
+    ns = s.shape[1] - 1
+    nis = 0.0
+    for k in range(rows):
+        y = s[k, ns]
+        nis += y * y
+        wk = w[k]
+        for j in range(n):
+            x[j] += y * wk[j]
+    x[2] = wrap_scalar(x[2])
+    downdate(p, n, w, rows)
+    return rows, nis
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def whiten(
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
+) -> int:  # fmt: skip
+    """Write W = L⁻¹ H P into ``w`` and L⁻¹ ν into the last column of ``s``; return the number of rows."""
     rows = 0
     ns = s.shape[1] - 1  # the last column holds the innovation
     for k in range(z.shape[0]):
@@ -44,8 +71,6 @@ def stacked_update(
         s[rows + 1, ns] = wrap_scalar(z[k, 1] - bearing)
         _h_times_p(p, n, m, hk, w[rows], w[rows + 1])
         rows += 2
-    if rows == 0:
-        return 0, 0.0
     # S, its lower triangle: H W' row by row.
     a = 0
     for k in range(z.shape[0]):
@@ -64,18 +89,7 @@ def stacked_update(
         s[a + 1, a + 1] += z[k, 4]
         a += 2
     _cholesky_solve(s, rows, ns, w, n)
-    nis = 0.0
-    for k in range(rows):
-        y = s[k, ns]
-        nis += y * y
-        wk = w[k]
-        for j in range(n):
-            x[j] += y * wk[j]
-    x[2] = wrap_scalar(x[2])
-    if rows % 4 != 0:
-        w[rows : rows + 2, :n] = 0.0
-    _downdate(p, n, w, rows)
-    return rows, nis
+    return rows
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
@@ -130,12 +144,14 @@ def _cholesky_solve(s: Array, rows: int, column: int, w: Array, n: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _downdate(p: Array, n: int, w: Array, rows: int) -> None:
-    """Subtract Wᵀ W from the upper triangle of p.
+def downdate(p: Array, n: int, w: Array, rows: int) -> None:
+    """Subtract Wᵀ W from the upper triangle of p; two spare rows of w may be overwritten.
 
     Two rows of p and four of W at a time, to spare memory traffic; the rows are sliced first, without which
-    the inner loop does not vectorise and takes three times as long. Rows of W up to a multiple of four are zero.
+    the inner loop does not vectorise and takes three times as long.
     """
+    if rows % 4 != 0:
+        w[rows : rows + 2, :n] = 0.0
     for i in range(0, n - 1, 2):
         diagonal = 0.0
         for k in range(rows):

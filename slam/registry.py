@@ -8,6 +8,7 @@ from typing import Any
 from slam.backend import Backend, BackendConfig
 from slam.dead_reckoning import OdometrySlam, TruthSlam
 from slam.ekf import EkfConfig, EkfSlam
+from slam.invariant import InvariantEkfSlam
 from slam.settings import from_mapping, unknown_name
 
 __all__ = ["config_type", "make", "names"]
@@ -16,6 +17,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "odometry": (OdometrySlam, EkfConfig),
     "truth": (TruthSlam, EkfConfig),
     "ekf": (EkfSlam, EkfConfig),
+    "invariant-ekf": (InvariantEkfSlam, EkfConfig),
 }
 
 

@@ -88,7 +88,7 @@ def test_joint_compatibility_holds_where_nearest_neighbour_is_fooled() -> None:
     z = np.array([observe(truth, i, sigma=0.01) for i in (1, 2, 3, 4)])
     nearest, joint = np.zeros(4, np.int64), np.zeros(4, np.int64)
     marks = np.zeros((5, 2))
-    nearest_neighbour(x, p, 5, OFFSET, z, marks, GATES[1], 0.1, 0.6, nearest, np.zeros(4), np.zeros((2, 5)))
+    nearest_neighbour(x, p, 5, OFFSET, z, marks, GATES[1], 0.1, 0.6, False, nearest, np.zeros(4), np.zeros((2, 5)))
     joint_compatibility(x, p, 5, OFFSET, z, marks, GATES, 0.1, 0.6, 10_000, joint)
     assert nearest[:3].tolist() == [0, 1, 2]
     assert joint.tolist() == [1, 2, 3, 4]

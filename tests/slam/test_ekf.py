@@ -20,6 +20,7 @@ from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
 OFFSET = 0.2
+FILTERS = ("ekf", "invariant-ekf")  # that keep a joint Gaussian
 states = st.integers(0, 10_000)
 
 
@@ -136,18 +137,19 @@ def test_nearest_neighbour_takes_the_right_one_once_and_leaves_new_ones() -> Non
     ])  # fmt: skip
     match, distance = np.zeros(len(z), np.int64), np.zeros(len(z))
     nearest_neighbour(
-        x, p, 3, OFFSET, z, marks, chi2_quantile(0.997, 2), 0.2, 0.6, match, distance, np.zeros((2, 5))
+        x, p, 3, OFFSET, z, marks, chi2_quantile(0.997, 2), 0.2, 0.6, False, match, distance, np.zeros((2, 5))
     )
     assert match.tolist() == [0, 1, IGNORED, UNMATCHED, UNMATCHED, IGNORED, UNMATCHED]
     assert distance[0] < distance[2]
 
 
-def test_ekf_agrees_with_batch_least_squares_on_a_small_world() -> None:
+@pytest.mark.parametrize("name", FILTERS)
+def test_filters_agree_with_batch_least_squares_on_a_small_world(name: str) -> None:
     """Three landmarks, twelve steps, little noise: the filter's last belief is the batch solution's."""
     rng = np.random.default_rng(5)
     landmarks = np.array([[3.0, 1.0], [1.5, -2.0], [-2.0, 2.5]])
     r = np.diag([1e-4, 1e-5])
-    backend = slam.make("ekf", config={"lidar_offset_m": OFFSET, "odometry": {"slip_share": 0.0}})
+    backend = slam.make(name, config={"lidar_offset_m": OFFSET, "odometry": {"slip_share": 0.0}})
     start_cov = np.diag([1e-4, 1e-4, 1e-4])
     backend.reset((0, 0, 0), pose_cov=start_cov)
     noise = backend.config.odometry
