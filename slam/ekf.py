@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam.association import joint_compatibility, nearest_neighbour
 from slam.backend import Backend, BackendConfig
+from slam.blas import rank_k_downdate
 from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update, symmetric_block
 from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
@@ -28,6 +29,9 @@ Array = NDArray[np.float64]
 ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is within
 the gate; or as many as one pose can explain together (JCBB)."""
+
+BLAS_FROM = 181
+"""Size of the state from which BLAS subtracts Wᵀ W: below, its calls cost more than the loop (89 landmarks)."""
 
 _MAX_OBSERVATIONS = 64
 _MOST_NODES = 4000
@@ -187,9 +191,12 @@ class EkfSlam(Backend):
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""
+        n, small = self._n, self._n < BLAS_FROM
         self.nis_dof, self.nis = stacked_update(
-            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s
+            self._x, self._p, n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, small
         )
+        if not small and self.nis_dof:
+            rank_k_downdate(self._p, n, self._w, self.nis_dof)
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks`)."""

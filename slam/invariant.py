@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfSlam
+from slam.blas import rank_k_downdate
+from slam.ekf import BLAS_FROM, EkfSlam
 from slam.geometry import wrap_scalar
 from slam.joint_gaussian import downdate, whiten
 from slam.metrics import nees_pose_invariant
@@ -28,9 +29,23 @@ class InvariantEkfSlam(EkfSlam):
     """The right-invariant EKF-SLAM backend, ``invariant-ekf``."""
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
+        n, small = self._n, self._n < BLAS_FROM
         self.nis_dof, self.nis = invariant_update(
-            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, self._shift
+            self._x,
+            self._p,
+            n,
+            z,
+            match,
+            self.config.lidar_offset_m,
+            self._h,
+            self._w,
+            self._s,
+            self._shift,
+            small,
         )
+        if not small and self.nis_dof:
+            rank_k_downdate(self._p, n, self._w, self.nis_dof)
+            _reset(self._p, n, self._shift[1], self._shift[2])
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
@@ -48,12 +63,13 @@ class InvariantEkfSlam(EkfSlam):
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def invariant_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
-    shift: Array,
+    shift: Array, subtract: bool,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 
     The gain is the standard filter's (:func:`slam.joint_gaussian.stacked_update`). ``shift`` ``(3, ≥ n)`` is work
     space: the correction δ, then g and v of the reset P ← P + g vᵀ + v gᵀ (invariant-ekf.md, Retract and Reset).
+    Without ``subtract``, P − Wᵀ W and then the reset are left to the caller.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     if rows == 0:
@@ -76,8 +92,9 @@ def invariant_update(
     half = 0.5 * v[2]
     for j in range(n):
         v[j] += half * g[j]
-    downdate(p, n, w, rows)
-    _reset(p, n, g, v)
+    if subtract:
+        downdate(p, n, w, rows)
+        _reset(p, n, g, v)
     return rows, nis
 
 

@@ -33,12 +33,14 @@ OBSERVED_LIMIT = 1e4
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def stacked_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
+    subtract: bool,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
 
     S = H P Hᵀ + R = L Lᵀ, W = L⁻¹ H P, x += Wᵀ L⁻¹ ν, P ← P − Wᵀ W (theory.md A, observe; the same as
-    P − K S Kᵀ). ``p`` is an upper triangle; ``h``, ``w``, ``s`` are work space.
+    P − K S Kᵀ). ``p`` is an upper triangle; ``h``, ``w``, ``s`` are work space. Without ``subtract``, P − Wᵀ W is
+    left to the caller.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     ns = s.shape[1] - 1
@@ -50,7 +52,8 @@ def stacked_update(
         for j in range(n):
             x[j] += y * wk[j]
     x[2] = wrap_scalar(x[2])
-    downdate(p, n, w, rows)
+    if subtract:
+        downdate(p, n, w, rows)
     return rows, nis
 
 

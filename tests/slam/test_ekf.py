@@ -106,7 +106,7 @@ def test_stacked_update_is_the_textbook_one(seed: int, seen: int) -> None:
     want_x, want_p = x + gain @ nu, p - gain @ s @ gain.T
     state, upper = x.copy(), np.triu(p)
     dof, nis = stacked_update(
-        state, upper, n, z, match, OFFSET, np.zeros((8, 2, 5)), np.zeros((18, n)), np.zeros((16, 17))
+        state, upper, n, z, match, OFFSET, np.zeros((8, 2, 5)), np.zeros((18, n)), np.zeros((16, 17)), True
     )
     assert dof == 2 * seen
     assert nis == pytest.approx(nu @ np.linalg.solve(s, nu), rel=1e-8)

@@ -58,7 +58,7 @@ def run(update, x: np.ndarray, p: np.ndarray, z: np.ndarray) -> tuple[np.ndarray
     work = [np.zeros((64, 2, 5)), np.zeros((130, n)), np.zeros((128, 129))]
     if update is invariant_update:
         work.append(np.zeros((3, n)))
-    _, nis = update(x, p, n, z, match, OFFSET, *work)
+    _, nis = update(x, p, n, z, match, OFFSET, *work, True)
     return x, p + np.triu(p, 1).T, nis
 
 
@@ -97,7 +97,7 @@ def test_turning_the_whole_map_keeps_its_shape() -> None:
         work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
         if kernel is invariant_update:
             work.append(np.zeros((3, 9)))
-        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work)
+        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work, True)
         return state
 
     turned = update(invariant_update)
