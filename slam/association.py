@@ -12,8 +12,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.types import LINE
 
-__all__ = ["IGNORED", "UNMATCHED", "innovation_blocks", "joint_compatibility", "nearest_neighbour"]
+__all__ = [
+    "IGNORED",
+    "UNMATCHED",
+    "innovation_blocks",
+    "joint_compatibility",
+    "line_blocks",
+    "nearest_neighbour",
+    "predicted",
+]
 
 Array = NDArray[np.float64]
 
@@ -42,9 +51,34 @@ def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def line_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float, float]:
+    """Write H of line ``i`` (α, r) ``(2, 5)``: by x, y, θ, α, r; return its predicted distance and bearing.
+
+    invariant-ekf.md, Line, with the distance first, so that a line's row looks like a point's range and bearing.
+    """
+    alpha, r = x[3 + 2 * i], x[4 + 2 * i]
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    c, s = math.cos(x[2]), math.sin(x[2])
+    sx, sy = x[0] + offset * c, x[1] + offset * s
+    h[0, 0], h[0, 1] = -nx, -ny
+    h[0, 2] = offset * (nx * s - ny * c)
+    h[0, 3], h[0, 4] = ny * sx - nx * sy, 1.0
+    h[1, 0], h[1, 1], h[1, 2], h[1, 3], h[1, 4] = 0.0, 0.0, -1.0, 1.0, 0.0
+    return r - nx * sx - ny * sy, wrap_scalar(alpha - x[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def predicted(x: Array, i: int, kind: float, offset: float, h: Array) -> tuple[float, float]:
+    """Write H of a landmark of a kind ``(2, 5)`` and return what should be seen of it."""
+    if kind == LINE:
+        return line_blocks(x, i, offset, h)
+    return innovation_blocks(x, i, offset, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from landmark ``i``."""
-    rho, bearing = innovation_blocks(x, i, offset, h)
+    rho, bearing = predicted(x, i, z[5], offset, h)
     m = 3 + 2 * i
     # S = H P Hᵀ + R over the five states that H touches, read from the upper triangle.
     s00, s01, s11 = z[2], z[3], z[4]
@@ -64,9 +98,25 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
 @njit(cache=True, nogil=True, error_model="numpy")
 def _alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
     """Tell whether an observation has a landmark's kind and direction, as far as both are known."""
-    if z[5] == 0.0 or mark[0] == 0.0:
+    if (z[5] == 0.0 and mark[0] != LINE) or (mark[0] == 0.0 and z[5] != LINE):
         return True
     return bool(z[5] == mark[0] and abs(wrap_scalar(z[6] + theta - mark[1])) <= max_turn)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: float) -> bool:
+    """Tell whether a piece of wall that is seen lies within a window [m] of wall ``i``, along it and across."""
+    alpha, r = x[3 + 2 * i], x[4 + 2 * i]
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    sx, sy = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
+    # The two ends of the piece, in the belief's frame.
+    c, s = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
+    ax, ay = sx + z[0] * c - z[8] * s, sy + z[0] * s + z[8] * c
+    bx, by = sx + z[0] * c - z[9] * s, sy + z[0] * s + z[9] * c
+    if abs(nx * ax + ny * ay - r) > window or abs(nx * bx + ny * by - r) > window:
+        return False
+    ta, tb = nx * ay - ny * ax, nx * by - ny * bx
+    return bool(max(ta, tb) > mark[6] - window and min(ta, tb) < mark[7] + window)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -79,9 +129,11 @@ def nearest_neighbour(
     Parameters
     ----------
     z : Array
-        ``(m, ≥ 7)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame.
+        ``(m, ≥ 7)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame;
+        of a LINE distance and bearing of its foot, and in columns 8 and 9 from where to where it was seen [m].
     marks : Array
-        ``(n, ≥ 2)`` of each landmark: kind, direction in the belief's frame [rad].
+        ``(n, ≥ 2)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
+        from where to where it goes [m].
     gate : float
         Largest squared Mahalanobis distance (chi-square with two degrees of freedom).
     near : float
@@ -105,10 +157,14 @@ def nearest_neighbour(
         candidates = 0
         for i in range(landmarks):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
-            if abs(dx) > window or abs(dy) > window:
+            if z[k, 5] != LINE and (abs(dx) > window or abs(dy) > window):
                 continue
             if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
+            if z[k, 5] == LINE:
+                if not _beside(x, i, offset, z[k], marks[i], window):
+                    continue
+                dx = dy = 0.0  # as near as that, it is no new wall
             d2 = _gate(x, p, i, offset, z[k], h)
             candidates += d2 < gate
             if d2 < gate and d2 < distance[k]:
@@ -124,6 +180,7 @@ def nearest_neighbour(
                 match[k if distance[k] >= distance[j] else j] = IGNORED
 
 
+_WALL_WINDOW_M = 1.0  # farther off, a piece of wall is not tested for being a known wall
 _CANDIDATES = 8  # landmarks considered for one observation, the nearest first
 
 
@@ -213,6 +270,8 @@ def _compatible(
     for i in range(landmarks):
         if not _alike(z, marks[i], x[2], max_turn):
             continue
+        if z[5] == LINE and not _beside(x, i, offset, z, marks[i], _WALL_WINDOW_M):
+            continue
         d2 = _gate(x, p, i, offset, z, h)
         if d2 >= gate or (found == _CANDIDATES and d2 >= distance[found - 1]):
             continue
@@ -232,7 +291,7 @@ def _extend(
 ) -> None:  # fmt: skip
     """Add a pairing's two rows to the Cholesky factor L of S and to y = L⁻¹ ν."""
     i = landmark[pairs]
-    rho, bearing = innovation_blocks(x, i, offset, h[pairs])
+    rho, bearing = predicted(x, i, z[5], offset, h[pairs])
     row = 2 * pairs
     y[row], y[row + 1] = z[0] - rho, wrap_scalar(z[1] - bearing)
     for e in range(2):
@@ -280,6 +339,12 @@ def _set_aside(
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         for i in range(landmarks):
+            if not _alike(z[k], marks[i], x[2], max_turn):
+                continue
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
-            if dx * dx + dy * dy < near * near and _alike(z[k], marks[i], x[2], max_turn):
+            if z[k, 5] == LINE:
+                too_near = _beside(x, i, offset, z[k], marks[i], near)
+            else:
+                too_near = dx * dx + dy * dy < near * near
+            if too_near:
                 match[k] = IGNORED

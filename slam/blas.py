@@ -1,7 +1,8 @@
 """BLAS's matrix product on part of a larger array, for maps too large for a plain loop.
 
-SciPy's own wrappers take whole contiguous matrices only; a filter's covariance is the corner of an array with room
-to grow. So the routine is taken from where SciPy offers it to compiled code, and called with its leading dimension.
+SciPy's own wrappers take whole contiguous matrices only; a filter's covariance is the corner of an array with
+room to grow. So the routine is taken from where SciPy offers it to compiled code, and called with its leading
+dimension.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ __all__ = ["rank_k_downdate"]
 
 Array = NDArray[np.float64]
 
-# Products this large OpenBLAS spreads over threads, and then rounds otherwise than on one. Smaller ones it does not,
-# whatever the number of threads (interface/gemm.c): one seed must give the same bits everywhere.
+# Products this large OpenBLAS spreads over threads, and then rounds otherwise than on one. Smaller ones it does
+# not, whatever the number of threads (interface/gemm.c): one seed must give the same bits everywhere.
 _LARGEST_PRODUCT = 65536 * 4
 
 _AS_IS, _TRANSPOSED = ctypes.byref(ctypes.c_char(b"N")), ctypes.byref(ctypes.c_char(b"T"))
@@ -36,7 +37,7 @@ def _dgemm() -> Callable[..., None]:
 def rank_k_downdate(p: Array, n: int, w: Array, rows: int) -> None:
     """Subtract Wᵀ W, W = w[:rows, :n], from the upper triangle of p[:n, :n], both C-ordered.
 
-    By blocks of rows, from the diagonal to the right; in a block's part of the lower triangle p is undefined after.
+    By blocks of rows, from the diagonal to the right; p is undefined after in a block's part of the lower triangle.
     """
     dgemm = _dgemm()
     length, height, depth = ctypes.c_int(), ctypes.c_int(), ctypes.c_int(rows)

@@ -17,18 +17,18 @@ from slam.backend import Backend, BackendConfig
 from slam.blas import rank_k_downdate
 from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update, symmetric_block
-from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
+from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
-from slam.types import Belief, Observations, Odometry, Scan
+from slam.types import LINE, Belief, Observations, Odometry, Scan
 
-__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfSlam"]
+__all__ = ["ASSOCIATIONS", "BLAS_FROM", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
 
 Array = NDArray[np.float64]
 
 ASSOCIATIONS = ("nearest", "individual", "joint")
-"""How observations are matched: each to the nearest landmark within its gate; only where a single landmark is within
-the gate; or as many as one pose can explain together (JCBB)."""
+"""How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
+within the gate; or as many as one pose can explain together (JCBB)."""
 
 BLAS_FROM = 181
 """Size of the state from which BLAS subtracts Wᵀ W: below, its calls cost more than the loop (89 landmarks)."""
@@ -47,6 +47,7 @@ class EkfConfig(BackendConfig):
     association: str = "nearest"  # or "individual", "joint": see ASSOCIATIONS
     gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     max_turn_deg: float = 35.0  # difference in a corner's direction
+    lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
     def __post_init__(self) -> None:
@@ -56,8 +57,15 @@ class EkfConfig(BackendConfig):
             raise unknown_name("EkfConfig.association", self.association, ASSOCIATIONS)
 
 
+@dataclass(frozen=True, kw_only=True)
+class EkfLinesConfig(EkfConfig):
+    """EKF-SLAM over walls and what corners say beside them."""
+
+    lines: bool = True
+
+
 class EkfSlam(Backend):
-    """The standard EKF-SLAM backend, ``ekf``."""
+    """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``."""
 
     config: EkfConfig
 
@@ -98,7 +106,7 @@ class EkfSlam(Backend):
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
-        z = self.extractor.extract(scan)[:_MAX_OBSERVATIONS]
+        z = self._observed(scan)
         match = self._associate(z)
         if self._out_of_sight(match):
             match = self._allow_for_spinning_wheels(z, match, scan)
@@ -109,13 +117,17 @@ class EkfSlam(Backend):
         self._draw(scan)
         self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
 
+    def _observed(self, scan: Scan) -> Array:
+        corners = self.extractor.extract(scan)
+        return (self.extractor.with_walls() if self.config.lines else corners)[:_MAX_OBSERVATIONS]
+
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed, and new ones added."""
         rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
         cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
         if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
             raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-        z = np.zeros((len(rb), 8))
+        z = np.zeros((len(rb), 10))
         z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
         for begin in range(0, len(z), _MAX_OBSERVATIONS):
             part = z[begin : begin + _MAX_OBSERVATIONS]
@@ -211,8 +223,15 @@ class EkfSlam(Backend):
         if self._n + 2 > len(self._x):
             self._enlarge()
         add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
+        direction = float(z[DIRECTION]) + float(self._x[2])
+        extent = (0.0, 0.0)
+        if z[KIND] == LINE:
+            # Where the sensor stands along the wall, from the wall's foot; its own foot is there.
+            sensor_x, sensor_y, _ = self.sensor_pose().tolist()
+            along = math.cos(direction) * sensor_y - math.sin(direction) * sensor_x
+            extent = (along + float(z[FROM]), along + float(z[TO]))
         self._n += 2
-        self._book.add(float(z[KIND]), float(z[DIRECTION]) + float(self._x[2]), known_id)
+        self._book.add(float(z[KIND]), direction, known_id, extent=extent)
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
@@ -255,28 +274,36 @@ class EkfSlam(Backend):
 
     @property
     def joint_cov(self) -> Array:
-        """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark."""
+        """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, walls included."""
         upper = np.triu(self._p[: self._n, : self._n])
         return upper + np.triu(upper, 1).T
 
     @property
     def landmark_count(self) -> int:
-        """Number of confirmed landmarks."""
+        """Number of confirmed landmarks, walls included."""
         return self._book.count
 
+    def _point_rows(self) -> NDArray[np.int64]:
+        return np.flatnonzero(self._book.marks[:, 0] != LINE)
+
     def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
-        """Return per landmark how often it was seen and its direction in the belief's frame [rad]."""
-        return self._book.times_seen(), self._book.directions()
+        """Return per point landmark how often it was seen and its direction in the belief's frame [rad]."""
+        rows = self._point_rows()
+        return self._book.times_seen()[rows], self._book.directions()[rows]
 
     def near_landmarks(self, out: NDArray[np.float32]) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
-        near_landmarks(self._x, self._p, self._book.count, out)
+        near_landmarks(self._x, self._p, self._book.marks, out)
 
     @property
     def belief(self) -> Belief:
-        """Pose, landmarks, joint covariance and grid."""
-        joint = self.joint_cov
-        index = 3 + 2 * np.arange(self._book.count)
+        """Pose, landmarks, joint covariance (of pose and points) and grid."""
+        joint, rows = self.joint_cov, self._point_rows()
+        lines = np.setdiff1d(np.arange(self._book.count), rows)
+        if len(lines):
+            keep = np.concatenate([np.arange(3), np.column_stack([3 + 2 * rows, 4 + 2 * rows]).ravel()])
+            joint = joint[np.ix_(keep, keep)]
+        index = 3 + 2 * np.arange(len(rows))
         cov = np.empty((len(index), 2, 2))
         for a in range(2):
             for b in range(2):
@@ -284,10 +311,20 @@ class EkfSlam(Backend):
         return Belief(
             pose=self.pose,
             pose_cov=joint[:3, :3].copy(),
-            landmarks=self._points.copy(),
+            landmarks=self._points[rows],
             landmark_cov=cov,
-            landmark_ids=self._book.ids.copy(),
+            landmark_ids=self._book.ids[rows],
             grid=self.grid,
             joint_cov=joint,
-            landmark_kinds=self._book.kinds(),
+            landmark_kinds=self._book.kinds()[rows],
+            lines=self._points[lines],
+            line_ends=self._line_ends(lines),
         )
+
+    def _line_ends(self, rows: NDArray[np.int64]) -> Array:
+        """Return the ends ``(k, 4)`` of walls: as far as they were seen."""
+        alpha, r = self._points[rows].T
+        n = np.column_stack([np.cos(alpha), np.sin(alpha)])
+        along = np.column_stack([-n[:, 1], n[:, 0]])
+        extent = self._book.marks[rows, 6:8]
+        return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam.corners import all_on, edge, meet
 from slam.settings import require
 from slam.surfaces import (
+    COV,
     ENDS,
     FIRST,
     LAST,
@@ -30,16 +31,20 @@ from slam.surfaces import (
     POINTS,
     T0,
     T1,
+    VAR_OFFSET,
+    VAR_SLOPE,
     R,
     fit,
     points_in_order,
     split,
 )
-from slam.types import Scan
+from slam.types import LINE, Scan
 
 __all__ = ["Corners", "FeatureConfig", "FeatureExtractor", "Lines"]
 
 Array = NDArray[np.float64]
+
+_LOOSE_M = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +70,11 @@ class FeatureConfig:
     # 1σ of a corner along each axis that the model of straight walls leaves out. When it was chosen, over
     # apartments of the training seeds 0-15, the average pose NEES/3 was 0.98 with it and 0.63 with 2 mm.
     sigma_floor_m: float = 0.001
+    # Of a surface that is a landmark itself, where the backend takes walls.
+    wall_length_m: float = 0.6
+    wall_points: int = 10
+    wall_sigma_m: float = 0.001  # 1σ that the model of a straight wall leaves out, across it …
+    wall_sigma_rad: float = 0.0005  # … and in its direction
 
     def __post_init__(self) -> None:
         require(self.range_sigma_m >= 0, "FeatureConfig.range_sigma_m must be ≥ 0")
@@ -72,6 +82,8 @@ class FeatureConfig:
         require(0 < self.grazing_deg < 45, "FeatureConfig.grazing_deg must be in (0, 45)")
         require(5 <= self.min_angle_deg <= 85, "FeatureConfig.min_angle_deg must be in [5, 85]")
         require(self.sigma_floor_m > 0, "FeatureConfig.sigma_floor_m must be > 0")
+        require(self.wall_length_m > 0, "FeatureConfig.wall_length_m must be > 0")
+        require(self.wall_sigma_m > 0 and self.wall_sigma_rad > 0, "FeatureConfig.wall_sigma_* must be > 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +118,8 @@ class FeatureExtractor:
         self._angles = np.zeros(0)
         self._scan_of: tuple[int, float, float] = (0, 0.0, 0.0)
         self._lines = np.zeros((MAX_LINES, 14))
-        self._corners = np.zeros((3 * MAX_LINES, 8))
+        self._corners = np.zeros((3 * MAX_LINES, 10))
+        self._walls_and_corners = np.zeros((4 * MAX_LINES, 10))
         self._line_count = 0
         self._corner_count = 0
         c = self.config
@@ -117,10 +130,10 @@ class FeatureExtractor:
         ])  # fmt: skip
 
     def extract(self, scan: Scan) -> NDArray[np.float64]:
-        """Return the corners as rows of ``(m, 8)`` (a view, until the next call).
+        """Return the corners as rows of ``(m, 10)`` (a view, until the next call).
 
         Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and 1 for the visible
-        end of a surface, 0 for a meeting of two.
+        end of a surface, 0 for a meeting of two; then the surfaces' numbers, -1 for none.
         :meth:`corners` and :meth:`lines` give the same as named arrays.
         """
         n = len(scan.ranges)
@@ -140,6 +153,20 @@ class FeatureExtractor:
             self._gaps, self._xy, self._beam, self._stack, self._pieces, self.surface, self._lines, self._corners,
         )  # fmt: skip
         return self._corners[: self._corner_count]
+
+    def with_walls(self) -> NDArray[np.float64]:
+        """Return walls and corners of the last scan, as rows like :meth:`extract`'s (a view, until the next call).
+
+        A wall is a surface long enough to be a landmark: a row of kind LINE with distance and bearing of its foot,
+        and in the last two columns from where to where it was seen. A corner says about the walls that make it
+        only what they do not say themselves: nothing where two of them meet, and at a wall's end the place along it.
+        """
+        c = self.config
+        count = _walls_first(
+            self._lines[: self._line_count], self._corners[: self._corner_count], c.wall_length_m, c.wall_points,
+            c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
+        )  # fmt: skip
+        return self._walls_and_corners[:count]
 
     def _gap_table(self, increment: float) -> Array:
         """Return, for neighbours 1, 2, … beams apart: how far apart they may be, and 2 − 2 cos of the angle.
@@ -205,6 +232,7 @@ def _extract(
         # Noise near a corner may leave a sliver between its two surfaces; its points must lie on either.
         if last_line >= 0 and all_on(xy, last_end, first, lines[last_line], line, limits):
             met = meet(lines[last_line], line, increment, limits, corners[corner_count])
+            corners[corner_count, 8], corners[corner_count, 9] = last_line, line_count
             corner_count += met
             lines[last_line, ENDS] += 2.0 * met
             line[ENDS] += met
@@ -214,7 +242,56 @@ def _extract(
         for side in range(2):
             # This end may already make a corner with the neighbouring surface.
             if int(lines[k, ENDS]) & (1 << side) == 0:
+                corners[corner_count, 8], corners[corner_count, 9] = k, -1.0
                 corner_count += edge(
                     lines[k], side, ranges, rays, increment, range_max, limits, corners[corner_count]
                 )
     return line_count, corner_count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _walls_first(
+    lines: Array, corners: Array, length: float, points: float, sigma_r: float, sigma_alpha: float, out: Array
+) -> int:
+    """Write the rows of :meth:`FeatureExtractor.with_walls`; return their number."""
+    count = 0
+    for k in range(lines.shape[0]):
+        line, row = lines[k], out[count]
+        if not _is_wall(line, length, points):
+            continue
+        middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
+        # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
+        row[0], row[1] = line[R], math.atan2(line[NY], line[NX])
+        row[2] = line[VAR_OFFSET] - 2.0 * middle * line[COV] + middle * middle * line[VAR_SLOPE] + sigma_r**2
+        row[3] = middle * line[VAR_SLOPE] - line[COV]
+        row[4] = line[VAR_SLOPE] + sigma_alpha**2
+        row[5], row[6], row[7] = LINE, row[1], 0.0
+        row[8], row[9] = middle + line[T0], middle + line[T1]
+        count += 1
+    for k in range(corners.shape[0]):
+        row = out[count]
+        row[:] = corners[k]
+        one, two = int(corners[k, 8]), int(corners[k, 9])
+        first = _is_wall(lines[one], length, points)
+        second = two >= 0 and _is_wall(lines[two], length, points)
+        if first and second:
+            continue
+        if first or second:
+            _loosen(row, lines[one if first else two])
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_wall(line: Array, length: float, points: float) -> bool:
+    return bool(line[T1] - line[T0] >= length and line[POINTS] >= points)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _loosen(row: Array, line: Array) -> None:
+    """Add to a corner's covariance across a wall: that much of it the wall's own row says."""
+    ux, uy = math.cos(row[1]), math.sin(row[1])
+    across, turned = line[NX] * ux + line[NY] * uy, (line[NY] * ux - line[NX] * uy) / row[0]
+    row[2] += _LOOSE_M**2 * across * across
+    row[3] += _LOOSE_M**2 * across * turned
+    row[4] += _LOOSE_M**2 * turned * turned

@@ -12,8 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.association import innovation_blocks
+from slam.association import predicted
 from slam.geometry import wrap_scalar
+from slam.types import LINE
 
 __all__ = [
     "OBSERVED_LIMIT",
@@ -69,7 +70,7 @@ def whiten(
             continue
         m = 3 + 2 * match[k]
         hk = h[rows // 2]
-        rho, bearing = innovation_blocks(x, match[k], offset, hk)
+        rho, bearing = predicted(x, match[k], z[k, 5], offset, hk)
         s[rows, ns] = z[k, 0] - rho
         s[rows + 1, ns] = wrap_scalar(z[k, 1] - bearing)
         _h_times_p(p, n, m, hk, w[rows], w[rows + 1])
@@ -178,6 +179,9 @@ def downdate(p: Array, n: int, w: Array, rows: int) -> None:
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
     """Append a landmark seen at (ρ, φ) = z[:2] with covariance z[2:5] (theory.md A, add a landmark)."""
+    if z[5] == LINE:
+        _add_line(x, p, n, z, offset)
+        return
     c, s = math.cos(x[2]), math.sin(x[2])
     cb, sb = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
     rx, ry = offset * c + z[0] * cb, offset * s + z[0] * sb
@@ -200,6 +204,31 @@ def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _add_line(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
+    """Append a line (α, r) seen at distance z[0] and bearing z[1]: α = θ + φ, r = ρ + n(α)ᵀ s."""
+    alpha = wrap_scalar(x[2] + z[1])
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    c, s = math.cos(x[2]), math.sin(x[2])
+    sx, sy = x[0] + offset * c, x[1] + offset * s
+    lever = nx * sy - ny * sx  # (J n)ᵀ s: by how much r grows with α
+    turn = lever + offset * (ny * c - nx * s)
+    x[n], x[n + 1] = alpha, z[0] + nx * sx + ny * sy
+    # Gr = [[0, 0, 1], [nx, ny, turn]], Gz (by distance, bearing) = [[0, 1], [1, lever]]
+    for j in range(n):
+        p0 = p[0, j]
+        p1 = p[1, j] if j >= 1 else p[0, 1]
+        p2 = p[2, j] if j >= 2 else p[j, 2]
+        p[j, n] = p2
+        p[j, n + 1] = nx * p0 + ny * p1 + turn * p2
+    p[n, n] = p[2, n] + z[4]
+    p[n, n + 1] = p[2, n + 1] + z[3] + lever * z[4]
+    p[n + 1, n + 1] = (
+        nx * p[0, n + 1] + ny * p[1, n + 1] + turn * p[2, n + 1]
+        + z[2] + 2.0 * lever * z[3] + lever * lever * z[4]
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def symmetric_block(p: Array, out: Array) -> None:
     """Write the leading block of an upper triangle as the full symmetric matrix."""
     for i in range(out.shape[0]):
@@ -208,14 +237,16 @@ def symmetric_block(p: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def near_landmarks(x: Array, p: Array, count: int, out: NDArray[np.float32]) -> None:
-    """Write the nearest landmarks in the robot frame, by insertion into a list sorted by distance."""
+def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -> None:
+    """Write the nearest point landmarks in the robot frame, by insertion into a list sorted by distance."""
     out[:] = 0.0
     c, s = math.cos(x[2]), math.sin(x[2])
     size = out.shape[0]
     nearest, distance = np.empty(size, np.int64), np.empty(size)
     filled = 0
-    for i in range(count):
+    for i in range(marks.shape[0]):
+        if marks[i, 0] == LINE:
+            continue
         dx, dy = x[3 + 2 * i] - x[0], x[4 + 2 * i] - x[1]
         d2 = dx * dx + dy * dy
         j = filled if filled < size else size - 1

@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from slam.association import UNMATCHED
 from slam.geometry import wrap_scalar
 from slam.settings import require
-from slam.types import Scan
+from slam.types import LINE, Scan
 
 __all__ = ["KIND", "LandmarkBook", "LandmarkPolicy"]
 
 Array = NDArray[np.float64]
 
-KIND, DIRECTION, EDGE = 5, 6, 7  # columns of an observation row, see FeatureExtractor.extract
+KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 
 # Columns of ``marks``, one row a landmark.
-_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN = range(6)
+_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN, _FROM, _TO = range(8)
 _RECENT = 3  # updates
+_WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may become one landmark
 # Columns of the tentative ones.
 _X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
 _TENTATIVE = 64
@@ -62,14 +63,17 @@ class LandmarkBook:
         self._next_id = 0
         self._now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
-        self._marks = np.zeros((32, 6))
+        self._marks = np.zeros((32, 8))
         self._tentative = np.zeros((_TENTATIVE, 8))
         self._tentative_count = np.zeros(1, np.int64)
         self._new = np.zeros(256, np.int64)
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting ``(n, 6)``. A view."""
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to ``(n, 8)``.
+
+        A wall goes from one to the other [m], along it from its foot. A view.
+        """
         return self._marks[: self.count]
 
     @property
@@ -95,8 +99,10 @@ class LandmarkBook:
             return int(self.row_of_id[landmark_id])
         return -1
 
-    def add(self, kind: float, direction: float, known_id: int | None) -> None:
-        """Append a landmark; without a known id it gets the next one."""
+    def add(
+        self, kind: float, direction: float, known_id: int | None, *, extent: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Append a landmark; without a known id it gets the next one. A wall has an extent along it [m]."""
         new_id = self._next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
@@ -106,7 +112,7 @@ class LandmarkBook:
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now, *extent)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -126,8 +132,9 @@ class LandmarkBook:
         return recent, still
 
     def just_seen(self) -> NDArray[np.int64]:
-        """Return the rows ``(k,)`` of the landmarks that the last update showed."""
-        return np.flatnonzero(self._marks[: self.count, _LAST_SEEN] == self._now)
+        """Return the rows ``(k,)`` of the points that the last update showed."""
+        marks = self._marks[: self.count]
+        return np.flatnonzero((marks[:, _LAST_SEEN] == self._now) & (marks[:, _KIND] != LINE))
 
     def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
         """Count sightings; return which observations are new landmarks by now.
@@ -160,6 +167,19 @@ class LandmarkBook:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
+    """Stretch wall ``row`` to the piece of it that is seen, and take over its direction from the state."""
+    alpha = x[3 + 2 * row]
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    sx, sy = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
+    c, s = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
+    for e in range(8, 10):
+        t = nx * (sy + z[0] * s + z[e] * c) - ny * (sx + z[0] * c - z[e] * s)
+        mark[_FROM], mark[_TO] = min(mark[_FROM], t), max(mark[_TO], t)
+    mark[_DIRECTION] = alpha
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
     recent = still = 0
     for i in range(marks.shape[0]):
@@ -187,6 +207,8 @@ def _review(
         if match[k] >= 0:
             marks[match[k], _SEEN] += 1.0
             marks[match[k], _LAST_SEEN] = now
+            if z[k, KIND] == LINE:
+                _lengthen(x, offset, z[k], match[k], marks[match[k]])
             continue
         if match[k] != UNMATCHED:
             continue
@@ -194,9 +216,19 @@ def _review(
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         turn = wrap_scalar(x[2] + z[k, 6])
+        if z[k, KIND] == LINE:
+            # The middle of the piece that is seen stands for it; another piece of the same wall counts as seen, too.
+            middle = 0.5 * (z[k, 8] + z[k, 9])
+            px, py = px - middle * math.sin(bearing), py + middle * math.cos(bearing)
         nearest, best = -1, gate * gate
         for i in range(n):
-            d2 = (tentative[i, _X] - px) ** 2 + (tentative[i, _Y] - py) ** 2
+            dx, dy = tentative[i, _X] - px, tentative[i, _Y] - py
+            if z[k, KIND] == LINE:
+                d2 = (dx * math.cos(turn) + dy * math.sin(turn)) ** 2
+                if tentative[i, _T_KIND] != LINE or dx * dx + dy * dy > _WALL_REACH_M**2:
+                    continue
+            else:
+                d2 = dx * dx + dy * dy
             same = tentative[i, _T_KIND] == z[k, 5] and (
                 z[k, 5] == 0.0 or abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
             )
@@ -245,7 +277,7 @@ def _look_through(
     full = beams >= circle
     doubtful = False
     for i in range(marks.shape[0]):
-        if marks[i, _LAST_SEEN] == now:
+        if marks[i, _LAST_SEEN] == now or marks[i, _KIND] == LINE:
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy

@@ -7,7 +7,8 @@ from typing import Any
 
 from slam.backend import Backend, BackendConfig
 from slam.dead_reckoning import OdometrySlam, TruthSlam
-from slam.ekf import EkfConfig, EkfSlam
+from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
+from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
 from slam.invariant import InvariantEkfSlam
 from slam.settings import from_mapping, unknown_name
 
@@ -17,7 +18,10 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "odometry": (OdometrySlam, EkfConfig),
     "truth": (TruthSlam, EkfConfig),
     "ekf": (EkfSlam, EkfConfig),
+    "ekf-lines": (EkfSlam, EkfLinesConfig),
     "invariant-ekf": (InvariantEkfSlam, EkfConfig),
+    "fastslam1": (FastSlam1, FastSlamConfig),
+    "fastslam2": (FastSlam2, FastSlamConfig),
 }
 
 

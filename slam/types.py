@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from slam.occupancy import OccupancyGrid
 
-__all__ = ["CONCAVE", "CONVEX", "Belief", "Observations", "Odometry", "Scan"]
+__all__ = ["CONCAVE", "CONVEX", "LINE", "Belief", "Observations", "Odometry", "Scan"]
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,8 @@ CONVEX = 1
 """A corner that stands out into free space: the end of a wall, the edge of a cupboard."""
 CONCAVE = -1
 """A corner of the free space itself: where two walls of a room meet."""
+LINE = 2
+"""A straight wall, not a point: its two coordinates are α [rad] and r [m], x cos α + y sin α = r."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,3 +68,5 @@ class Belief:
     landmark_kinds: NDArray[np.int8] = field(  # (n,) CONVEX, CONCAVE or 0 where not known
         default_factory=lambda: np.zeros(0, np.int8)
     )
+    lines: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (k, 2) walls: α [rad], r [m]
+    line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]

@@ -1,0 +1,454 @@
+"""FastSLAM (theory.md B, point 6): particles of the path, each with independent filters of its landmarks.
+
+FastSLAM 1.0 draws a particle's pose from the motion model; 2.0 from the motion model given what is seen now,
+which leaves the weights more even. Both are one computation: a particle has a Gaussian of its pose since the last
+measurement, which the measurement narrows before the pose is drawn, and 1.0 is the case in which the pose was
+drawn before, so that nothing is left to narrow.
+"""
+
+from __future__ import annotations
+
+import abc
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.association import joint_compatibility
+from slam.backend import Backend, BackendConfig
+from slam.chi_square import chi2_quantile
+from slam.geometry import compose, rotation, wrap, wrap_scalar
+from slam.joint_gaussian import OBSERVED_LIMIT
+from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
+from slam.motion import predict_robot
+from slam.particle_maps import ParticleMaps, associate, correct_landmark, innovation, own, refresh_extents
+from slam.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.settings import require
+from slam.types import Belief, Observations, Odometry, Scan
+
+__all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_MAX_OBSERVATIONS = 64  # of a scan
+_MOST_NODES = 4000
+_FEWEST_BACK = 2  # landmarks; one alone says nothing about the heading
+# Of k pairings together: 99 % of chi-square with 2k degrees of freedom.
+_JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, _MAX_OBSERVATIONS + 1)])
+_LOG_2PI = math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FastSlamConfig(BackendConfig):
+    """FastSLAM: particles, resampling, gating and landmark management."""
+
+    particles: int = 100
+    resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
+    gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
+    max_turn_deg: float = 35.0  # difference in a corner's direction
+    # An observation that no landmark of a particle explains weighs as one at this squared distance from a
+    # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
+    unexplained: float = 11.83
+    landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.particles >= 1, "FastSlamConfig.particles must be at least 1")
+        require(self.gate > 0, "FastSlamConfig.gate must be > 0")
+        require(self.unexplained >= 0, "FastSlamConfig.unexplained must be ≥ 0")
+
+
+class FastSlam(Backend):
+    """What both versions share.
+
+    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. The
+    covariances are those of the particles there are: once all descend from one (``ancestors``), they say nothing
+    of the error that all inherit from it, and NEES grows with the length of the way.
+    """
+
+    config: FastSlamConfig
+
+    def __init__(self, config: FastSlamConfig | None = None) -> None:
+        super().__init__(config or FastSlamConfig())
+        self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        n = self.config.particles
+        self._rng = np.random.Generator(np.random.PCG64(seed))
+        variances, axes = np.linalg.eigh(pose_cov)
+        spread = axes * np.sqrt(np.maximum(variances, 0.0))
+        self._poses = pose + self._rng.standard_normal((n, 3)) @ spread.T  # (particles, 3)
+        self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._covs = np.zeros((n, 3, 3))  # of the motion since the pose was last drawn; upper triangles
+        self._log_weights = np.full(n, -math.log(n))
+        self._weights = np.full(n, 1.0 / n)
+        self._origin = np.arange(n)  # the particle of the start that each one descends from
+        self._maps = ParticleMaps(n)
+        self._book = LandmarkBook(self.config.landmarks)
+        self._match = np.zeros((n, _MAX_OBSERVATIONS), np.int64)
+        self._ancestors = np.zeros(n, np.int64)
+        self._updates = 0  # since the last resampling
+        self._twist = (0.0, 0.0, 0.0)
+        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
+        self.n_eff = float(n)
+        self.resampled = False
+        self._believe()
+
+    # ---- the filter ----------------------------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move every particle on by what the wheels measured (theory.md A, predict)."""
+        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
+        noise, dt = self.config.odometry, odometry.dt
+        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
+        self._move(np.array(twist), dt, var_v, var_w)
+        self._twist = twist
+        way = math.hypot(vx, vy, noise.lever_m * omega) * dt
+        moved, turned = self._unseen_motion
+        self._unseen_motion = (moved + way, turned + way / noise.lever_m)
+        self._believe()
+
+    @abc.abstractmethod
+    def _move(self, twist: Array, dt: float, var_v: float, var_w: float) -> None:
+        """Move every particle by a measured twist of these variances."""
+
+    def update(self, scan: Scan) -> None:
+        """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
+        z = self.extractor.extract(scan)[:_MAX_OBSERVATIONS]
+        match, leader = self._associate(z)
+        if self._out_of_sight(match[leader]):
+            self._allow_for_spinning_wheels(z, match, leader, scan)
+        if np.count_nonzero(match[leader] >= 0) >= _FEWEST_BACK:
+            self._unseen_motion = (0.0, 0.0)
+        best = self._correct(z, match)
+        self._manage(z, match[best], best, scan)
+        self._resample(len(z))
+        self._believe()
+        self._draw(scan)
+        self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
+
+    def observe(self, observations: Observations) -> None:
+        """Correct by landmark observations without a scan; known ids are believed, and new ones added."""
+        rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
+        cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
+        if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
+            raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
+        z = np.zeros((len(rb), 8))
+        z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+        if observations.ids is None:
+            match, _ = self._associate(z)
+            best = self._correct(z, match)
+            self._manage(z, match[best], best, None)
+        else:
+            ids = [int(i) for i in observations.ids]
+            rows = np.array([self._book.row(i) for i in ids], np.int64)
+            match = self._match_buffer(len(z))
+            match[:] = rows
+            best = self._correct(z, match)
+            for k in np.flatnonzero(rows < 0):
+                if self._book.row(ids[k]) < 0:  # not added by this very call
+                    self._add(z[k], best, ids[k])
+        self._resample(len(z))
+        self._believe()
+
+    def _match_buffer(self, observations: int) -> Indices:
+        if self._match.shape[1] < observations:
+            self._match = np.zeros((len(self._match), observations), np.int64)
+        return self._match[:, :observations]
+
+    def _associate(self, z: Array) -> tuple[Indices, int]:
+        """Return the landmark of every observation in every particle, and the particle that matches most."""
+        match, maps = self._match_buffer(len(z)), self._maps
+        leader = associate(
+            self._poses, self._covs, self.config.lidar_offset_m, z, self._book.marks, self.config.gate,
+            self.config.landmarks.new_distance_m, math.radians(self.config.max_turn_deg), maps.table, maps.records,
+            maps.extents, match,
+        )  # fmt: skip
+        return match, leader
+
+    def _correct(self, z: Array, match: Indices) -> int:
+        """Draw the poses, weigh the particles, correct their landmarks; return the heaviest particle."""
+        maps, config = self._maps, self.config
+        if not len(z):
+            return int(np.argmax(self._log_weights))
+        maps.reserve(match.size)
+        drawn = not self._covs.any()
+        normals = np.zeros_like(self._poses) if drawn else self._rng.standard_normal(self._poses.shape)
+        _correct(
+            self._poses, self._covs, normals, self._log_weights, z, match, config.lidar_offset_m,
+            config.unexplained, maps.table, maps.records, maps.references, maps.free, maps.free_count,
+        )  # fmt: skip
+        refresh_extents(maps.table, maps.records, match, maps.extents)
+        normalise(self._log_weights, self._weights)
+        return int(np.argmax(self._weights))
+
+    def _resample(self, observations: int) -> None:
+        self.resampled = False
+        if not observations:
+            return
+        n = self.config.particles
+        self.n_eff = effective_particles(self._weights)
+        self._updates += 1
+        if not self.config.resampling.due(self.n_eff, n, self._updates):
+            return
+        systematic(self._weights, self._rng.random(), self._ancestors)
+        self._maps.resample(self._ancestors)
+        self._poses, self._covs = self._poses[self._ancestors], self._covs[self._ancestors]
+        self._origin = self._origin[self._ancestors]
+        self._weights[:] = 1.0 / n
+        self._log_weights[:] = -math.log(n)
+        self._updates, self.resampled = 0, True
+
+    # ---- wheels that turn in vain --------------------------------------------------------------------------
+
+    def _out_of_sight(self, match: Indices) -> bool:
+        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
+        recent, still = self._book.recently_seen(match)
+        return recent >= 3 and still < 0.6 * recent
+
+    def _allow_for_spinning_wheels(self, z: Array, match: Indices, leader: int, scan: Scan) -> None:
+        """Associate anew as though the wheels had turned in vain, where one pose then explains more.
+
+        See :meth:`slam.ekf.EkfSlam._allow_for_spinning_wheels`. The leader's map decides for all; its landmarks
+        are independent, given the path. Where the wheels did spin, the poses are drawn by what is seen in either
+        version: a thousand times the usual volume is more than any number of blind draws could fill.
+        """
+        n, config, policy = self._maps.count, self.config, self.config.landmarks
+        wide = np.diag(np.square([self._unseen_motion[0], *self._unseen_motion]))
+        pose, cov, landmarks = self._poses[leader], self._covs[leader], self._maps.of(leader)
+        x, p = np.concatenate([pose, landmarks[:, :2].ravel()]), np.zeros((3 + 2 * n, 3 + 2 * n))
+        p[:3, :3] = cov + wide
+        index = 3 + 2 * np.arange(n)
+        p[index, index], p[index, index + 1], p[index + 1, index + 1] = landmarks[:, 2:].T
+        found = np.zeros(len(z), np.int64)
+        joint_compatibility(
+            x, p, n, config.lidar_offset_m, z, self._book.marks, _JOINT_GATES, policy.new_distance_m,
+            math.radians(config.max_turn_deg), _MOST_NODES, found,
+        )  # fmt: skip
+        count = np.count_nonzero(found >= 0)
+        if count < _FEWEST_BACK or count <= np.count_nonzero(match[leader] >= 0):
+            return
+        usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
+        if self._fit(pose, cov + wide, landmarks, z, found, scan) > usual_fit:
+            self._covs += wide
+            match[:] = found
+
+    def _fit(self, pose: Array, cov: Array, landmarks: Array, z: Array, match: Indices, scan: Scan) -> float:
+        """Correct a particle's pose by a match; return how well the scan fits the map from there."""
+        pose, offset = pose.copy(), self.config.lidar_offset_m
+        _narrow(pose, cov.copy(), landmarks, np.arange(len(landmarks)), z, match, offset, 0.0)
+        return self.grid.agreement(compose(pose, np.array([offset, 0.0, 0.0])), scan)
+
+    # ---- the book of landmarks -----------------------------------------------------------------------------
+
+    def _manage(self, z: Array, match: Indices, best: int, scan: Scan | None) -> None:
+        """Tentative → confirmed → dropped (see :mod:`slam.landmarks`), for all particles as the best one has it.
+
+        So a row is the same landmark in every particle, which has it where it saw it from its own pose.
+        """
+        x = np.concatenate([self._poses[best], self._maps.of(best)[:, :2].ravel()])
+        for k in self._book.review(x, self.config.lidar_offset_m, z, match):
+            self._add(z[k], best, None)
+        if scan is not None:
+            x = np.concatenate([self._poses[best], self._maps.of(best)[:, :2].ravel()])
+            for row in self._book.contradicted(x, self.config.lidar_offset_m, scan):
+                self._maps.drop(row)
+                self._book.drop(row)
+
+    def _add(self, z: Array, best: int, known_id: int | None) -> None:
+        self._book.add(float(z[KIND]), float(z[DIRECTION]) + float(self._poses[best, 2]), known_id)
+        self._maps.add(self._poses, z, self.config.lidar_offset_m)
+
+    def _landmarks_in_view(self) -> tuple[Indices, Array]:
+        rows = self._book.just_seen()
+        return self._book.ids[rows], self._points[rows]
+
+    # ---- the belief ----------------------------------------------------------------------------------------
+
+    def _believe(self) -> None:
+        """Sum the particles up; of the landmarks, only when somebody asks."""
+        config = self.config
+        self._mean, self._cov = np.zeros(3), np.zeros((3, 3))
+        floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
+        pose_moments(self._poses, self._covs, self._weights, floor, self._mean, self._cov)
+        self._mixture: tuple[Array, Array] | None = None
+
+    def _landmark_moments(self) -> tuple[Array, Array]:
+        # Of all particles, not of the heaviest: the mean has the least expected error, goes with the mean pose,
+        # and does not jump (nor make the map be redrawn) each time another particle becomes the heaviest.
+        if self._mixture is None:
+            self._mixture = self._maps.mixture(self._weights)
+        return self._mixture
+
+    @property
+    def _points(self) -> Array:
+        return self._landmark_moments()[0]
+
+    @property
+    def ancestors(self) -> int:
+        """Number of particles of the start that still have descendants."""
+        return len(np.unique(self._origin))
+
+    @property
+    def pose(self) -> Array:
+        """Pose mean ``(3,)``."""
+        return self._mean.copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``."""
+        return self._cov.copy()
+
+    @property
+    def landmark_count(self) -> int:
+        """Number of confirmed landmarks."""
+        return self._book.count
+
+    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+        """Return per landmark how often it was seen and its direction in the belief's frame [rad]."""
+        return self._book.times_seen(), self._book.directions()
+
+    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+        """Write the nearest landmarks in the robot frame (see the base class)."""
+        points, covs = self._landmark_moments()
+        ahead = points - self._mean[:2]
+        nearest = np.argsort(np.sum(ahead**2, axis=1), kind="stable")[: len(out)]
+        k, from_body = len(nearest), rotation(float(self._mean[2]))
+        turned = from_body.T @ covs[nearest] @ from_body
+        out[:] = 0.0
+        out[:k, :2] = ahead[nearest] @ from_body
+        out[:k, 2], out[:k, 3], out[:k, 4] = turned[:, 0, 0], turned[:, 0, 1], turned[:, 1, 1]
+        np.clip(out, -OBSERVED_LIMIT, OBSERVED_LIMIT, out=out)
+        out[:k, 5] = 1.0
+
+    @property
+    def belief(self) -> Belief:
+        """Pose, landmarks and grid; there is no joint covariance."""
+        points, cov = self._landmark_moments()
+        return Belief(
+            pose=self.pose,
+            pose_cov=self.pose_cov,
+            landmarks=points.copy(),
+            landmark_cov=cov.copy(),
+            landmark_ids=self._book.ids.copy(),
+            grid=self.grid,
+            landmark_kinds=self._book.kinds(),
+        )
+
+
+class FastSlam1(FastSlam):
+    """FastSLAM 1.0, backend ``fastslam1``: poses are drawn from the motion model."""
+
+    def _move(self, twist: Array, dt: float, var_v: float, var_w: float) -> None:
+        sigma = np.sqrt([var_v, var_v, var_w])
+        twists = twist + sigma * self._rng.standard_normal(self._poses.shape)
+        _predict(self._poses, self._covs, twists, dt, 0.0, 0.0)
+
+
+class FastSlam2(FastSlam):
+    """FastSLAM 2.0, backend ``fastslam2``: poses are drawn once the measurement is known, and given it."""
+
+    def _move(self, twist: Array, dt: float, var_v: float, var_w: float) -> None:
+        _predict(self._poses, self._covs, np.tile(twist, (len(self._poses), 1)), dt, var_v, var_w)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict(poses: Array, covs: Array, twists: Array, dt: float, var_v: float, var_w: float) -> None:
+    for i in range(poses.shape[0]):
+        predict_robot(poses[i], covs[i], 3, twists[i, 0], twists[i, 1], twists[i, 2], dt, var_v, var_w)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _correct(
+    poses: Array, covs: Array, normals: Array, log_weights: Array, z: Array, match: Indices, offset: float,
+    unexplained: float, table: Indices, records: Array, references: Indices, free: Indices, free_count: Indices,
+) -> None:  # fmt: skip
+    """Narrow each particle's pose by what it sees, weigh it, draw the pose, correct the landmarks seen.
+
+    The weight is p(z | the path so far): of each observation the predictive likelihood, given those before.
+    """
+    for i in range(poses.shape[0]):
+        log_weights[i] += _narrow(poses[i], covs[i], records, table[i], z, match[i], offset, unexplained)
+        if covs[i, 0, 0] + covs[i, 1, 1] + covs[i, 2, 2] > 0.0:
+            _draw(poses[i], covs[i], normals[i])
+        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        for k in range(z.shape[0]):
+            if match[i, k] < 0:
+                continue
+            before = records[table[i, match[i, k]]]
+            after = records[own(i, match[i, k], table, references, free, free_count)]
+            correct_landmark(poses[i], c, s, offset, z[k], before, after)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _narrow(
+    pose: Array, p: Array, records: Array, table: Indices, z: Array, match: Indices, offset: float,
+    unexplained: float,
+) -> float:  # fmt: skip
+    """Update the Gaussian of a particle's pose by all its matches, in turn; return the log likelihood of ``z``.
+
+    S = H_x P H_xᵀ + H_m P_m H_mᵀ + R (theory.md B); ``p`` is an upper triangle.
+    """
+    total = 0.0
+    spread = p[0, 0] + p[1, 1] + p[2, 2] > 0.0
+    cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+    for k in range(z.shape[0]):
+        r00, r01, r11 = z[k, 2], z[k, 3], z[k, 4]
+        if match[k] < 0:
+            total -= 0.5 * (unexplained + math.log(r00 * r11 - r01 * r01)) + _LOG_2PI
+            continue
+        m = records[table[match[k]]]
+        u, v, a, b, c, d, e, f = innovation(pose, cosine, sine, offset, m[0], m[1], z[k])
+        s00 = r00 + a * a * m[2] + 2.0 * a * b * m[3] + b * b * m[4]
+        s01 = r01 + a * d * m[2] + (a * e + b * d) * m[3] + b * e * m[4]
+        s11 = r11 + d * d * m[2] + 2.0 * d * e * m[3] + e * e * m[4]
+        gx = gy = gt = hx = hy = ht = 0.0  # P H_xᵀ, column by column
+        if spread:
+            gx, hx = p[0, 0] * a + p[0, 1] * b + p[0, 2] * c, p[0, 0] * d + p[0, 1] * e + p[0, 2] * f
+            gy, hy = p[0, 1] * a + p[1, 1] * b + p[1, 2] * c, p[0, 1] * d + p[1, 1] * e + p[1, 2] * f
+            gt, ht = p[0, 2] * a + p[1, 2] * b + p[2, 2] * c, p[0, 2] * d + p[1, 2] * e + p[2, 2] * f
+            s00 += a * gx + b * gy + c * gt
+            s01 += d * gx + e * gy + f * gt
+            s11 += d * hx + e * hy + f * ht
+        # With S = L Lᵀ: y = L⁻¹ ν, W = L⁻¹ H P, x += Wᵀ y, P ← P − Wᵀ W.
+        l00 = math.sqrt(s00)
+        l10 = s01 / l00
+        l11 = math.sqrt(s11 - l10 * l10)
+        y0 = u / l00
+        y1 = (v - l10 * y0) / l11
+        total -= 0.5 * (y0 * y0 + y1 * y1) + math.log(l00 * l11) + _LOG_2PI
+        if not spread:
+            continue
+        gx, gy, gt = gx / l00, gy / l00, gt / l00
+        hx, hy, ht = (hx - l10 * gx) / l11, (hy - l10 * gy) / l11, (ht - l10 * gt) / l11
+        pose[0] += gx * y0 + hx * y1
+        pose[1] += gy * y0 + hy * y1
+        pose[2] = wrap_scalar(pose[2] + gt * y0 + ht * y1)
+        cosine, sine = math.cos(pose[2]), math.sin(pose[2])
+        p[0, 0] -= gx * gx + hx * hx
+        p[0, 1] -= gx * gy + hx * hy
+        p[0, 2] -= gx * gt + hx * ht
+        p[1, 1] -= gy * gy + hy * hy
+        p[1, 2] -= gy * gt + hy * ht
+        p[2, 2] -= gt * gt + ht * ht
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw(pose: Array, p: Array, normal: Array) -> None:
+    """Draw the pose from its Gaussian and clear the covariance: the pose is known from here on.
+
+    By p's Cholesky factor; where rounding has left no variance, nothing is added.
+    """
+    l00 = math.sqrt(max(p[0, 0], 0.0))
+    l10, l20 = (p[0, 1] / l00, p[0, 2] / l00) if l00 > 0.0 else (0.0, 0.0)
+    l11 = math.sqrt(max(p[1, 1] - l10 * l10, 0.0))
+    l21 = (p[1, 2] - l20 * l10) / l11 if l11 > 0.0 else 0.0
+    l22 = math.sqrt(max(p[2, 2] - l20 * l20 - l21 * l21, 0.0))
+    pose[0] += l00 * normal[0]
+    pose[1] += l10 * normal[0] + l11 * normal[1]
+    pose[2] = wrap_scalar(pose[2] + l20 * normal[0] + l21 * normal[1] + l22 * normal[2])
+    p[:, :] = 0.0
