@@ -57,6 +57,9 @@ class Agent(ABC):
         self._frontiers: Array = np.zeros((0, 2))
         self._status = "idle"
 
+    outlives_coverage = False
+    """Whether an episode goes on when all is mapped: this agent has something left to do."""
+
     @property
     def goal(self) -> Goal | None:
         """The goal it is driving to, if any."""

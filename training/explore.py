@@ -99,6 +99,7 @@ class Episode:
         metrics: dict[str, Any] = dict(self.env.episode_metrics())
         coverage = metrics["coverage"]
         metrics["decision_ms_median"] = statistics.median(self.decisions_ms) if self.decisions_ms else None
+        metrics["return_error_m"] = float(np.hypot(*self.env.truth.pose[:2])) if self.end == "returned" else None
         metrics |= {
             "success": bool(coverage is not None and coverage >= self.config.coverage_target),
             "agent": self.run["agent"],
@@ -213,7 +214,7 @@ def run(episode: Episode, progress: Progress) -> None:
             idle = idle + 1 if goal is None else 0
             if interrupted.is_set():
                 episode.end, episode.interrupted = "interrupted", True
-            elif terminated:
+            elif terminated and not (info["is_success"] and agent.outlives_coverage):
                 episode.end = "all mapped" if info["is_success"] else "collision"
             elif idle >= patience:
                 episode.end = agent.status

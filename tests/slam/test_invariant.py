@@ -57,7 +57,7 @@ def run(update, x: np.ndarray, p: np.ndarray, z: np.ndarray) -> tuple[np.ndarray
     match = np.arange(len(z))
     work = [np.zeros((64, 2, 5)), np.zeros((130, n)), np.zeros((128, 129))]
     if update is invariant_update:
-        work.append(np.zeros((3, n)))
+        work = [np.zeros(((n - 3) // 2, 8)), *work, np.zeros((7, n))]
     _, nis = update(x, p, n, z, match, OFFSET, *work, True)
     return x, p + np.triu(p, 1).T, nis
 
@@ -96,7 +96,7 @@ def test_turning_the_whole_map_keeps_its_shape() -> None:
         state, cov = x.copy(), np.triu(p)
         work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
         if kernel is invariant_update:
-            work.append(np.zeros((3, 9)))
+            work = [np.zeros((3, 8)), *work, np.zeros((7, 9))]
         kernel(state, cov, 9, z, np.array([2]), OFFSET, *work, True)
         return state
 

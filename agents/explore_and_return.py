@@ -1,0 +1,187 @@
+"""Explore, then drive back to the start (Newman's experiment; theory.md B, 7).
+
+The robot has nothing but its own belief to find the start with: how far from the true one it stops is what its
+whole journey has cost it in certainty.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents import cost_map as cost_maps
+from agents.base import Goal
+from agents.control import PathFollower
+from agents.frontier import NearestFrontier, NearestFrontierConfig
+from agents.planning import shortest_path, travel_costs
+from agents.safety import LocalMap
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam import geometry
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
+
+Array = NDArray[np.float64]
+
+_HOME = np.zeros(3)  # the belief's frame is that of the start pose
+_TURN_WITHIN_M = 0.5  # of the start: from there on it turns to the start's heading
+
+
+@dataclass(frozen=True, kw_only=True)
+class HomingConfig:
+    """How near to the start, by the belief, is there."""
+
+    arrived_m: float = 0.05
+    arrived_rad: float = 0.1
+    arrival_m_s: float = 0.06  # speed at which the start is reached
+    last_leg_m: float = 0.25  # so far it goes straight: the start may lie too near to a wall to be planned to
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value > 0, f"HomingConfig.{f.name} must be > 0, got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExploreAndReturnConfig(NearestFrontierConfig):
+    """The parts of the explorer, and the way back."""
+
+    homing: HomingConfig = field(default_factory=HomingConfig)
+
+
+class ExploreAndReturn(NearestFrontier):
+    """Explores as the nearest-frontier agent does; with nothing left to explore, goes back to where it began.
+
+    It ends with status ``returned`` where it believes to stand on its start pose again, and ``stuck`` where as
+    many attempts as a frontier gets have not brought it there.
+    """
+
+    outlives_coverage = True
+    """An episode ends when this agent has ended, not when all is mapped."""
+
+    def __init__(
+        self,
+        config: ExploreAndReturnConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        whole = from_mapping(ExploreAndReturnConfig, config)
+        self._homing = whole.homing
+        super().__init__(whole, robot=robot, lidar=lidar, step_s=step_s)
+
+    def _forget(self) -> None:
+        # Looking at a frontier needs another follower than the way back.
+        self._follower = PathFollower(
+            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
+        super()._forget()
+        self._returning = False
+        self._end = ""  # the status it has ended with
+
+    # ---- choosing ------------------------------------------------------------------------------------------
+
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return the next view point; with none left, the start; at the start, or given up, ``None``."""
+        if not self._returning:
+            goal = super().choose(belief)
+            if goal is not None:
+                return goal
+            self._turn_back()
+        return self._choose_home(belief)
+
+    def _turn_back(self) -> None:
+        homing = self._homing
+        self._returning = True
+        self._troubles = []  # what could not be seen has no bearing on the way back
+        self._target = None
+        # Aimed at more exactly than what counts as there: the last of the speed is still to be braked away.
+        control = replace(
+            self.config.control,
+            arrived_m=0.6 * homing.arrived_m,
+            arrived_rad=0.6 * homing.arrived_rad,
+            arrival_m_s=homing.arrival_m_s,
+        )
+        self._follower = _HomeFollower(control, robot=self._robot, lidar=self._lidar, step_s=self._step_s)
+
+    def _choose_home(self, belief: Belief) -> Goal | None:
+        """Return the start as the goal: the way to it, or as near to it as the map allows."""
+        patience = self.config.patience
+        trouble = self._note(_HOME[:2])
+        if trouble.looks and not self._end:
+            if self._is_home(belief):
+                self._end = "returned"
+            else:
+                # The map lets it no nearer: that was an attempt, and what stands in the way is looked at anew.
+                trouble.looks = 0
+                trouble.failures += 1
+                self._target = None
+                self._recover_until = self._time + patience.recover_s
+        if trouble.failures >= patience.attempts:
+            self._end = "stuck"
+        if self._end:
+            self._target = None
+            self._status = self._end
+            return None
+        path, cost = self._way_home(belief)
+        if self._target is None:
+            self._deadline = self._time + 10.0 + cost / patience.slowest_m_s
+            self._arrived_for = 0.0
+        self._target = _HOME[:2].copy()
+        self._status = "returning"
+        return Goal(pose=np.array([*path[-1], _HOME[2]]), path=path)
+
+    def _way_home(self, belief: Belief) -> tuple[Array, float]:
+        """Return the path ``(n, 2)`` [m] to the start, or to the reachable place nearest to it, and its cost."""
+        cost_map = cost_maps.build(belief, self.config.planner, self._robot)
+        travel = travel_costs(cost_map)
+        reached = np.argwhere(np.isfinite(travel.cost))
+        away = np.hypot(*(cost_map.to_points(reached) - _HOME[:2]).T)
+        nearest = int(np.argmin(away))
+        cell = (int(reached[nearest, 0]), int(reached[nearest, 1]))
+        spacing = self.config.planner.path_spacing_m
+        path = shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
+        if away[nearest] <= max(self._homing.last_leg_m, cost_map.resolution):
+            # The start itself for the centre of the cell. Where that cell is not the start's own, the robot has
+            # stood there all the same, and the follower's safety check keeps it off the walls.
+            path = np.vstack([path[: max(len(path) - 1, 1)], _HOME[:2]])
+        return path, float(travel.cost[cell])
+
+    def _is_home(self, belief: Belief) -> bool:
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        near = float(np.hypot(*(pose[:2] - _HOME[:2]))) <= self._homing.arrived_m
+        return near and abs(geometry.wrap_scalar(pose[2] - _HOME[2])) <= self._homing.arrived_rad
+
+    # ---- driving -------------------------------------------------------------------------------------------
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action on the way to the goal, choosing a goal when one is due."""
+        action = super().act(observation, belief)
+        if self._returning and self._status == "driving":
+            self._status = "returning"
+        return action
+
+    def _is_frontier(self, belief: Belief, point: Array) -> bool:
+        # On the way back the goal is no frontier, and stays what it is whatever is seen.
+        return self._returning or super()._is_frontier(belief, point)
+
+
+class _HomeFollower(PathFollower):
+    """Ends with the start's heading, also where the sensor sees all round and would not need to turn."""
+
+    def set_path(self, path: Array, heading: float | None) -> None:
+        super().set_path(path, float(_HOME[2]))
+
+    def _wanted_heading(
+        self, pose: Array, near: LocalMap, at: float, room: Array
+    ) -> tuple[float | None, float | None]:
+        heading, tight_in = super()._wanted_heading(pose, near, at, room)
+        # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
+        return (self._heading if self.remaining_m < _TURN_WITHIN_M else heading), tight_in
