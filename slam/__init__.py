@@ -10,11 +10,12 @@ Nothing here knows of a simulator: the same backends run on the logs of real rob
 """
 
 from slam.registry import config_type, make, names
-from slam.types import CONCAVE, CONVEX, Belief, Observations, Odometry, Scan
+from slam.types import CONCAVE, CONVEX, LINE, Belief, Observations, Odometry, Scan
 
 __all__ = [
     "CONCAVE",
     "CONVEX",
+    "LINE",
     "Belief",
     "Observations",
     "Odometry",

@@ -173,10 +173,10 @@ def nearest_neighbour(
                 match[k] = IGNORED
         if only_sure and candidates > 1:
             match[k] = IGNORED
-    # Two observations cannot be one landmark: the farther gives way.
+    # Two observations cannot be one point: the farther gives way. Of a wall any number of pieces may be seen.
     for k in range(z.shape[0]):
         for j in range(k):
-            if match[k] >= 0 and match[k] == match[j]:
+            if match[k] >= 0 and match[k] == match[j] and z[k, 5] != LINE:
                 match[k if distance[k] >= distance[j] else j] = IGNORED
 
 
@@ -242,7 +242,7 @@ def joint_compatibility(
         option[k] += 1
         if o < count[k]:
             i = candidate[k, o]
-            if np.any(landmark[:pairs] == i):
+            if z[k, 5] != LINE and np.any(landmark[:pairs] == i):
                 continue
             landmark[pairs] = i
             _extend(x, p, offset, z[k], landmark, pairs, h, factor, y)

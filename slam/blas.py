@@ -37,7 +37,7 @@ def _dgemm() -> Callable[..., None]:
 def rank_k_downdate(p: Array, n: int, w: Array, rows: int) -> None:
     """Subtract Wᵀ W, W = w[:rows, :n], from the upper triangle of p[:n, :n], both C-ordered.
 
-    By blocks of rows, from the diagonal to the right; p is undefined after in a block's part of the lower triangle.
+    By blocks of rows, from the diagonal to the right: p's lower triangle is undefined after.
     """
     dgemm = _dgemm()
     length, height, depth = ctypes.c_int(), ctypes.c_int(), ctypes.c_int(rows)

@@ -159,7 +159,8 @@ class FeatureExtractor:
 
         A wall is a surface long enough to be a landmark: a row of kind LINE with distance and bearing of its foot,
         and in the last two columns from where to where it was seen. A corner says about the walls that make it
-        only what they do not say themselves: nothing where two of them meet, and at a wall's end the place along it.
+        only what they do not say themselves: nothing where two of them meet, and at a wall's end the place along
+        it.
         """
         c = self.config
         count = _walls_first(

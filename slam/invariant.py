@@ -54,8 +54,8 @@ class InvariantEkfSlam(EkfSlam):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def invariant_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array, w: Array,
-    s: Array, shift: Array, subtract: bool,
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array,
+    w: Array, s: Array, shift: Array, subtract: bool,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 

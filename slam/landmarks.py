@@ -217,7 +217,7 @@ def _review(
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         turn = wrap_scalar(x[2] + z[k, 6])
         if z[k, KIND] == LINE:
-            # The middle of the piece that is seen stands for it; another piece of the same wall counts as seen, too.
+            # The middle of the piece that is seen stands for it; another piece of the same wall counts, too.
             middle = 0.5 * (z[k, 8] + z[k, 9])
             px, py = px - middle * math.sin(bearing), py + middle * math.cos(bearing)
         nearest, best = -1, gate * gate
@@ -244,6 +244,8 @@ def _review(
             t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
         # Compared with where it was first seen: what wanders with the robot never settles.
         t = tentative[nearest]
+        if t[_AGE] == np.inf:  # this very scan has made it a landmark, by another piece of the wall
+            continue
         t[_T_DIRECTION] = turn
         t[_COUNT] += 1.0
         t[_AGE] = 0.0
@@ -252,7 +254,7 @@ def _review(
         if settled or (z[k, EDGE] == 0.0 and t[_COUNT] >= confirm_after):
             new[found] = k
             found += 1
-            t[_AGE] = forget_after + 1.0
+            t[_AGE] = np.inf
     kept = 0
     for i in range(n):
         if tentative[i, _AGE] <= forget_after:

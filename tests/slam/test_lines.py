@@ -1,0 +1,197 @@
+"""Walls as landmarks: extraction, Jacobians, the filters over them, and their extents."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import slam
+from slam import LINE
+from slam.association import line_blocks
+from slam.features import FeatureExtractor
+from slam.geometry import compose, inverse, wrap
+from slam.invariant import invariant_update
+from slam.joint_gaussian import add_landmark, stacked_update
+from tests.slam.numerics import numerical_jacobian, random_covariance
+from tests.slam.simulated import circle_twist, drive, room_scan
+
+OFFSET = 0.2
+J = np.array([[0.0, -1.0], [1.0, 0.0]])
+seeds = st.integers(0, 10_000)
+
+
+def n_of(alpha: float) -> np.ndarray:
+    return np.array([math.cos(alpha), math.sin(alpha)])
+
+
+def predicted(v: np.ndarray, i: int = 0) -> np.ndarray:
+    """Distance and bearing of line ``i`` of a state, from the geometry."""
+    sensor = v[:2] + OFFSET * n_of(v[2])
+    alpha, r = v[3 + 2 * i : 5 + 2 * i]
+    return np.array([r - n_of(alpha) @ sensor, float(wrap(alpha - v[2]))])
+
+
+def observation(rng: np.random.Generator, distance: float, bearing: float) -> np.ndarray:
+    z = np.zeros(10)
+    noise = 1e-3 * random_covariance(2, rng)
+    z[:5] = distance, bearing, noise[0, 0], noise[0, 1], noise[1, 1]
+    z[5], z[6], z[8], z[9] = LINE, bearing, -1.0, 1.0
+    return z
+
+
+@given(seeds)
+def test_line_jacobian_against_finite_differences(seed: int) -> None:
+    x = np.random.default_rng(seed).uniform(-3, 3, 5)
+    h = np.zeros((2, 5))
+    np.testing.assert_allclose(line_blocks(x, 0, OFFSET, h), predicted(x), atol=1e-12)
+    np.testing.assert_allclose(h, numerical_jacobian(predicted, x, angle=1), atol=1e-5)
+
+
+@given(seeds, st.integers(0, 3))
+def test_adding_a_line_propagates_pose_and_noise(seed: int, landmarks: int) -> None:
+    rng = np.random.default_rng(seed)
+    n = 3 + 2 * landmarks
+    x, p = rng.uniform(-3, 3, n), random_covariance(n, rng)
+    z = observation(rng, rng.uniform(0.5, 6), rng.uniform(-3, 3))
+
+    def place(v: np.ndarray) -> np.ndarray:
+        """From pose and observation (distance, bearing) to α, r."""
+        alpha = v[2] + v[4]
+        return np.array([float(wrap(alpha)), v[3] + n_of(alpha) @ (v[:2] + OFFSET * n_of(v[2]))])
+
+    jacobian = numerical_jacobian(place, np.concatenate([x[:3], z[:2]]), angle=0)
+    g = np.zeros((2, n))
+    g[:, :3] = jacobian[:, :3]
+    want = np.zeros((n + 2, n + 2))
+    want[:n, :n] = p
+    want[:n, n:] = p @ g.T
+    r = np.array([[z[2], z[3]], [z[3], z[4]]])
+    want[n:, n:] = g @ p @ g.T + jacobian[:, 3:] @ r @ jacobian[:, 3:].T
+    state, upper = np.zeros(n + 2), np.zeros((n + 2, n + 2))
+    state[:n], upper[:n, :n] = x, np.triu(p)
+    add_landmark(state, upper, n, z, OFFSET)
+    np.testing.assert_allclose(predicted(state, landmarks), [z[0], float(wrap(z[1]))], atol=1e-9)
+    np.testing.assert_allclose(np.triu(upper), np.triu(want), atol=1e-5)
+
+
+def test_a_wall_s_covariance_is_the_noise_s() -> None:
+    """Distance and bearing of the four walls over 400 noisy scans from one place, normalised."""
+    rng = np.random.default_rng(1)
+    pose = np.array([2.0, 1.7, 0.4])
+    extractor = FeatureExtractor()
+    errors = []
+    for _ in range(400):
+        extractor.extract(room_scan(pose, rng))
+        rows = extractor.with_walls()
+        walls = rows[rows[:, 5] == LINE]
+        assert len(walls) >= 4  # more where noise, or the scan's beginning, cuts one in two
+        for row in walls:
+            side = [(6.0, 0.0), (5.0, math.pi / 2), (0.0, math.pi), (0.0, -math.pi / 2)]
+            turned = float(wrap(row[1] + pose[2]))
+            r, alpha = min(side, key=lambda s: abs(float(wrap(s[1] - turned))))
+            e = np.array([row[0] - (r - n_of(alpha) @ pose[:2]), float(wrap(turned - alpha))])
+            cov = np.array([[row[2], row[3]], [row[3], row[4]]]) - np.diag([0.001**2, 0.0005**2])
+            errors.append(e @ np.linalg.solve(cov, e))
+    assert np.mean(errors) / 2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_wall_s_end_keeps_what_the_wall_does_not_say() -> None:
+    """The visible end of a wall: its covariance across the wall grows, along it it stays."""
+    angles = -math.pi + 2 * math.pi / 360 * np.arange(360)
+    x, half = 2.0, 1.5  # a wall at x = 2 from y = −1.5 to 1.5, nothing else
+    with np.errstate(divide="ignore"):
+        reach = np.where(np.cos(angles) > 1e-9, x / np.cos(angles), np.inf)
+    ranges = np.where(np.abs(reach * np.sin(angles)) <= half, reach, np.inf)
+    scan = slam.Scan(ranges, angle_min=-math.pi, angle_increment=2 * math.pi / 360, range_max=8.0)
+    extractor = FeatureExtractor()
+    ends = extractor.extract(scan).copy()
+    rows = extractor.with_walls()
+    assert len(ends) == 2 and len(rows) == 3
+    for before, after in zip(ends, rows[1:], strict=True):
+        to_polar = np.array([n_of(before[1]), J @ n_of(before[1]) / before[0]])
+        cov = [
+            np.linalg.inv(to_polar) @ np.array([[z[2], z[3]], [z[3], z[4]]]) @ np.linalg.inv(to_polar).T
+            for z in (before, after)
+        ]
+        added = cov[1] - cov[0]
+        np.testing.assert_allclose(added, [[0.02**2, 0.0], [0.0, 0.0]], atol=1e-6)  # the wall's normal is x
+
+
+@pytest.mark.parametrize("name", ["ekf-lines", "invariant-ekf"])
+def test_a_room_s_walls_are_mapped_and_hold_the_pose(name: str) -> None:
+    rng = np.random.default_rng(7)
+    backend = slam.make(name, config={"lines": True, "odometry": {"slip_share": 0.0}})
+    start = pose = np.array([2.0, 2.0, 0.3])
+    backend.reset()
+    for k in range(80):
+        backend.update(room_scan(compose(pose, np.array([OFFSET, 0, 0])), rng))
+        pose, odometry = drive(pose, circle_twist(k), (0.01, 0.02), rng)
+        backend.predict(odometry)
+    belief = backend.belief
+    assert len(belief.lines) == 4 and len(belief.landmarks) == 0
+    assert belief.joint_cov is not None and belief.joint_cov.shape == (3, 3)
+    error = compose(inverse(start), pose) - belief.pose
+    assert np.hypot(*error[:2]) < 0.02
+    assert abs(float(wrap(error[2]))) < 0.01
+    ends = np.vstack([belief.line_ends[:, :2], belief.line_ends[:, 2:]])
+    world = ends @ np.array([[math.cos(0.3), math.sin(0.3)], [-math.sin(0.3), math.cos(0.3)]]) + start[:2]
+    for corner in ([0, 0], [6, 0], [6, 5], [0, 5]):  # each wall reaches from corner to corner
+        assert np.sort(np.hypot(*(world - corner).T))[1] < 0.15
+
+
+def state_with_lines(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pose, a point, two lines; an observation of each."""
+    rng = np.random.default_rng(seed)
+    x = np.concatenate([rng.uniform(-3, 3, 3), rng.uniform(3, 6, 2), [0.4, 8.0], [-2.0, 9.0]])
+    z = np.array([observation(rng, rng.uniform(3, 8), rng.uniform(-3, 3)) for _ in range(3)])
+    z[0, 5] = 0.0
+    marks = np.zeros((3, 8))
+    marks[1:, 0] = LINE
+    return x, 0.01 * random_covariance(9, rng), z, marks
+
+
+def transform(x: np.ndarray) -> np.ndarray:
+    """T(x) of invariant-ekf.md with a point and two lines: invariant error coordinates to ordinary ones."""
+    out = np.eye(9)
+    out[:2, 2], out[3:5, 2] = J @ x[:2], J @ x[3:5]
+    for i in (5, 7):
+        out[i + 1, :2] = n_of(x[i])
+    return out
+
+
+@given(seeds)
+def test_invariant_update_of_lines_is_gain_retraction_and_reset(seed: int) -> None:
+    x, p, z, marks = state_with_lines(seed)
+    work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
+    plain_x, plain_p = x.copy(), np.triu(p)
+    stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work, True)
+    plain_p = plain_p + np.triu(plain_p, 1).T
+    got_x, got_p = x.copy(), np.triu(p)
+    invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros((7, 9)), True)
+    got_p = got_p + np.triu(got_p, 1).T
+    np.testing.assert_allclose(got_x[6::2], plain_x[6::2], atol=1e-12)  # r is added to
+    np.testing.assert_allclose(wrap(got_x[5::2] - plain_x[5::2]), 0.0, atol=1e-12)
+    gamma = transform(got_x) @ np.linalg.inv(transform(x))
+    np.testing.assert_allclose(got_p, gamma @ plain_p @ gamma.T, atol=1e-9)
+
+
+def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
+    """The trap that invariant-ekf.md names: otherwise a line drifts by −½ t² nᵀ p each time."""
+    x = np.array([30.0, -20.0, 0.1, 5.0, 5.0, 0.3, 25.0])
+    p = np.diag([1e-12, 1e-12, 0.04, 1e-12, 1e-12, 1e-12, 1e-12])
+    marks = np.zeros((2, 8))
+    marks[1, 0] = LINE
+    z = np.zeros((1, 10))
+    z[0, :7] = *predicted(x, 1), 1e-4, 0.0, 1e-6, LINE, 0.0
+    z[0, 1] -= 0.3  # the line is seen turned: it is the heading that is wrong
+    z[0, 2] = 1e6
+    got, cov = x.copy(), p.copy()
+    work = [np.zeros((64, 2, 5)), np.zeros((130, 7)), np.zeros((128, 129)), np.zeros((7, 7))]
+    invariant_update(got, cov, 7, z, np.array([1]), OFFSET, marks, *work, True)
+    assert got[2] == pytest.approx(0.4, abs=1e-3)
+    np.testing.assert_allclose(got[5:], x[5:], atol=1e-9)
+    np.testing.assert_allclose(got[:2], x[:2], atol=1e-9)
