@@ -19,20 +19,19 @@ _PERSISTENCE = 10.0
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
 
-    Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, the
-    mean of the slip, uniform within their bounds). Four wheels average into vx and vy with weight 1/4 each,
-    and into ω with 1/(4l).
+    Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
+    within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
+    weight 1/4 each, and into ω with 1/(4l). ``python -m training.calibrate`` measures V on the simulated robot.
     """
     white = noise.encoder**2 + noise.slip**2 / 3.0
     lasting = _PERSISTENCE * (noise.radius_error**2 / 3.0)
     per_wheel = math.sqrt((white + lasting) / 4.0)
-    # The mean share that slip takes away is a bias along the motion; base errors are one in the turn rate.
-    bias_v = noise.slip * math.sqrt(_PERSISTENCE)
-    bias_w = math.hypot(bias_v, noise.base_error * math.sqrt(_PERSISTENCE / 3.0))
+    # A wrong lever is a bias in the turn rate, which on average has a third of the wheels' squared speed.
+    base = noise.base_error * math.sqrt(_PERSISTENCE / 9.0)
     return OdometryNoise(
         lever_m=robot.lever_m,
-        speed_share=math.hypot(per_wheel, bias_v),
-        turn_share_rad_m=math.hypot(per_wheel, bias_w) / robot.lever_m,
+        speed_share=per_wheel,
+        turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
     )
 
 

@@ -314,7 +314,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         known_before, map_entropy_before, pose_entropy_before = self._before
         self._remember()
         known, map_entropy, pose_entropy = self._before
-        cell = self.backend.grid.resolution ** 2
+        cell = self.backend.grid.resolution**2
         vx, vy, omega = np.asarray(self._odometry.twist).tolist()
         robot = self.config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s

@@ -121,7 +121,8 @@ class Lidar:
 class WheelEncoders:
     """Encoders on the four wheels, and the systematic errors of the robot they are mounted on.
 
-    Odometry is reckoned with the nominal wheel radius and lever. The true ones differ, each wheel's radius and
+    Odometry is reckoned with the nominal wheel radius and lever, less the mean share that is lost to slip, as one
+    who has calibrated it would. The true ones differ, each wheel's radius and
     the lever by a relative error drawn uniformly when this is built: once an episode.
 
     Parameters
@@ -163,17 +164,19 @@ class WheelEncoders:
         """
         increments = np.asarray(wheel_increments, dtype=np.float64)
         twist = np.empty(3)
-        _read_encoders(self._forward, increments, rng.standard_normal(4), self.noise.encoder, dt, twist)
+        noise = self.noise
+        gain = (1.0 - noise.slip) / dt
+        _read_encoders(self._forward, increments, rng.standard_normal(4), noise.encoder, gain, twist)
         return Odometry(twist, dt)
 
 
 @njit(cache=True, nogil=True)
 def _read_encoders(
-    forward: Array, increments: Array, normals: Array, sigma: float, dt: float, twist: Array
+    forward: Array, increments: Array, normals: Array, sigma: float, gain: float, twist: Array
 ) -> None:
-    """Write forward · increments (1 + σ normals) / dt."""
+    """Write gain · forward · increments (1 + σ normals)."""
     for i in range(3):
         total = 0.0
         for k in range(4):
             total += forward[i, k] * (increments[k] * (1.0 + sigma * normals[k]))
-        twist[i] = total / dt
+        twist[i] = gain * total

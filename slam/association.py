@@ -22,6 +22,7 @@ __all__ = [
     "line_blocks",
     "nearest_neighbour",
     "predicted",
+    "refuse_unlikely",
 ]
 
 Array = NDArray[np.float64]
@@ -93,6 +94,16 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
     dr, db = z[0] - rho, wrap_scalar(z[1] - bearing)
     det = s00 * s11 - s01 * s01
     return float((s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def refuse_unlikely(
+    x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64], h: Array
+) -> None:
+    """Set to IGNORED the matches, given from outside, that lie beyond a squared Mahalanobis distance."""
+    for k in range(z.shape[0]):
+        if match[k] >= 0 and _gate(x, p, match[k], offset, z[k], h) > gate:
+            match[k] = IGNORED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.association import joint_compatibility, nearest_neighbour
+from slam.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
 from slam.backend import Backend, BackendConfig
 from slam.blas import rank_k_downdate
 from slam.chi_square import chi2_quantile
@@ -46,13 +46,14 @@ class EkfConfig(BackendConfig):
 
     association: str = "nearest"  # or "individual", "joint": see ASSOCIATIONS
     gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
+    known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
     max_turn_deg: float = 35.0  # difference in a corner's direction
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.gate > 0, "EkfConfig.gate must be > 0")
+        require(self.gate > 0 and self.known_gate > 0, "EkfConfig.gate and known_gate must be > 0")
         if self.association not in ASSOCIATIONS:
             raise unknown_name("EkfConfig.association", self.association, ASSOCIATIONS)
 
@@ -122,7 +123,10 @@ class EkfSlam(Backend):
         return (self.extractor.with_walls() if self.config.lines else corners)[:_MAX_OBSERVATIONS]
 
     def observe(self, observations: Observations) -> None:
-        """Correct by landmark observations without a scan; known ids are believed, and new ones added."""
+        """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``).
+
+        New ids are added at once; without ids, landmarks are confirmed as with scans.
+        """
         rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
         cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
         if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
@@ -138,8 +142,13 @@ class EkfSlam(Backend):
                 continue
             ids = np.asarray(observations.ids)[begin : begin + _MAX_OBSERVATIONS]
             match = np.array([self._book.row(int(i)) for i in ids], np.int64)
+            if self.config.known_gate < math.inf:
+                refuse_unlikely(
+                    self._x, self._p, self.config.lidar_offset_m, part, self.config.known_gate, match, self._h[0]
+                )
             self._correct(part, match)
-            for k in np.flatnonzero(match < 0):
+            self._book.count_sightings(match)
+            for k in np.flatnonzero(match == UNMATCHED):
                 if self._book.row(int(ids[k])) < 0:  # not added by this very call
                     self._add(part[k], int(ids[k]))
 

@@ -149,31 +149,32 @@ def _cholesky_solve(s: Array, rows: int, column: int, w: Array, n: int) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def downdate(p: Array, n: int, w: Array, rows: int) -> None:
-    """Subtract Wᵀ W from the upper triangle of p; two spare rows of w may be overwritten.
+    """Subtract Wᵀ W from the upper triangle of p; two spare rows of w may be overwritten. ``rows`` is even.
 
-    Two rows of p and four of W at a time, to spare memory traffic; the rows are sliced first, without which
-    the inner loop does not vectorise and takes three times as long.
+    Four rows of p and four of W at a time, to spare memory traffic; the rows are sliced first, without which the
+    inner loop does not vectorise and takes three times as long. The lower triangle is undefined after.
     """
     if rows % 4 != 0:
         w[rows : rows + 2, :n] = 0.0
-    for i in range(0, n - 1, 2):
-        diagonal = 0.0
-        for k in range(rows):
-            diagonal += w[k, i] * w[k, i]
-        p[i, i] -= diagonal
-        upper, lower = p[i, i + 1 : n], p[i + 1, i + 1 : n]
+    whole = n - n % 4
+    for i in range(0, whole, 4):
+        p0, p1, p2, p3 = p[i, i:n], p[i + 1, i:n], p[i + 2, i:n], p[i + 3, i:n]
         for k in range(0, rows, 4):
             a0, a1, a2, a3 = w[k, i], w[k + 1, i], w[k + 2, i], w[k + 3, i]
             b0, b1, b2, b3 = w[k, i + 1], w[k + 1, i + 1], w[k + 2, i + 1], w[k + 3, i + 1]
-            w0, w1, w2, w3 = w[k, i + 1 : n], w[k + 1, i + 1 : n], w[k + 2, i + 1 : n], w[k + 3, i + 1 : n]
-            for j in range(upper.shape[0]):
-                c0, c1, c2, c3 = w0[j], w1[j], w2[j], w3[j]
-                upper[j] -= a0 * c0 + a1 * c1 + (a2 * c2 + a3 * c3)
-                lower[j] -= b0 * c0 + b1 * c1 + (b2 * c2 + b3 * c3)
-    # n is odd: three for the robot, two a landmark.
-    last = n - 1
-    for k in range(rows):
-        p[last, last] -= w[k, last] * w[k, last]
+            c0, c1, c2, c3 = w[k, i + 2], w[k + 1, i + 2], w[k + 2, i + 2], w[k + 3, i + 2]
+            d0, d1, d2, d3 = w[k, i + 3], w[k + 1, i + 3], w[k + 2, i + 3], w[k + 3, i + 3]
+            w0, w1, w2, w3 = w[k, i:n], w[k + 1, i:n], w[k + 2, i:n], w[k + 3, i:n]
+            for j in range(p0.shape[0]):
+                x0, x1, x2, x3 = w0[j], w1[j], w2[j], w3[j]
+                p0[j] -= a0 * x0 + a1 * x1 + (a2 * x2 + a3 * x3)
+                p1[j] -= b0 * x0 + b1 * x1 + (b2 * x2 + b3 * x3)
+                p2[j] -= c0 * x0 + c1 * x1 + (c2 * x2 + c3 * x3)
+                p3[j] -= d0 * x0 + d1 * x1 + (d2 * x2 + d3 * x3)
+    for i in range(whole, n):
+        for j in range(i, n):
+            for k in range(rows):
+                p[i, j] -= w[k, i] * w[k, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -136,6 +136,13 @@ class LandmarkBook:
         marks = self._marks[: self.count]
         return np.flatnonzero((marks[:, _LAST_SEEN] == self._now) & (marks[:, _KIND] != LINE))
 
+    def count_sightings(self, match: NDArray[np.int64]) -> None:
+        """Count an update in which these rows (negative: none) were seen, all of them known from outside."""
+        self._now += 1
+        seen = match[match >= 0]
+        self._marks[seen, _SEEN] += 1.0
+        self._marks[seen, _LAST_SEEN] = self._now
+
     def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
         """Count sightings; return which observations are new landmarks by now.
 

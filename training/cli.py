@@ -193,6 +193,119 @@ def speed(
     run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json, peer=peer)
 
 
+@app.command()
+def consistency(
+    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
+    rooms: Annotated[
+        str, typer.Option(help="A world of landmarks (circle, room), or a generator of rooms.")
+    ] = "circle",
+    runs: Annotated[int, typer.Option(min=1, max=10_000, help="Monte-Carlo runs of each backend.")] = 50,
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Of a run.  [default: the world's, or at most 3000]")
+    ] = None,
+    noise: Annotated[float, typer.Option(help="Times the noise, told to the backends.")] = 1.0,
+    seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/consistency"),
+    as_json: Json = False,
+) -> None:
+    """Ask whether errors are as large as the covariances say: NEES and NIS over Monte-Carlo runs.
+
+    Writes into --out: consistency.json, consistency.png and each run as it comes, so that the same command goes
+    on where it was broken off, and more runs or backends are added to those that are there.
+
+    \b
+    Examples:
+      mecanum consistency
+      mecanum consistency --slam ekf,odometry --rooms circle --runs 50 --out out/circle
+      mecanum consistency --rooms rectangular --noise 3 --runs 20 --workers 2 --out out/rectangular --json
+    """  # noqa: D301
+    from training.consistency import Plan, table
+    from training.consistency import consistency as measure
+
+    plan = Plan.parse(slam=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0)
+    result = measure(plan, out=out, workers=workers or os.cpu_count() or 1)
+    print(json.dumps(result) if as_json else table(result))
+
+
+@app.command()
+def complexity(
+    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
+    landmarks: Annotated[
+        str, typer.Option(help="Sizes of the map, separated by commas.")
+    ] = "25,50,100,200,400,800",
+    steps: Annotated[int, typer.Option(min=10, max=100_000, help="Steps that a median is taken of.")] = 100,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/complexity"),
+    as_json: Json = False,
+) -> None:
+    """Measure the time per step against the number of landmarks in the map.
+
+    A step is a prediction and ten observations of known landmarks. Writes into --out: complexity.json,
+    complexity.png and each point as it comes, so that the same command goes on where it was broken off.
+
+    \b
+    Examples:
+      mecanum complexity
+      mecanum complexity --slam ekf,odometry --landmarks 25,50,100 --out out/complexity --json
+    """  # noqa: D301
+    from training.complexity import Plan, table
+    from training.complexity import complexity as measure
+
+    result = measure(Plan.parse(slam=slam, landmarks=landmarks, steps=steps), out=out)
+    print(json.dumps(result) if as_json else table(result))
+
+
+@app.command()
+def replay(
+    log: Annotated[
+        Path,
+        typer.Argument(metavar="LOG", help="UTIAS: Robot1_Odometry.dat[.gz] or folder. Victoria Park: folder."),
+    ],
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
+    association: Annotated[
+        str | None, typer.Option(help="known or unknown landmark ids.  [default: known where the log has them]")
+    ] = None,
+    robot: Annotated[int | None, typer.Option(min=1, help="Which robot of a UTIAS folder.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
+    ] = None,
+    limit_s: Annotated[float | None, typer.Option(help="Stop after so many seconds of the log.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/replay"),
+    as_json: Json = False,
+) -> None:
+    """Run a SLAM backend on the recorded log of a real robot, and compare it with the log's reference.
+
+    Writes into --out: trajectory_estimate.tum, trajectory_true.tum, trajectory.png, landmarks.db (SQLite),
+    landmarks.csv, config.toml and metrics.json. Ctrl-C ends the replay and keeps it as far as it came.
+
+    \b
+    Examples:
+      mecanum replay utias6/Robot1_Odometry.dat.gz --slam ekf --out out/utias1
+      mecanum replay utias6 --robot 3 --association unknown --json
+      mecanum replay victoria_park --slam ekf --limit-s 300 --out out/park
+    """  # noqa: D301
+    from training import replay as task
+    from training import replay_report
+
+    options = task.ReplayOptions(
+        log=log, out=out, robot=robot, slam=slam, association=association, seed=seed, limit_s=limit_s,
+        config=config,
+    )  # fmt: skip
+    prepared = task.prepare(options)
+    progress = task.Progress(prepared.log.duration_s)
+    try:
+        task.run(prepared, progress)
+    finally:
+        progress.close()
+    metrics = replay_report.write(prepared)
+    print(json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out))
+    if prepared.interrupted:
+        raise Interrupted(f"interrupted after {metrics['duration_s']:.1f} s of the log; what was done is in {out}")
+
+
 # ---- running it ------------------------------------------------------------------------------------------------
 
 

@@ -6,16 +6,17 @@ import itertools
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import slam
-from slam import Odometry
+from slam import Observations, Odometry
 from slam.association import IGNORED, innovation_blocks, joint_compatibility, nearest_neighbour
 from slam.chi_square import chi2_quantile
 from slam.geometry import compose, inverse, wrap
 from tests.slam.numerics import random_covariance
-from tests.slam.simulated import circle_twist, drive, room_scan
+from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
 OFFSET = 0.2
 GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, 65)])
@@ -118,3 +119,23 @@ def test_a_changed_view_is_not_taken_for_wheels_that_spin() -> None:
         assert abs(float(wrap(error[2]))) < 0.02
         pose, odometry = drive(pose, circle_twist(k), (0.01, 0.02), rng)
         backend.predict(Odometry(odometry.twist, odometry.dt))
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant-ekf"])
+def test_a_misread_label_is_refused_where_there_is_a_gate(name: str) -> None:
+    """Two landmarks known well; then one is reported in the place of the other."""
+    noise = np.diag([1e-4, 1e-5])
+    errors = {}
+    for gate in (math.inf, 18.4):
+        backend = slam.make(name, config={"known_gate": gate})
+        backend.reset()
+        places = np.array([[3.0, 1.0], [2.0, -2.0]])
+        seen = observe_landmarks(np.zeros(3), places, OFFSET, noise, np.random.default_rng(0))
+        for _ in range(5):
+            backend.observe(seen)
+        wrong = Observations(seen.range_bearing[:1], seen.cov[:1], np.array([1]))
+        backend.observe(wrong)
+        assert backend.landmark_count == 2
+        assert backend.landmark_details()[0].tolist() == ([6 - 1, 6] if gate == math.inf else [5, 5])
+        errors[gate] = float(np.hypot(*(backend.belief.landmarks[1] - places[1])))
+    assert errors[18.4] < 0.02 < 0.1 < errors[math.inf]

@@ -88,7 +88,6 @@ def test_a_wall_s_covariance_is_the_noise_s() -> None:
         extractor.extract(room_scan(pose, rng))
         rows = extractor.with_walls()
         walls = rows[rows[:, 5] == LINE]
-        assert len(walls) >= 4  # more where noise, or the scan's beginning, cuts one in two
         for row in walls:
             side = [(6.0, 0.0), (5.0, math.pi / 2), (0.0, math.pi), (0.0, -math.pi / 2)]
             turned = float(wrap(row[1] + pose[2]))
@@ -96,6 +95,7 @@ def test_a_wall_s_covariance_is_the_noise_s() -> None:
             e = np.array([row[0] - (r - n_of(alpha) @ pose[:2]), float(wrap(turned - alpha))])
             cov = np.array([[row[2], row[3]], [row[3], row[4]]]) - np.diag([0.001**2, 0.0005**2])
             errors.append(e @ np.linalg.solve(cov, e))
+    assert len(errors) > 4 * 390  # now and then noise makes one look curved, or cuts one in two
     assert np.mean(errors) / 2 == pytest.approx(1.0, abs=0.15)
 
 
@@ -169,10 +169,10 @@ def test_invariant_update_of_lines_is_gain_retraction_and_reset(seed: int) -> No
     work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
     plain_x, plain_p = x.copy(), np.triu(p)
     stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work, True)
-    plain_p = plain_p + np.triu(plain_p, 1).T
+    plain_p = np.triu(plain_p) + np.triu(plain_p, 1).T
     got_x, got_p = x.copy(), np.triu(p)
     invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros((7, 9)), True)
-    got_p = got_p + np.triu(got_p, 1).T
+    got_p = np.triu(got_p) + np.triu(got_p, 1).T
     np.testing.assert_allclose(got_x[6::2], plain_x[6::2], atol=1e-12)  # r is added to
     np.testing.assert_allclose(wrap(got_x[5::2] - plain_x[5::2]), 0.0, atol=1e-12)
     gamma = transform(got_x) @ np.linalg.inv(transform(x))

@@ -34,7 +34,14 @@ def explore_refused(argv: list[str], capsys: pytest.CaptureFixture[str], out: Pa
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["explor"], ["unknown command 'explor'", "did you mean explore?", "valid: explore, rooms, speed"]),
+        (
+            ["explor"],
+            [
+                "unknown command 'explor'",
+                "did you mean explore?",
+                "valid: complexity, consistency, explore, replay, rooms, speed",
+            ],
+        ),
         (["--sed", "3"], ["unknown option --sed", "--version"]),
         (["explore", "--agnt", "x"], ["unknown option --agnt", "did you mean --agent?", "--coverage-target"]),
         (["explore", "--seed", "x"], ["--seed", "integer"]),

@@ -1,0 +1,190 @@
+"""A recorded log in memory: what the robot sensed, in time order, and what is known of where it really was."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import wrap
+from slam.settings import require
+from slam.types import Observations, Odometry
+
+__all__ = ["Event", "ObservationNoise", "RecordedLog", "group_by_time", "split_holds"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationNoise:
+    """Standard deviations of a landmark observation, independent of each other."""
+
+    range_m: float
+    range_share: float = 0.0  # of the range, added to ``range_m``
+    bearing_deg: float
+
+    def __post_init__(self) -> None:
+        for name in ("range_m", "bearing_deg"):
+            value = getattr(self, name)
+            require(value > 0 and math.isfinite(value), f"ObservationNoise.{name} must be > 0 and finite")
+        require(0 <= self.range_share < math.inf, "ObservationNoise.range_share must be ≥ 0 and finite")
+
+    def cov(self, range_bearing: Array) -> Array:
+        """Return the covariances ``(m, 2, 2)`` of observations ``(m, 2)`` [m², m·rad, rad²]."""
+        out = np.zeros((len(range_bearing), 2, 2))
+        out[:, 0, 0] = (self.range_m + self.range_share * range_bearing[:, 0]) ** 2
+        out[:, 1, 1] = math.radians(self.bearing_deg) ** 2
+        return out
+
+
+class Event(NamedTuple):
+    """One step of a replay: move on by ``odometry``, then correct by ``observations`` where there are any."""
+
+    time_s: float  # at its end, since the start of the log
+    odometry: Odometry
+    observations: Observations | None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RecordedLog:
+    """Odometry and landmark observations of a real robot, with a reference where one was recorded.
+
+    Times are seconds since the first odometry; what was seen before it or after the last one is left out. The body
+    frame is that of the sensor: observations are made at its origin.
+    """
+
+    name: str
+    clock_start_s: float  # the recorder's own time of the start
+    odometry_times: Array  # (k ≥ 2,) [s] never falling, the first 0; a twist is held from its time to the next
+    twists: Array  # (k, 3) vx, vy [m/s], ω [rad/s] in the body frame
+    observation_times: Array  # (m,) [s] rising; one entry a set
+    observation_ends: NDArray[np.int64]  # (m,) set i is the rows from the end of set i - 1 to here
+    range_bearing: Array  # (o, 2) [m, rad] in the body frame
+    ids: NDArray[np.int64] | None  # (o,) where landmarks were told apart as they were seen
+    reference_times: Array  # (r,) [s] rising; only where the reference is valid
+    reference_poses: Array  # (r, 3) [m, m, rad] of the body frame; headings nan where not recorded
+    reference_gap_s: float  # the reference is interpolated between times no farther apart than this
+    landmark_ids: NDArray[np.int64] | None  # (l,) of the surveyed landmarks
+    landmarks: Array | None  # (l, 2) [m] in the reference's frame
+    start_pose: Array  # (3,) in the reference's frame, given to every backend
+    observation_noise: ObservationNoise
+    settings: Mapping[str, Any] = field(default_factory=dict)  # backend configuration for this log
+    note: str = ""  # what the reference is, and what of the comparison is given rather than estimated
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first odometry to the last [s]."""
+        return float(self.odometry_times[-1])
+
+    @property
+    def has_heading(self) -> bool:
+        """Whether the reference knows the heading."""
+        return len(self.reference_poses) > 0 and bool(np.isfinite(self.reference_poses[:, 2]).all())
+
+    def until(self, limit_s: float) -> RecordedLog:
+        """Return the log's beginning, as far as ``limit_s``."""
+        if limit_s >= self.duration_s:
+            return self
+        k = max(int(np.searchsorted(self.odometry_times, limit_s)), 1)
+        times = np.append(self.odometry_times[:k], limit_s)
+        m = int(np.searchsorted(self.observation_times, limit_s, side="right"))
+        r = int(np.searchsorted(self.reference_times, limit_s, side="right"))
+        rows = int(self.observation_ends[m - 1]) if m else 0
+        return replace(
+            self, odometry_times=times, twists=np.vstack([self.twists[:k], self.twists[k - 1 : k]]),
+            observation_times=self.observation_times[:m], observation_ends=self.observation_ends[:m],
+            range_bearing=self.range_bearing[:rows], ids=None if self.ids is None else self.ids[:rows],
+            reference_times=self.reference_times[:r], reference_poses=self.reference_poses[:r],
+        )  # fmt: skip
+
+    def events(self, noise: ObservationNoise | None = None, *, known: bool = True) -> Iterator[Event]:
+        """Yield the log in time order: at every odometry and every set of observations, one event.
+
+        Each moves on from the event before by the twist held then, so an observation between two odometry
+        stamps splits the interval; one at an odometry's own stamp belongs to the end of the interval before. A
+        step may have dt = 0 where there is something to observe at the start.
+
+        Parameters
+        ----------
+        noise : ObservationNoise, optional
+            Of the observations, instead of the log's own.
+        known : bool
+            Hand the ids on, where the log has them.
+        """
+        cov = (noise or self.observation_noise).cov(self.range_bearing)
+        ids = self.ids if known else None
+        seen, sets = 0, len(self.observation_times)
+        begin, now = 0, 0.0
+        twists = [tuple(row) for row in self.twists.tolist()]
+        for i, end in enumerate(self.odometry_times.tolist()):
+            # The first odometry has no interval before it, but may have observations at its stamp.
+            twist = twists[max(i - 1, 0)]
+            while seen < sets and self.observation_times[seen] <= end:
+                at, stop = float(self.observation_times[seen]), int(self.observation_ends[seen])
+                part = slice(begin, stop)
+                observations = Observations(
+                    range_bearing=self.range_bearing[part], cov=cov[part], ids=None if ids is None else ids[part]
+                )
+                yield Event(at, Odometry(twist, at - now), observations)
+                seen, begin, now = seen + 1, stop, at
+            if end > now:
+                yield Event(end, Odometry(twist, end - now), None)
+                now = end
+
+    def dead_reckoning(self) -> Array:
+        """Return the poses ``(k, 3)`` at the odometry's times by the odometry alone, from the start pose."""
+        dt = np.diff(self.odometry_times)
+        vx, vy, omega = self.twists[:-1].T
+        turned = self.start_pose[2] + np.append(0.0, np.cumsum(omega * dt))
+        middle = turned[:-1] + 0.5 * omega * dt  # slam.motion.move
+        c, s = np.cos(middle), np.sin(middle)
+        x = self.start_pose[0] + np.append(0.0, np.cumsum((c * vx - s * vy) * dt))
+        y = self.start_pose[1] + np.append(0.0, np.cumsum((s * vx + c * vy) * dt))
+        return np.column_stack([x, y, wrap(turned)])
+
+    def reference_at(self, time_s: float) -> Array | None:
+        """Return the reference pose ``(3,)`` at a time, or ``None`` where it has a gap there."""
+        times = self.reference_times
+        i = int(np.searchsorted(times, time_s, side="right")) - 1
+        if i < 0 or i >= len(times) or (i + 1 == len(times) and time_s > times[i]):
+            return None
+        if i + 1 == len(times) or times[i] == time_s:
+            return np.array(self.reference_poses[i])
+        span = times[i + 1] - times[i]
+        if span > self.reference_gap_s:
+            return None
+        step = self.reference_poses[i + 1] - self.reference_poses[i]
+        step[2] = wrap(step[2])
+        pose: Array = self.reference_poses[i] + (time_s - times[i]) / span * step
+        pose[2] = wrap(pose[2])
+        return pose
+
+
+def group_by_time(times: Array, begin: float, end: float) -> tuple[Array, NDArray[np.int64], slice]:
+    """Group observations ``(o,)`` in time order by equal times, those within [begin, end] only.
+
+    Returns
+    -------
+    times (m,) since ``begin``, where each set ends (m,), and the slice of the rows that are kept.
+    """
+    kept = slice(int(np.searchsorted(times, begin)), int(np.searchsorted(times, end, side="right")))
+    unique, counts = np.unique(times[kept], return_counts=True)
+    return unique - begin, np.cumsum(counts).astype(np.int64), kept
+
+
+def split_holds(times: Array, twists: Array, *, longest_s: float) -> tuple[Array, Array]:
+    """Split every interval longer than ``longest_s`` into equal parts, each with the twist held there.
+
+    V is the covariance of the twist of one step, so a walk of k equal steps gathers V dt² k: a twist held for a
+    second in one step would count as much noise as 2500 steps of 20 ms do.
+    """
+    dt = np.diff(times)
+    parts = np.maximum(np.ceil(dt / longest_s - 1e-9), 1).astype(np.int64)
+    source = np.repeat(np.arange(len(dt)), parts)
+    within = np.arange(len(source)) - np.repeat(np.cumsum(parts) - parts, parts)
+    split = times[source] + within / parts[source] * dt[source]
+    return np.append(split, times[-1]), np.vstack([twists[source], twists[-1:]])

@@ -1,0 +1,104 @@
+"""Tables of numbers in text files, plain or gzip, with errors that name the file and the line."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["check_times", "find", "read_table"]
+
+Array = NDArray[np.float64]
+
+_LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
+_GZIP = b"\x1f\x8b"
+
+
+def find(folder: Path, name: str) -> Path:
+    """Return ``folder/name`` or ``folder/name.gz``, whichever is there.
+
+    Raises
+    ------
+    ValueError
+        One line, where neither is.
+    """
+    for path in (folder / name, folder / f"{name}.gz"):
+        if path.is_file():
+            return path
+    raise ValueError(f"log {folder} lacks {name} (or {name}.gz); put it beside the others")
+
+
+def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, NDArray[np.int64]]:
+    """Read white-space separated numbers; empty lines and lines that begin with ``#`` are skipped.
+
+    Parameters
+    ----------
+    columns : int
+        Numbers a line.
+    meaning : str
+        What they are, for the error message.
+
+    Returns
+    -------
+    values (n ≥ 1, columns), finite; and the number of the line ``(n,)`` that each row came from.
+
+    Raises
+    ------
+    ValueError
+        One line: the file and line with a wrong number of columns, or something that is no finite number; or
+        that the file cannot be read or holds no row.
+    """
+    lines = _text(path).splitlines()
+    rows = [(number, line.split()) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
+    rows = [(number, words) for number, words in rows if words]
+    if not rows:
+        raise ValueError(f"{path} holds no data: expected lines of {meaning}")
+    for number, words in rows:
+        if len(words) != columns:
+            raise ValueError(f"{path}, line {number}: expected {columns} columns ({meaning}), got {len(words)}")
+    numbers = np.array([number for number, _ in rows], np.int64)
+    try:
+        values = np.array([[float(word) for word in words] for _, words in rows])
+    except ValueError:
+        values = np.array([[_number(word) for word in words] for _, words in rows])
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        number, words = rows[int(bad[0])]
+        word = next(w for w in words if not math.isfinite(_number(w)))
+        raise ValueError(f"{path}, line {number}: {word[:40]!r} is not a finite number ({meaning})")
+    return values, numbers
+
+
+def check_times(path: Path, times: Array, lines: NDArray[np.int64]) -> None:
+    """Raise ``ValueError`` with the file and line where a time lies before the one above it."""
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        i = int(back[0]) + 1
+        raise ValueError(f"{path}, line {lines[i]}: time {times[i]:.6g} is before {times[i - 1]:.6g} above it")
+
+
+def _number(word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
+
+
+def _text(path: Path) -> str:
+    try:
+        with open(path, "rb") as raw:
+            packed = raw.read(2) == _GZIP
+        # By its first bytes: a browser may have unpacked a file and left its name.
+        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
+            data = file.read(_LARGEST + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise ValueError(f"{path} is a damaged gzip file ({error}); fetch it again") from error
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
+    if len(data) > _LARGEST:
+        raise ValueError(f"{path} is larger than {_LARGEST >> 20} MiB: it is no such log")
+    return data.decode("utf-8", "replace")
