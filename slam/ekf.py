@@ -116,7 +116,8 @@ class EkfSlam(Backend):
             self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
         self._draw(scan)
-        self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
+        if self.key_scans.due():
+            self.key_scans.redraw_if_moved(self.grid, *self._map_points())
 
     def _observed(self, scan: Scan) -> Array:
         corners = self.extractor.extract(scan)
@@ -259,6 +260,10 @@ class EkfSlam(Backend):
         self._x, self._p = x, p
         self._w = np.zeros((2 * _MAX_OBSERVATIONS + 2, size))
 
+    def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
+        return self._points, self._book.row_of_id
+
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
         rows = self._book.just_seen()
         return self._book.ids[rows], self._points[rows]
@@ -327,13 +332,13 @@ class EkfSlam(Backend):
             joint_cov=joint,
             landmark_kinds=self._book.kinds()[rows],
             lines=self._points[lines],
-            line_ends=self._line_ends(lines),
+            line_ends=self._ends_of(self._points[lines], self._book.marks[lines, 6:8]),
         )
 
-    def _line_ends(self, rows: NDArray[np.int64]) -> Array:
-        """Return the ends ``(k, 4)`` of walls: as far as they were seen."""
-        alpha, r = self._points[rows].T
+    @staticmethod
+    def _ends_of(lines: Array, extent: Array) -> Array:
+        """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
+        alpha, r = lines.T
         n = np.column_stack([np.cos(alpha), np.sin(alpha)])
         along = np.column_stack([-n[:, 1], n[:, 0]])
-        extent = self._book.marks[rows, 6:8]
         return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

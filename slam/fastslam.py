@@ -128,7 +128,8 @@ class FastSlam(Backend):
         self._resample(len(z))
         self._believe()
         self._draw(scan)
-        self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
+        if self.key_scans.due():
+            self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed, and new ones added."""

@@ -82,16 +82,19 @@ class KeyScans:
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan, surface.copy()))
 
+    def due(self) -> bool:
+        """Count an update; tell whether it is time to look at the landmarks again."""
+        self._since_check += 1
+        n = len(self._scans)
+        # A redraw costs as much as there are key scans: the longer the journey, the rarer the look.
+        return self._since_check >= max(self.config.check_every, n // 8) and n >= 2
+
     def redraw_if_moved(self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64]) -> bool:
         """Redraw ``grid`` if a landmark's correction moved a key scan by more than half a cell; tell whether.
 
         ``landmarks`` ``(n, 2)`` are the current estimates, ``row_of_id`` maps a landmark's id to its row, or -1.
         """
-        self._since_check += 1
         n = len(self._scans)
-        # A redraw costs as much as there are key scans: the longer the journey, the rarer the look.
-        if self._since_check < max(self.config.check_every, n // 8) or n < 2:
-            return False
         self._since_check = 0
         corrected = np.empty((n, 3))
         largest = _corrected_poses(

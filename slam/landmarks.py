@@ -126,6 +126,17 @@ class LandmarkBook:
         self.count = n - 1
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
+    def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
+        """Have these landmarks ``(n,)``, with these marks ``(n, 8)``, instead of those it has."""
+        self.row_of_id[self.ids] = -1
+        count = len(ids)
+        while count > len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        self._ids[:count], self._marks[:count] = ids, marks
+        self.row_of_id[ids] = np.arange(count)
+        self.count = count
+
     def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
         """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
         recent, still = _recent(self._marks[: self.count], match, self._now)

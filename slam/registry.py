@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from slam.backend import Backend, BackendConfig
+from slam.compressed import CompressedEkfConfig, CompressedEkfSlam
 from slam.dead_reckoning import OdometrySlam, TruthSlam
 from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
 from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
@@ -20,6 +21,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "ekf": (EkfSlam, EkfConfig),
     "ekf-lines": (EkfSlam, EkfLinesConfig),
     "invariant-ekf": (InvariantEkfSlam, EkfConfig),
+    "compressed-ekf": (CompressedEkfSlam, CompressedEkfConfig),
     "fastslam1": (FastSlam1, FastSlamConfig),
     "fastslam2": (FastSlam2, FastSlamConfig),
 }

@@ -1,0 +1,119 @@
+"""The compressed filter is the full filter, later: state and covariance to rounding, over regions that change."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import slam
+from slam import Observations
+from slam.compressed import CompressedEkfSlam
+from tests.slam.simulated import drive, observe_landmarks, room_scan
+
+OFFSET = 0.2
+NOISE = np.diag([1e-3, 1e-4])
+
+
+def grove(seed: int, count: int = 120) -> np.ndarray:
+    """Landmarks along a corridor 40 m long."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-4, 36, count), rng.uniform(-3, 3, count)])
+
+
+def compare(full: slam.Belief, compressed: slam.Belief) -> None:
+    """The two beliefs agree to 1e-9, whatever the order of their landmarks."""
+    assert sorted(compressed.landmark_ids) == sorted(full.landmark_ids)
+    np.testing.assert_allclose(compressed.pose, full.pose, atol=1e-9)
+    np.testing.assert_allclose(compressed.pose_cov, full.pose_cov, atol=1e-9)
+    by_id = []
+    for belief in (full, compressed):
+        order = np.argsort(belief.landmark_ids)
+        rows = np.concatenate([np.arange(3), np.column_stack([3 + 2 * order, 4 + 2 * order]).ravel()])
+        assert belief.joint_cov is not None
+        by_id.append((belief.landmarks[order], belief.landmark_cov[order], belief.joint_cov[np.ix_(rows, rows)]))
+    for one, two in zip(*by_id, strict=True):
+        np.testing.assert_allclose(two, one, atol=1e-9)
+
+
+@pytest.mark.parametrize("look_every", [1, 37, 1000])
+def test_it_is_the_full_filter(look_every: int) -> None:
+    """Down a corridor and back with known ids; the belief, which flushes, is read now and then or at the end."""
+    rng = np.random.default_rng(2)
+    landmarks = grove(2)
+    config = {"odometry": {"speed_share": 0.05, "turn_share_rad_m": 0.05}}
+    full, compressed = slam.make("ekf", config=config), slam.make("compressed-ekf", config=config)
+    assert isinstance(compressed, CompressedEkfSlam)
+    for backend in (full, compressed):
+        backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
+    pose = np.zeros(3)
+    most = 0
+    for k in range(240):
+        twist = np.array([0.0, 0.0, math.pi / 2]) if 118 < k < 122 else np.array([0.8, 0.0, 0.02 * math.sin(k)])
+        pose, odometry = drive(pose, twist, (0.02, 0.02), rng, dt=0.3)
+        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
+        for backend in (full, compressed):
+            backend.predict(odometry)
+            backend.observe(seen)
+        assert compressed.nis == pytest.approx(full.nis, rel=1e-6)
+        np.testing.assert_allclose(compressed.pose, full.pose, atol=1e-9)
+        np.testing.assert_allclose(compressed.pose_cov, full.pose_cov, atol=1e-9)
+        most = max(most, compressed._book.count)
+        if k % look_every == look_every - 1:
+            compare(full.belief, compressed.belief)
+    compare(full.belief, compressed.belief)
+    assert compressed.landmark_count == full.landmark_count > 100
+    assert most < 0.6 * full.landmark_count  # it did filter a part only
+
+
+def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
+    """A known id that was left behind 20 m ago: a loop closed."""
+    rng = np.random.default_rng(3)
+    landmarks = grove(3)
+    full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
+    for backend in (full, compressed):
+        backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
+    pose = np.zeros(3)
+    for _ in range(100):
+        pose, odometry = drive(pose, np.array([0.8, 0.0, 0.0]), (0.02, 0.02), rng, dt=0.3)
+        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
+        for backend in (full, compressed):
+            backend.predict(odometry)
+            backend.observe(seen)
+    assert compressed.landmark_count > compressed._book.count
+    first = int(compressed._far_ids[0])
+    d = landmarks[first] - pose[:2] - OFFSET * np.array([math.cos(pose[2]), math.sin(pose[2])])
+    far = Observations(
+        np.array([[np.hypot(*d), math.atan2(d[1], d[0]) - pose[2]]]), NOISE[None], np.array([first])
+    )
+    for backend in (full, compressed):
+        backend.observe(far)
+    compare(full.belief, compressed.belief)
+
+
+@pytest.mark.parametrize("lines", [False, True])
+def test_scans_of_rooms_give_the_full_filter_s_map(lines: bool) -> None:
+    """A long hall, driven down and back with scans: landmarks come, are left behind and met again."""
+    backends = [slam.make(name, config={"lines": lines}) for name in ("ekf", "compressed-ekf")]
+    rng = np.random.default_rng(5)
+    pose = np.array([1.0, 2.0, 0.1])
+    for backend in backends:
+        backend.reset(pose)
+    for k in range(160):
+        twist = np.array([0.7, 0.0, 0.0]) if k < 75 or k > 90 else np.array([0.0, 0.0, 2.0])
+        pose, odometry = drive(pose, twist, (0.01, 0.01), rng, dt=0.1)
+        sensor = np.array([pose[0] + OFFSET * math.cos(pose[2]), pose[1] + OFFSET * math.sin(pose[2]), pose[2]])
+        scan = room_scan(sensor, rng, width=30.0, height=4.0)
+        short = slam.Scan(
+            np.where(scan.ranges < 2.5, scan.ranges, np.inf), scan.angle_min, scan.angle_increment, 2.5
+        )
+        for backend in backends:
+            backend.predict(odometry)
+            backend.update(short)
+    one, two = (backend.belief for backend in backends)
+    order = np.argsort(two.landmark_ids)
+    np.testing.assert_allclose(two.pose, one.pose, atol=1e-9)
+    np.testing.assert_allclose(two.landmarks[order], one.landmarks[np.argsort(one.landmark_ids)], atol=1e-9)
+    assert len(two.lines) == len(one.lines)
+    np.testing.assert_array_equal(two.grid.log_odds, one.grid.log_odds)
