@@ -66,7 +66,8 @@ class CompressedEkfSlam(EkfSlam):
         self._far_p = np.zeros((0, 0))  # P_bb, both triangles
         self._cross = np.zeros((3, 0))  # P_ab of the last flush
         self._centre = (float(pose[0]), float(pose[1]))
-        self._reach = 0.0  # farthest that the sensor has seen, or says that it can
+        self._reach = 0.0  # how far the sensor sees [m]: lately, or as it says itself
+        self._made_for = 0.0  # that, when the region was chosen
         self._begin_region()
 
     def _begin_region(self) -> None:
@@ -147,10 +148,11 @@ class CompressedEkfSlam(EkfSlam):
 
     def _settle(self, reach: float) -> None:
         """Take another region where the robot has left this one, or sees farther than it was made for."""
-        farther = reach > self._reach
-        self._reach = max(self._reach, reach)
+        share, margin = self.config.leave_share, self.config.margin_m
+        self._reach = max(reach, 0.95 * self._reach)
+        beyond = reach > self._made_for + margin and len(self._far_ids) > 0
         moved = math.hypot(self._x[0] - self._centre[0], self._x[1] - self._centre[1])
-        if (farther and len(self._far_ids)) or moved > self.config.leave_share * self._reach:
+        if beyond or moved > share * max(self._made_for, margin) or self._reach < 0.5 * self._made_for:
             self._choose_region(np.zeros(0, np.int64))
 
     def _choose_region(self, also: NDArray[np.int64]) -> None:
@@ -159,7 +161,7 @@ class CompressedEkfSlam(EkfSlam):
         joint, x = self._whole(), np.concatenate([self._x[3 : self._n], self._far_x]).reshape(-1, 2)
         marks = np.vstack([self._book.marks, self._far_marks])
         ids = np.concatenate([self._book.ids, self._far_ids])
-        self._centre = (float(self._x[0]), float(self._x[1]))
+        self._centre, self._made_for = (float(self._x[0]), float(self._x[1])), self._reach
         radius = (1.0 + self.config.leave_share) * self._reach + self.config.margin_m
         near = _distance(x, marks, *self._centre) < radius
         near |= np.isin(ids, also)
