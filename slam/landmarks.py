@@ -262,7 +262,9 @@ def _review(
             t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
         # Compared with where it was first seen: what wanders with the robot never settles.
         t = tentative[nearest]
-        if t[_AGE] == np.inf:  # this very scan has made it a landmark, by another piece of the wall
+        # This very scan has made it a landmark already. Another piece of a wall is the same wall; another corner,
+        # seen at once with the first, is another one.
+        if t[_AGE] == np.inf and z[k, KIND] == LINE:
             continue
         t[_T_DIRECTION] = turn
         t[_COUNT] += 1.0
