@@ -132,8 +132,10 @@ def test_a_room_s_walls_are_mapped_and_hold_the_pose(name: str) -> None:
         pose, odometry = drive(pose, circle_twist(k), (0.01, 0.02), rng)
         backend.predict(odometry)
     belief = backend.belief
-    assert len(belief.lines) == 4 and len(belief.landmarks) == 0
-    assert belief.joint_cov is not None and belief.joint_cov.shape == (3, 3)
+    # A corner becomes a landmark only where one of its walls is now and then too short to be a wall.
+    points = len(belief.landmarks)
+    assert len(belief.lines) == 4 and points <= 4
+    assert belief.joint_cov is not None and belief.joint_cov.shape == (3 + 2 * points, 3 + 2 * points)
     error = compose(inverse(start), pose) - belief.pose
     assert np.hypot(*error[:2]) < 0.02
     assert abs(float(wrap(error[2]))) < 0.01
