@@ -20,7 +20,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "truth": (TruthSlam, EkfConfig),
     "ekf": (EkfSlam, EkfConfig),
     "ekf-lines": (EkfSlam, EkfLinesConfig),
-    "invariant-ekf": (InvariantEkfSlam, EkfConfig),
+    "invariant-ekf": (InvariantEkfSlam, EkfLinesConfig),
     "compressed-ekf": (CompressedEkfSlam, CompressedEkfConfig),
     "fastslam1": (FastSlam1, FastSlamConfig),
     "fastslam2": (FastSlam2, FastSlamConfig),

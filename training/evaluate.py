@@ -116,6 +116,12 @@ def summarise(rows: list[Row]) -> list[Row]:
             values = [r[key] for r in group if r[key] is not None]
             summary[f"{key}_median"] = statistics.median(values) if values else None
         summary["final_position_error_m_max"] = max(r["final_position_error_m"] for r in group)
+        back = [r["return_error_m"] for r in group if r.get("return_error_m") is not None]
+        summary |= {
+            "returned": len(back),
+            "return_error_m_median": statistics.median(back) if back else None,
+            "return_error_m_max": max(back) if back else None,
+        }
         summary |= _consistency([r["nees_each_s"] for r in group])
         out.append(summary)
     return out
@@ -172,6 +178,11 @@ def _table(summaries: list[Row]) -> str:
             f"| {'–' if to_95 is None else format(to_95, '.0f')} "
             f"| {s['nees_over_3_mean']:.2f} ({100 * s['fraction_in_band']:.0f} %) |"
         )
+        if s["returned"]:
+            lines.append(
+                f"| | | {s['returned']} of {n} came back, truly {s['return_error_m_median']:.3f} m "
+                f"(at most {s['return_error_m_max']:.3f}) from the start | | | | | | | |"
+            )
     return "\n".join(lines)
 
 
