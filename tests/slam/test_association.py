@@ -142,7 +142,7 @@ def test_a_misread_label_is_refused_where_there_is_a_gate(name: str) -> None:
 
 
 def close_a_loop(association: str, name: str = "ekf") -> tuple[float, float]:
-    """Map a row of equal posts and an odd one, drive a long way round unseeing, come back: position error before, after.
+    """Map a row of equal posts and an odd one, drive round unseeing, come back; return the error before and after.
 
     The wheels have drifted by more than half the posts' distance, along the row.
     """
