@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["rank_k_downdate"]
+__all__ = ["product", "rank_k_downdate"]
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,15 @@ def _dgemm() -> Callable[..., None]:
 
     address = get_cython_function_address("scipy.linalg.cython_blas", "dgemm")
     return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 13)(address)
+
+
+def product(a: Array, b: Array) -> Array:
+    """Return a b, in pieces that BLAS does not spread over threads either."""
+    out = np.empty((a.shape[0], b.shape[1]))
+    step = max(_LARGEST_PRODUCT // max(b.shape[0] * b.shape[1], 1), 1)
+    for i in range(0, len(a), step):
+        np.matmul(a[i : i + step], b, out=out[i : i + step])
+    return out
 
 
 def rank_k_downdate(p: Array, n: int, w: Array, rows: int) -> None:

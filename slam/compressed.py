@@ -23,6 +23,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.association import UNMATCHED
+from slam.blas import product
 from slam.ekf import EkfConfig, EkfSlam
 from slam.joint_gaussian import symmetric_block
 from slam.landmarks import KIND
@@ -180,8 +181,8 @@ class CompressedEkfSlam(EkfSlam):
     def flush(self) -> None:
         """Bring the rest of the map up to date: what the full filter would have."""
         self._far_x += self._cross.T @ self._theta
-        self._far_p -= self._cross.T @ (self._psi @ self._cross)
-        self._cross = self._phi[: self._n] @ self._cross
+        self._far_p -= product(np.ascontiguousarray(self._cross.T), product(self._psi, self._cross))
+        self._cross = product(self._phi[: self._n], self._cross)
         self._begin_region()
 
     def _whole(self) -> Array:

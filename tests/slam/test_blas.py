@@ -58,9 +58,10 @@ def test_large_maps_come_out_the_same_either_way(name: str, monkeypatch: pytest.
     np.testing.assert_allclose(by_blas.joint_cov, by_loop.joint_cov, atol=1e-9)
 
 
-def test_the_same_bits_whatever_the_number_of_threads() -> None:
+@pytest.mark.parametrize("name", ["ekf", "compressed-ekf"])
+def test_the_same_bits_whatever_the_number_of_threads(name: str) -> None:
     code = (
-        "import hashlib; from tests.slam.test_blas import explore_grove; b = explore_grove('ekf');"
+        f"import hashlib; from tests.slam.test_blas import explore_grove; b = explore_grove('{name}');"
         "print(hashlib.sha256(b.pose.tobytes() + b.joint_cov.tobytes()).hexdigest())"
     )
     results = [
