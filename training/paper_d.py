@@ -47,7 +47,13 @@ def run_job(job: Job) -> Row:
     env = ExploreEnv(
         robot="cavity", rooms={"name": "corridors", "map": number}, slam=backend, config={"coverage_target": 1.0}
     )
-    agent = agents.make("nearest-frontier", robot=env.config.robot, lidar=env.config.lidar)
+    # In corridors this narrow what lies round a corner is not seen from afar: look from near by.
+    agent = agents.make(
+        "nearest-frontier",
+        config={"frontiers": {"view_range_m": 1.0}},
+        robot=env.config.robot,
+        lidar=env.config.lidar,
+    )
     observation, _ = env.reset(seed=seed)
     agent.reset(env.belief, seed=seed)
     idle = 0
