@@ -176,7 +176,7 @@ class EnvConfig:
     rooms: str = "apartment"
     floor_plan: str | None = None  # a file to read instead of generating rooms
     rooms_config: Mapping[str, Any] = field(default_factory=dict)
-    slam: str = "ekf"
+    slam: str = "invariant-ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
     robot: RobotConfig = field(default_factory=RobotConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)

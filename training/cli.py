@@ -76,7 +76,7 @@ def explore(
         str | None, typer.Option(help="Who decides where to go.  [default: nearest-frontier]")
     ] = None,
     rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
-    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.  [default: 0]")
     ] = None,

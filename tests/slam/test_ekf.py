@@ -20,7 +20,7 @@ from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
 OFFSET = 0.2
-FILTERS = ("ekf", "invariant-ekf")  # that keep a joint Gaussian
+FILTERS = ("ekf", "ekf-lines", "invariant-ekf", "compressed-ekf")  # that keep a joint Gaussian
 states = st.integers(0, 10_000)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import least_squares
 
 import slam
 from slam import LINE
@@ -16,6 +17,7 @@ from slam.features import FeatureExtractor
 from slam.geometry import compose, inverse, wrap
 from slam.invariant import invariant_update
 from slam.joint_gaussian import add_landmark, stacked_update
+from slam.motion import move
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, room_scan
 
@@ -197,3 +199,52 @@ def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
     assert got[2] == pytest.approx(0.4, abs=1e-3)
     np.testing.assert_allclose(got[5:], x[5:], atol=1e-9)
     np.testing.assert_allclose(got[:2], x[:2], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ekf-lines", "invariant-ekf"])
+def test_filters_over_walls_agree_with_batch_least_squares(name: str) -> None:
+    """Three walls, twelve steps, little noise: the filter's last belief is the batch solution's."""
+    rng = np.random.default_rng(9)
+    walls = np.array([[0.2, 4.0], [1.8, 3.0], [-2.4, 5.0]])
+    r = np.diag([1e-4, 4e-6])  # of distance and bearing
+    backend = slam.make(name, config={"odometry": {"slip_share": 0.0}})
+    start_cov = np.diag([1e-4, 1e-4, 1e-4])
+    backend.reset(pose_cov=start_cov)
+    pose, odometry, seen = np.zeros(3), [], []
+    for k in range(12):
+        twist = circle_twist(5 * k)
+        var_v, var_w = backend.config.odometry.variances(*twist)
+        pose, odo = drive(pose, twist, (math.sqrt(var_v), math.sqrt(var_w)), rng)
+        z = np.zeros((3, 10))
+        for i in range(3):
+            z[i, :2] = predicted(np.concatenate([pose, walls.ravel()]), i) + rng.multivariate_normal([0, 0], r)
+            z[i, 2], z[i, 4], z[i, 5], z[i, 6], z[i, 8:] = r[0, 0], r[1, 1], LINE, z[i, 1], (-1.0, 1.0)
+        backend.predict(odo)
+        backend._correct(z, np.arange(3) if k else np.full(3, -1))
+        for row in z if k == 0 else ():
+            backend._add(row, None)
+        odometry.append(odo)
+        seen.append(z)
+
+    def residuals(v: np.ndarray) -> np.ndarray:
+        poses, lines = v[:39].reshape(13, 3), v[39:]
+        out = [poses[0] / np.sqrt(np.diag(start_cov))]
+        for k in range(12):
+            twist = np.array(odometry[k].twist)
+            var_v, var_w = backend.config.odometry.variances(*twist)
+            relative = inverse(move(np.zeros(3), twist, 0.1))
+            error = compose(relative, compose(inverse(poses[k]), poses[k + 1]))
+            out.append(error / (0.1 * np.sqrt([var_v, var_v, var_w])))
+            for i in range(3):
+                e = seen[k][i, :2] - predicted(np.concatenate([poses[k + 1], lines]), i)
+                out.append(np.array([e[0], float(wrap(e[1]))]) / np.sqrt(np.diag(r)))
+        return np.concatenate(out)
+
+    guess = np.concatenate([np.zeros(39), walls.ravel()])
+    solution = least_squares(residuals, guess, xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    cov = np.linalg.inv(solution.jac.T @ solution.jac)
+    sigma = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose((backend.pose - solution.x[36:39]) / sigma[36:39], 0, atol=0.06)
+    np.testing.assert_allclose((backend.belief.lines.ravel() - solution.x[39:]) / sigma[39:], 0, atol=0.06)
+    np.testing.assert_allclose(np.diag(backend.joint_cov)[3:], np.diag(cov)[39:], rtol=0.05)
+    np.testing.assert_allclose(backend.pose_cov, cov[36:39, 36:39], rtol=0.05, atol=1e-7)
