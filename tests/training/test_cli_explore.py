@@ -50,8 +50,8 @@ def episode(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
     folder = tmp_path_factory.mktemp("episode")
     write_room(folder / "room.png")
     process = run(
-        "explore", "--floor-plan", "room.png", "--start", "1.0,0.9,0.5", "--seed", "7", "--out", "deep/out",
-        "--json", cwd=folder,
+        "explore", "--floor-plan", "room.png", "--slam", "ekf", "--start", "1.0,0.9,0.5", "--seed", "7", "--out",
+        "deep/out", "--json", cwd=folder,
     )  # fmt: skip
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
