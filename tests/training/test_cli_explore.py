@@ -127,7 +127,7 @@ def test_the_pictures_lie_on_each_other(episode: tuple[Path, dict[str, Any]]) ->
 def test_the_config_is_the_effective_one(episode: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = episode
     plan = str(folder.parents[1] / "room.png")
-    assert from_toml(folder / "config.toml") == replace(make_config(), floor_plan=plan)
+    assert from_toml(folder / "config.toml") == replace(make_config(slam="ekf"), floor_plan=plan)
 
 
 def test_the_config_repeats_the_episode(
