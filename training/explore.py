@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-import platform
 import shutil
-import signal
 import statistics
-import threading
 import time
 import tomllib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import mkdtemp
-from types import FrameType
 from typing import Any, Protocol
 
 import cv2
@@ -36,6 +30,7 @@ from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
 from slam.settings import to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
+from training.running import interrupt_flag, plain, versions
 
 __all__ = ["FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
 
@@ -50,7 +45,6 @@ LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
 
 _DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
-_LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +105,7 @@ class Episode:
             "interrupted": self.interrupted,
             "wall_time_s": round(self.wall_time_s, 3),
         }
-        return {key: _plain(value) for key, value in metrics.items()}
+        return {key: plain(value) for key, value in metrics.items()}
 
 
 # ---- before --------------------------------------------------------------------------------------------------
@@ -201,7 +195,7 @@ def run(episode: Episode, progress: Progress) -> None:
     patience = math.ceil(_DONE_AFTER_S / episode.config.step_s)
     observation, goal, idle, max_steps = episode.observation, agent.goal, 0, episode.run["max_steps"]
     began = time.perf_counter()
-    with _interrupt_flag() as interrupted:
+    with interrupt_flag() as interrupted:
         for steps in range(1, max_steps + 1):
             asked = time.perf_counter()
             action = agent.act(observation, env.belief)
@@ -224,26 +218,6 @@ def run(episode: Episode, progress: Progress) -> None:
     episode.wall_time_s = time.perf_counter() - began
 
 
-@contextmanager
-def _interrupt_flag() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once."""
-    flag = threading.Event()
-
-    def note(signum: int, frame: FrameType | None) -> None:
-        if flag.is_set():
-            raise KeyboardInterrupt
-        flag.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield flag  # only the main thread may handle signals
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 # ---- after -----------------------------------------------------------------------------------------------------
 
 
@@ -257,7 +231,7 @@ def write_episode(episode: Episode) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     folder = Path(mkdtemp(prefix=".writing-", dir=out))
     try:
-        with _interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
+        with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
             metrics = _write_into(folder, episode)
             for name in FILES:
                 (folder / name).replace(out / name)
@@ -300,27 +274,10 @@ def _write_into(folder: Path, episode: Episode) -> dict[str, Any]:
 def config_text(episode: Episode) -> str:
     """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
     run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
-    run["versions"] = _versions()
+    run["versions"] = versions()
     return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
-
-
-def _versions() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in _LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return found
 
 
 def _place(episode: Episode) -> str:
     plan = episode.config.floor_plan
     return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers of Python's own, null for what is not finite."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value

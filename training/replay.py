@@ -21,7 +21,7 @@ from slam.metrics import nees_pose
 from slam.motion import move
 from slam.settings import from_mapping, require, to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
-from training.explore import _interrupt_flag
+from training.running import interrupt_flag
 
 __all__ = ["FILES", "Progress", "Replay", "ReplayConfig", "ReplayOptions", "prepare", "run", "sample_times"]
 
@@ -200,7 +200,7 @@ def run(replay: Replay, progress: Callable[[float], None]) -> None:
     give_pose = getattr(backend, "give_pose", None)
     known = replay.run["association"] == "known"
     began = time.perf_counter()
-    with _interrupt_flag() as interrupted:
+    with interrupt_flag() as interrupted:
         for event in log.events(replay.config.observation, known=known):
             _sample(replay, event.time_s, event.odometry.twist)
             if event.odometry.dt > 0:

@@ -22,9 +22,9 @@ from slam.landmark_map import write_landmark_map
 from slam.metrics import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
 from slam.types import Belief
-from training.explore import _interrupt_flag, _plain, _versions
 from training.replay import FILES, Replay
 from training.replay_picture import draw_replay
+from training.running import interrupt_flag, plain, versions
 
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
 
@@ -64,7 +64,7 @@ def metrics(replay: Replay) -> dict[str, Any]:
         "slam": replay.config.slam, "association": replay.run["association"], "log": replay.log.name,
         "seed": replay.run["seed"], "end": replay.end, "interrupted": replay.interrupted, "note": replay.log.note,
     }  # fmt: skip
-    return {key: _plain(value) for key, value in found.items()}
+    return {key: plain(value) for key, value in found.items()}
 
 
 def surveyed_places(replay: Replay, ids: NDArray[np.int64]) -> Array:
@@ -89,7 +89,7 @@ def write(replay: Replay) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     folder = Path(mkdtemp(prefix=".writing-", dir=out))
     try:
-        with _interrupt_flag():  # one Ctrl-C does not leave half the files of this replay, half of another
+        with interrupt_flag():  # one Ctrl-C does not leave half the files of this replay, half of another
             found = _write_into(folder, replay)
             for name in FILES:
                 (folder / name).replace(out / name)
@@ -128,7 +128,7 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
 
 
 def _run_values(replay: Replay) -> dict[str, Any]:
-    return {key: v for key, v in replay.run.items() if v is not None} | {"versions": _versions()}
+    return {key: v for key, v in replay.run.items() if v is not None} | {"versions": versions()}
 
 
 def _landmarks_csv(belief: Belief, seen: NDArray[np.int64], surveyed: Array) -> str:

@@ -23,7 +23,8 @@ from slam.landmark_map import read_landmark_map
 from slam.occupancy import FREE, OCCUPIED
 from tests.training.plans import write_room
 from training.cli import main
-from training.explore import FILES, _plain
+from training.explore import FILES
+from training.running import plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -160,7 +161,7 @@ def test_options_go_before_the_config(
 
 def test_json_has_null_for_what_is_not_finite() -> None:
     values = [np.float64("nan"), math.inf, np.int64(3), np.bool_(True), None, "ekf", 0.5]
-    assert json.dumps([_plain(v) for v in values]) == '[null, null, 3, true, null, "ekf", 0.5]'
+    assert json.dumps([plain(v) for v in values]) == '[null, null, 3, true, null, "ekf", 0.5]'
 
 
 def test_a_folder_where_a_file_goes_is_found_before_the_episode(

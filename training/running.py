@@ -1,0 +1,57 @@
+"""What every long run needs: Ctrl-C between two steps, values as JSON has them, the versions it ran with."""
+
+from __future__ import annotations
+
+import math
+import platform
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+__all__ = ["interrupt_flag", "plain", "versions"]
+
+_LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once."""
+    flag = threading.Event()
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        if flag.is_set():
+            raise KeyboardInterrupt
+        flag.set()
+
+    if threading.current_thread() is not threading.main_thread():
+        yield flag  # only the main thread may handle signals
+        return
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield flag
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of the project and of the libraries that results depend on."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers of Python's own, null for what is not finite."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
