@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 import slam
 from slam import Observations, Odometry
 from slam.association import nearest_neighbour
-from slam.fastslam import FastSlam, FastSlam1, FastSlam2, FastSlamConfig, _draw, _narrow
+from slam.fastslam import FastSlam, FastSlam1, FastSlam2, FastSlamConfig
 from slam.geometry import compose, inverse, wrap
 from slam.motion import OdometryNoise, jacobians, move
+from slam.particle_filter import draw, narrow
 from slam.particle_maps import ParticleMaps, associate, correct_landmark, innovation
 from slam.resampling import ResamplingPolicy
 from slam.settings import from_mapping
@@ -90,7 +91,7 @@ def test_proposal_and_weight_of_one_landmark_against_direct_computation(seed: in
     want_log = -0.5 * (nu @ np.linalg.solve(s, nu) + np.linalg.slogdet(2 * math.pi * s)[1])
     pose, cov = state[:3].copy(), np.triu(p)
     records, table = np.array([[*state[3:], *upper_terms(p_m)]]), np.array([0])
-    log_likelihood = _narrow(pose, cov, records, table, z[None], np.array([0]), OFFSET, 0.0)
+    log_likelihood = narrow(pose, cov, records, table, z[None], np.array([0]), OFFSET, 0.0)
     assert log_likelihood == pytest.approx(want_log, abs=1e-4)
     difference = pose - want_mean
     difference[2] = wrap(difference[2])
@@ -99,7 +100,7 @@ def test_proposal_and_weight_of_one_landmark_against_direct_computation(seed: in
     # Where the pose is known, only the landmark and the sensor are left to be uncertain.
     want_log = -0.5 * (nu @ np.linalg.solve(rest, nu) + np.linalg.slogdet(2 * math.pi * rest)[1])
     pose, nothing = state[:3].copy(), np.zeros((3, 3))
-    assert _narrow(pose, nothing, records, table, z[None], np.array([0]), OFFSET, 0.0) == pytest.approx(
+    assert narrow(pose, nothing, records, table, z[None], np.array([0]), OFFSET, 0.0) == pytest.approx(
         want_log, abs=1e-4
     )
     np.testing.assert_array_equal(pose, state[:3])
@@ -108,7 +109,7 @@ def test_proposal_and_weight_of_one_landmark_against_direct_computation(seed: in
 def test_an_unexplained_observation_weighs_as_one_at_the_given_distance() -> None:
     _, _, _, z, _ = random_sight(1)
     pose = np.zeros(3)
-    got = _narrow(pose, np.zeros((3, 3)), np.zeros((1, 5)), np.array([0]), z[None], np.array([-1]), OFFSET, 9.0)
+    got = narrow(pose, np.zeros((3, 3)), np.zeros((1, 5)), np.array([0]), z[None], np.array([-1]), OFFSET, 9.0)
     assert got == pytest.approx(-0.5 * (9.0 + np.linalg.slogdet(2 * math.pi * noise_of(z))[1]))
 
 
@@ -130,7 +131,7 @@ def test_poses_are_drawn_with_their_covariance(seed: int) -> None:
     root = []
     for unit in np.eye(3):
         pose, cov = np.zeros(3), np.triu(p)
-        _draw(pose, cov, unit)
+        draw(pose, cov, unit)
         root.append(pose)
         assert not cov.any()
     np.testing.assert_allclose(np.transpose(root) @ root, p, atol=1e-12)
@@ -138,10 +139,10 @@ def test_poses_are_drawn_with_their_covariance(seed: int) -> None:
 
 def test_drawing_from_a_singular_covariance_adds_nothing_where_there_is_none() -> None:
     pose, normal = np.zeros(3), np.array([1.0, 2.0, 3.0])
-    _draw(pose, np.diag([0.0, -1e-20, 0.04]), normal)
+    draw(pose, np.diag([0.0, -1e-20, 0.04]), normal)
     np.testing.assert_allclose(pose, [0, 0, 0.6])
     way = np.array([1.0, 2.0, 0.5])  # of rank one
-    _draw(pose := np.zeros(3), np.triu(np.outer(way, way)), normal)
+    draw(pose := np.zeros(3), np.triu(np.outer(way, way)), normal)
     np.testing.assert_allclose(pose, way, atol=1e-7)
 
 
