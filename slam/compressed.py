@@ -22,7 +22,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.association import UNMATCHED
 from slam.blas import product
 from slam.ekf import EkfConfig, EkfSlam
 from slam.joint_gaussian import symmetric_block
@@ -273,7 +272,7 @@ def _postpone(
     rows = 0
     column = s.shape[1] - 1
     for k in range(match.shape[0]):
-        if match[k] == UNMATCHED or match[k] < 0:
+        if match[k] < 0:
             continue
         m = 3 + 2 * match[k]
         hk = h[rows // 2]

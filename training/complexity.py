@@ -11,12 +11,12 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
 
 import slam
 from slam.backend import Backend
@@ -28,7 +28,7 @@ from training.campaign import backend_names, check_settings, installed_version, 
 from training.charts import Axis, Line, draw_chart, png
 from training.errors import BadInput, bad_input
 
-__all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "reference_kernel", "run_job", "table"]
+__all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
 
 Array = NDArray[np.float64]
 Job = tuple[str, int, int]  # backend or REFERENCE, landmarks, steps
@@ -71,7 +71,7 @@ class Plan:
         """Return what every point depends on."""
         return {
             "version": installed_version(), "steps": self.steps, "repeats": REPEATS, "seen": SEEN,
-            "reference": reference_kernel(),
+            "reference": "dsyrk",
         }  # fmt: skip
 
     def jobs(self) -> list[Job]:
@@ -174,36 +174,19 @@ def _time_steps(
 
 
 def _time_reference(landmarks: int) -> float:
-    """Return how long BLAS takes for P ← P − WᵀW [µs]; see :func:`reference_kernel`."""
+    """Return how long BLAS takes for P ← P − WᵀW by `dsyrk` [µs]."""
     n = 3 + 2 * landmarks
     w = np.asfortranarray(1e-3 * np.random.default_rng(0).standard_normal((2 * SEEN, n)))
     p = np.asfortranarray(np.eye(n))
-    if reference_kernel() == "dsyrk":
-        from scipy.linalg.blas import dsyrk
-
-        def downdate() -> None:  # one triangle, in place
-            dsyrk(-1.0, w, beta=1.0, c=p, trans=1, overwrite_c=1)
-    else:
-        left, product = np.ascontiguousarray(w.T), np.empty((n, n))
-
-        def downdate() -> None:  # both triangles, and the subtraction in a second pass
-            np.matmul(left, w, out=product)
-            np.subtract(p, product, out=p)
-
     medians = []
     for _ in range(REPEATS):
         times = []
         for _ in range(100):
             begin = time.perf_counter()
-            downdate()
+            dsyrk(-1.0, w, beta=1.0, c=p, trans=1, overwrite_c=1)  # one triangle, in place
             times.append(time.perf_counter() - begin)
         medians.append(float(np.median(times)))
     return 1e6 * min(medians)
-
-
-def reference_kernel() -> str:
-    """Return ``dsyrk`` where SciPy, which is not among the core's dependencies, is installed, else ``dgemm``."""
-    return "dgemm" if find_spec("scipy") is None else "dsyrk"
 
 
 # ---- all of them -----------------------------------------------------------------------------------------------

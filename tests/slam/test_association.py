@@ -136,7 +136,7 @@ def test_a_misread_label_is_refused_where_there_is_a_gate(name: str) -> None:
         wrong = Observations(seen.range_bearing[:1], seen.cov[:1], np.array([1]))
         backend.observe(wrong)
         assert backend.landmark_count == 2
-        assert backend.landmark_details()[0].tolist() == ([6 - 1, 6] if gate == math.inf else [5, 5])
+        assert backend.landmark_details()[0].tolist() == ([5, 6] if gate == math.inf else [5, 5])
         errors[gate] = float(np.hypot(*(backend.belief.landmarks[1] - places[1])))
     assert errors[18.4] < 0.02 < 0.1 < errors[math.inf]
 
