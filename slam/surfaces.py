@@ -145,11 +145,56 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     slope, and their covariance, the extent along the line from the centroid (2), the number of points; then
     (by the caller) the first and last beam, and which ends make a corner.
     """
-    # The end points are shared with what comes before and after, and may lie on that: the fit leaves them out.
+    # The end points are shared with what comes before and after, and may lie on that.
     a, b = first + 1, last - 1
+    if b - a + 3 < limits[MIN_POINTS] or b - a < 2:
+        return False
+    _line_through(xy, a, b, line)
+    if not _is_straight(xy, a, b, limits, line):
+        return False
+    # So may the points beside them, which the splitting could not tell apart: all that are so near are left out.
+    # With them a wall seemed turned towards its neighbour by more than its noise allows.
+    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
+    while a < b and _is_within(near, xy, a, first):
+        a += 1
+    while a < b and _is_within(near, xy, b, last):
+        b -= 1
     n = b - a + 1
     if n + 2 < limits[MIN_POINTS] or n < 3:
         return False
+    _line_through(xy, a, b, line)
+    nx, ny, mx, my = line[NX], line[NY], line[MX], line[MY]
+    # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
+    var_offset = var_slope = cov = spread = 0.0
+    for i in range(a, b + 1):
+        x, y = xy[i, 0], xy[i, 1]
+        t = -ny * (x - mx) + nx * (y - my)
+        d = nx * x + ny * y
+        variance = d * d / (x * x + y * y)  # in units of σ²
+        var_offset += variance
+        var_slope += t * t * variance
+        cov += t * variance
+        spread += t * t
+    sigma = limits[SIGMA]
+    line[VAR_OFFSET] = sigma * sigma * var_offset / (n * n)
+    line[VAR_SLOPE] = sigma * sigma * var_slope / (spread * spread)
+    line[COV] = sigma * sigma * cov / (n * spread)
+    t0 = -ny * (xy[first, 0] - mx) + nx * (xy[first, 1] - my)
+    t1 = -ny * (xy[last, 0] - mx) + nx * (xy[last, 1] - my)
+    line[T0], line[T1], line[POINTS] = t0, t1, n
+    return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_within(distance: float, xy: Array, i: int, j: int) -> bool:
+    dx, dy = xy[i, 0] - xy[j, 0], xy[i, 1] - xy[j, 1]
+    return bool(dx * dx + dy * dy < distance * distance)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _line_through(xy: Array, a: int, b: int, line: Array) -> None:
+    """Write normal, distance and centroid of the total least squares line of the points ``a`` … ``b``."""
+    n = b - a + 1
     # Sums about the first point: about the origin they would lose digits.
     x0, y0 = xy[a, 0], xy[a, 1]
     sx = sy = sxx = sxy = syy = 0.0
@@ -163,24 +208,23 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     mx, my = x0 + sx / n, y0 + sy / n
     sxx, sxy, syy = sxx - sx * sx / n, sxy - sx * sy / n, syy - sy * sy / n
     angle = 0.5 * math.atan2(2.0 * sxy, sxx - syy)  # of the line itself
-    tx, ty = math.cos(angle), math.sin(angle)
-    nx, ny = -ty, tx
+    nx, ny = -math.sin(angle), math.cos(angle)
     r = nx * mx + ny * my
     if r < 0.0:
         nx, ny, r = -nx, -ny, -r
-    ax, ay = -ny, nx
-    # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
-    sigma = limits[SIGMA]
-    var_offset = var_slope = cov = spread = residual = off = curve = fourth = largest = 0.0
+    line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, r, mx, my
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_straight(xy: Array, a: int, b: int, limits: Array, line: Array) -> bool:
+    """Tell whether the points ``a`` … ``b`` lie on their line, neither off it nor bulging away from it."""
+    n, sigma = b - a + 1, limits[SIGMA]
+    nx, ny, r, mx, my = line[NX], line[NY], line[R], line[MX], line[MY]
+    spread = residual = off = curve = fourth = largest = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
-        t = ax * (x - mx) + ay * (y - my)
-        d = nx * x + ny * y
-        variance = d * d / (x * x + y * y)  # in units of σ²
-        e, tt = d - r, t * t
-        var_offset += variance
-        var_slope += tt * variance
-        cov += t * variance
+        t = -ny * (x - mx) + nx * (y - my)
+        e, tt = nx * x + ny * y - r, t * t
         spread += tt
         residual += e * e
         off += e
@@ -190,17 +234,7 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[SPLIT_FLOOR])) ** 2:
         return False
     mean = spread / n
-    if _is_curved(curve - mean * off, fourth - mean * spread, largest, sigma):
-        return False
-    var_offset, var_slope, cov = sigma * sigma * var_offset, sigma * sigma * var_slope, sigma * sigma * cov
-    line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, r, mx, my
-    line[VAR_OFFSET] = var_offset / (n * n)
-    line[VAR_SLOPE] = var_slope / (spread * spread)
-    line[COV] = cov / (n * spread)
-    t0 = ax * (xy[first, 0] - mx) + ay * (xy[first, 1] - my)
-    t1 = ax * (xy[last, 0] - mx) + ay * (xy[last, 1] - my)
-    line[T0], line[T1], line[POINTS] = t0, t1, n
-    return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
+    return not _is_curved(curve - mean * off, fourth - mean * spread, largest, sigma)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
