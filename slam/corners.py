@@ -9,7 +9,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.surfaces import (
-    COV,
     EDGE_FACE,
     EDGE_JUMP,
     EDGE_LENGTH,
@@ -68,8 +67,8 @@ def meet(one: Array, two: Array, increment: float, limits: Array, corner: Array)
     if abs(s1 - one[T1]) > gap or abs(s2 - two[T0]) > gap:
         return 0
     # Each line's offset at the corner: n·p = r there, with this variance.
-    v1 = one[VAR_OFFSET] + 2.0 * s1 * one[COV] + s1 * s1 * one[VAR_SLOPE]
-    v2 = two[VAR_OFFSET] + 2.0 * s2 * two[COV] + s2 * s2 * two[VAR_SLOPE]
+    v1 = one[VAR_OFFSET] + s1 * s1 * one[VAR_SLOPE]
+    v2 = two[VAR_OFFSET] + s2 * s2 * two[VAR_SLOPE]
     # p = N⁻¹ (r1, r2)  ⇒  cov p = N⁻¹ diag(v1, v2) N⁻ᵀ
     a, b = two[NY] / cross, -one[NY] / cross
     c, d = -two[NX] / cross, one[NX] / cross
@@ -168,7 +167,7 @@ def edge(
     along = (
         (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + (4.0 * limits[SIGMA] ** 2 if faces > 0 else 0.0)
     )
-    off = line[VAR_OFFSET] + 2.0 * s * line[COV] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
+    off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
     direction = math.atan2(step * ay - ny, step * ax - nx)
     _to_polar(

@@ -1,7 +1,7 @@
 """Scan → straight surfaces and the corners where they meet, each with a covariance from its fit.
 
 Split and merge (iterative end-point fit) over the scan's points in order of bearing; every piece is fitted by
-total least squares. A corner is where two fitted surfaces meet and the scan runs
+maximum likelihood, range noise acting along the beam. A corner is where two fitted surfaces meet and the scan runs
 through without a break, or where one ends in front of something farther away. The rim of a shadow is neither:
 it moves with the robot.
 """
@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from slam.corners import all_on, edge, meet
 from slam.settings import require
 from slam.surfaces import (
-    COV,
     ENDS,
     FIRST,
     LAST,
@@ -117,7 +116,7 @@ class FeatureExtractor:
         self.surface = np.zeros(0, np.int16)
         self._angles = np.zeros(0)
         self._scan_of: tuple[int, float, float] = (0, 0.0, 0.0)
-        self._lines = np.zeros((MAX_LINES, 14))
+        self._lines = np.zeros((MAX_LINES, 13))
         self._corners = np.zeros((3 * MAX_LINES, 10))
         self._walls_and_corners = np.zeros((4 * MAX_LINES, 10))
         self._line_count = 0
@@ -263,8 +262,8 @@ def _walls_first(
         middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
         # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
         row[0], row[1] = line[R], math.atan2(line[NY], line[NX])
-        row[2] = line[VAR_OFFSET] - 2.0 * middle * line[COV] + middle * middle * line[VAR_SLOPE] + sigma_r**2
-        row[3] = middle * line[VAR_SLOPE] - line[COV]
+        row[2] = line[VAR_OFFSET] + middle * middle * line[VAR_SLOPE] + sigma_r**2
+        row[3] = middle * line[VAR_SLOPE]
         row[4] = line[VAR_SLOPE] + sigma_alpha**2
         row[5], row[6], row[7] = LINE, row[1], 0.0
         row[8], row[9] = middle + line[T0], middle + line[T1]

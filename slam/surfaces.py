@@ -1,4 +1,4 @@
-"""Scan → straight surfaces: split and merge over the points, total least squares on the pieces (kernels)."""
+"""Scan → straight surfaces: split and merge over the points, a line through each piece (kernels)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MAX_LINES = 128
+_GRAZING = 0.01  # c² that beams along a surface count as at least: bearings are not as exact as that
+_OUTLIER = 4.0  # σ along the beam by which a point may be off the line that it is fitted to
+_STEPS = 2  # of Gauss-Newton; after one from total least squares a wall seen at an angle is still too far off
 MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
 
 # The config as the kernels take it.
@@ -18,12 +21,13 @@ MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost
     SIGMA, SPLIT_SIGMAS, SPLIT_FLOOR, MIN_POINTS, MIN_LENGTH, SIN_MIN_ANGLE, MAX_GAP, FLOOR,
     EDGE_LENGTH, EDGE_JUMP, EDGE_SPACING, EDGE_POINTS, EDGE_FACE, EDGE_SIGMA,
 ) = range(14)  # fmt: skip
-# A fitted line: its normal, away from the sensor, and distance; the points' centroid; the variances of offset (at
-# the centroid) and slope and their covariance; from where to where it reaches along (-ny, nx) from the centroid;
-# its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0 and 1).
+# A fitted line: its normal, away from the sensor, and distance; the points' weighted centroid; the variances of
+# offset (at the centroid) and slope, which are uncorrelated there; from where to where it reaches along (-ny, nx)
+# from the centroid; its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0
+# and 1).
 (
-    NX, NY, R, MX, MY, VAR_OFFSET, VAR_SLOPE, COV, T0, T1, POINTS, FIRST, LAST, ENDS,
-) = range(14)  # fmt: skip
+    NX, NY, R, MX, MY, VAR_OFFSET, VAR_SLOPE, T0, T1, POINTS, FIRST, LAST, ENDS,
+) = range(13)  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -139,11 +143,9 @@ def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
-    """Fit a line to a piece by total least squares; tell whether it is a surface.
+    """Fit a line to a piece; tell whether it is a surface.
 
-    ``line``: normal (2), distance r, centroid (2), then the variance of the offset at the centroid, of the
-    slope, and their covariance, the extent along the line from the centroid (2), the number of points; then
-    (by the caller) the first and last beam, and which ends make a corner.
+    The caller writes the line's first and last beam, and which of its ends make a corner.
     """
     # The end points are shared with what comes before and after, and may lie on that.
     a, b = first + 1, last - 1
@@ -153,36 +155,68 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     if not _is_straight(xy, a, b, limits, line):
         return False
     # So may the points beside them, which the splitting could not tell apart: all that are so near are left out.
-    # With them a wall seemed turned towards its neighbour by more than its noise allows.
+    # With them a wall seemed turned towards its neighbour by more than its covariance allows.
     near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
     while a < b and _is_within(near, xy, a, first):
         a += 1
     while a < b and _is_within(near, xy, b, last):
         b -= 1
+    # The next is out of reach by its own noise, too: for it to count would make a bias of that.
+    a, b = a + 1, b - 1
     n = b - a + 1
-    if n + 2 < limits[MIN_POINTS] or n < 3:
+    if n < 3:
         return False
-    _line_through(xy, a, b, line)
-    nx, ny, mx, my = line[NX], line[NY], line[MX], line[MY]
-    # Range noise acts along the beam: across the line it counts by the cosine of the incidence.
-    var_offset = var_slope = cov = spread = 0.0
-    for i in range(a, b + 1):
-        x, y = xy[i, 0], xy[i, 1]
-        t = -ny * (x - mx) + nx * (y - my)
-        d = nx * x + ny * y
-        variance = d * d / (x * x + y * y)  # in units of σ²
-        var_offset += variance
-        var_slope += t * t * variance
-        cov += t * variance
-        spread += t * t
-    sigma = limits[SIGMA]
-    line[VAR_OFFSET] = sigma * sigma * var_offset / (n * n)
-    line[VAR_SLOPE] = sigma * sigma * var_slope / (spread * spread)
-    line[COV] = sigma * sigma * cov / (n * spread)
-    t0 = -ny * (xy[first, 0] - mx) + nx * (xy[first, 1] - my)
-    t1 = -ny * (xy[last, 0] - mx) + nx * (xy[last, 1] - my)
+    for _ in range(_STEPS):
+        if not _refine(xy, a, b, limits[SIGMA], line):
+            return False
+    t0 = -line[NY] * (xy[first, 0] - line[MX]) + line[NX] * (xy[first, 1] - line[MY])
+    t1 = -line[NY] * (xy[last, 0] - line[MX]) + line[NX] * (xy[last, 1] - line[MY])
     line[T0], line[T1], line[POINTS] = t0, t1, n
     return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> bool:
+    """Bring a line nearer to the maximum likelihood one of the points ``a`` … ``b``; write its covariance.
+
+    Range noise acts along the beam. It moves a point along a wall seen at an angle as well as across it, and
+    always both together: total least squares takes that for a turn of the wall, the more the shorter and the
+    noisier. So a point is placed along the wall by its bearing alone, and counts by the cosine c of its incidence:
+    across the wall its error has the variance σ² c². A Gauss-Newton step from the line as it is.
+    """
+    nx, ny, r = line[NX], line[NY], line[R]
+    mt = -ny * line[MX] + nx * line[MY]  # of the centroid, from the line's foot
+    gate = (_OUTLIER * sigma) ** 2
+    sw = st = stt = se = ste = 0.0
+    for i in range(a, b + 1):
+        x, y = xy[i, 0], xy[i, 1]
+        d = nx * x + ny * y
+        t = r * (nx * y - ny * x) / d - mt  # where the beam meets the line
+        square = x * x + y * y
+        weight = square / (d * d + _GRAZING * square)
+        e = d - r
+        if d <= 0.5 * r or e * e * weight > gate:
+            continue
+        sw += weight
+        st += weight * t
+        stt += weight * t * t
+        se += weight * e
+        ste += weight * t * e
+    if sw <= 0.0 or stt * sw <= st * st:
+        return False
+    mean = st / sw
+    spread = stt - mean * st
+    slope = (ste - mean * se) / spread
+    # Turned by the slope about the weighted centroid, where offset and slope are uncorrelated.
+    mt += mean
+    offset = r + se / sw
+    mx, my = offset * nx - mt * ny, offset * ny + mt * nx
+    norm = 1.0 / math.sqrt(1.0 + slope * slope)
+    nx, ny = norm * (nx + slope * ny), norm * (ny - slope * nx)
+    line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, nx * mx + ny * my, mx, my
+    line[VAR_OFFSET] = sigma * sigma / sw
+    line[VAR_SLOPE] = sigma * sigma / spread
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
