@@ -15,6 +15,10 @@ __all__ = ["backend_settings", "odometry_noise"]
 # the second or so that it takes the landmarks to correct a drift, ten steps' errors add up instead of averaging.
 _PERSISTENCE = 10.0
 
+# What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), with something to spare:
+# a robot that stands must not become certain of it.
+_FLOOR_M_S = 0.0003
+
 
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
@@ -30,6 +34,8 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     base = noise.base_error * math.sqrt(_PERSISTENCE / 9.0)
     return OdometryNoise(
         lever_m=robot.lever_m,
+        speed_floor_m_s=_FLOOR_M_S,
+        turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
         speed_share=per_wheel,
         turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
     )
@@ -44,6 +50,8 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
         "grid_resolution_m": config.grid_resolution_m,
         "odometry": {
             "lever_m": noise.lever_m,
+            "speed_floor_m_s": noise.speed_floor_m_s,
+            "turn_floor_rad_s": noise.turn_floor_rad_s,
             "speed_share": noise.speed_share,
             "turn_share_rad_m": noise.turn_share_rad_m,
         },

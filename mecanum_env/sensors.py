@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.raycast import beam_directions, cast_rays
-from mecanum_env.robot import forward_matrix
+from mecanum_env.robot import GRAVITY_M_S2, forward_matrix
 from slam.types import Odometry, Scan
 
 __all__ = ["Lidar", "WheelEncoders"]
@@ -118,6 +118,16 @@ class Lidar:
         return Scan(ranges, angle_min, increment, config.range_max_m, config.range_min_m)
 
 
+def creep(robot: RobotConfig, noise: NoiseConfig) -> Array:
+    """Return by how much of a second's acceleration the wheels run ahead of the body ``(3,)`` [s]: vx, vy, ω.
+
+    A wheel drives by slipping a little: each passes on μ N / s₀ times its slip along the roller's axis
+    (:mod:`mecanum_env.robot`), a quarter of the force at 45° to it.
+    """
+    linear = 2.0 * robot.slip_speed_m_s / (noise.friction * GRAVITY_M_S2)
+    return np.array([linear, linear, linear * robot.inertia_kg_m2 / (robot.mass_kg * robot.lever_m**2)])
+
+
 class WheelEncoders:
     """Encoders on the four wheels, and the systematic errors of the robot they are mounted on.
 
@@ -146,6 +156,8 @@ class WheelEncoders:
         self.robot = robot
         self.noise = noise
         self._forward = forward_matrix(robot)  # (3, 4)
+        self._creep = creep(robot, noise)
+        self._last_twist = np.zeros(3)
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
@@ -167,7 +179,9 @@ class WheelEncoders:
         noise = self.noise
         gain = (1.0 - noise.slip) / dt
         _read_encoders(self._forward, increments, rng.standard_normal(4), noise.encoder, gain, twist)
-        return Odometry(twist, dt)
+        rolling = twist - self._creep * ((twist - self._last_twist) / dt)
+        self._last_twist = twist
+        return Odometry(rolling, dt)
 
 
 @njit(cache=True, nogil=True)

@@ -106,6 +106,13 @@ def _to_polar(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _meets(line: Array, ray: Array) -> float:
+    """Return where a beam meets a line, along it from its centroid."""
+    reach = line[R] / (line[NX] * ray[0] + line[NY] * ray[1])
+    return -line[NY] * (reach * ray[0] - line[MX]) + line[NX] * (reach * ray[1] - line[MY])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def edge(
     line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
     corner: Array,
@@ -123,7 +130,8 @@ def edge(
     step = 1 if side == 1 else -1
     index = int(line[LAST]) if side == 1 else int(line[FIRST])
     full = n * increment > 2.0 * math.pi - 1.5 * increment
-    end = line[T1] if side == 1 else line[T0]
+    # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
+    end = _meets(line, rays[index])
     t = missed = 0.0
     faces = 0
     while True:
@@ -142,7 +150,7 @@ def edge(
         if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
             return 0
         if faces == 0:
-            t = -line[NY] * (missed * rays[index, 0] - line[MX]) + line[NX] * (missed * rays[index, 1] - line[MY])
+            t = _meets(line, rays[index])
         if reach > missed + limits[EDGE_JUMP]:
             px, py = reach * rays[index, 0], reach * rays[index, 1]
             depth = line[NX] * px + line[NY] * py - line[R]
