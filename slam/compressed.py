@@ -76,7 +76,7 @@ class CompressedEkfSlam(EkfSlam):
         self._phi = np.zeros((n + 16, n))
         self._phi[:n] = np.eye(n)
         self._psi, self._theta = np.zeros((n, n)), np.zeros(n)
-        self._u = np.zeros((len(self._w), n))
+        self._u = np.zeros((len(self._s), n))
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -142,7 +142,7 @@ class CompressedEkfSlam(EkfSlam):
 
     def _enlarge(self) -> None:
         super()._enlarge()
-        self._u = np.zeros((len(self._w), self._n0))
+        self._u = np.zeros((len(self._s), self._n0))
 
     # ---- regions -------------------------------------------------------------------------------------------
 
@@ -270,7 +270,6 @@ def _postpone(
     With U = L⁻¹ H Φ: Ψ += Uᵀ U, θ += Uᵀ L⁻¹ ν, Φ −= Wᵀ U.
     """
     rows = 0
-    column = s.shape[1] - 1
     for k in range(match.shape[0]):
         if match[k] < 0:
             continue
@@ -288,10 +287,10 @@ def _postpone(
     for i in range(rows):
         ui = u[i, :n0]
         for j in range(i):
-            factor, uj = s[i, j], u[j]
+            factor, uj = s[j, i], u[j]
             for q in range(n0):
                 ui[q] -= factor * uj[q]
-        inverse, y = 1.0 / s[i, i], s[i, column]
+        inverse, y = s[i, i], s[i, rows]
         for q in range(n0):
             ui[q] *= inverse
             theta[q] += y * ui[q]

@@ -1,0 +1,245 @@
+"""The stacked update of EKF-SLAM: all observations of a scan at once, by Numba kernels as fast as a BLAS.
+
+    S = H P Hᵀ + R = L Lᵀ,  W = L⁻¹ H P,  x += Wᵀ L⁻¹ ν,  P ← P − Wᵀ W
+
+(theory.md A, observe; the same as P − K S Kᵀ). From fifty landmarks on most of the time goes into the last
+product. A BLAS would spread it over threads, and then round otherwise than on one; but one seed must give the same
+bits everywhere.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.association import predicted
+from slam.geometry import wrap_scalar
+from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
+
+__all__ = ["SPARE_ROWS", "add_combination", "downdate", "stacked_update", "whiten", "work_space"]
+
+Array = NDArray[np.float64]
+
+SPARE_ROWS = 6
+"""Rows of w beyond the observations', for what a filter may want to subtract beside Wᵀ W."""
+
+
+def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
+    """Return h, w and s: the work space of updates by so many observations, of a state of ``size`` at most."""
+    rows = 2 * observations
+    h = np.zeros((observations, 2, 5))
+    w = aligned_zeros(rows + SPARE_ROWS, size)
+    s = aligned_zeros(rows, rows + 1 + LANES)  # S and ν, and room for the last vector of a row
+    return h, w, s
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def stacked_update(
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
+) -> tuple[int, float]:
+    """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
+
+    ``p`` is an upper triangle; the lower one is undefined after. ``h``, ``w``, ``s`` are a :func:`work_space`.
+    """
+    rows = whiten(x, p, n, z, match, offset, h, w, s)
+    if rows == 0:
+        return 0, 0.0
+    nis = 0.0
+    for k in range(rows):
+        nis += s[k, rows] * s[k, rows]
+    add_combination(x, n, s[:rows, rows], w)
+    x[2] = wrap_scalar(x[2])
+    downdate(p, n, w, rows, 0)
+    return rows, nis
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def whiten(
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
+) -> int:
+    """Write W = L⁻¹ H P into ``w``; return the number of rows.
+
+    ``s`` holds in row k, from the diagonal on, 1 / L_kk, the rest of L's column k and, after that, (L⁻¹ ν)_k.
+    """
+    rows = 0
+    for j in range(3):  # the robot's block is read as rows, so both its triangles are
+        for q in range(j):
+            p[j, q] = p[q, j]
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            _landmark_rows(p, n, 3 + 2 * match[k], w[rows], w[rows + 1])
+            rows += 2
+    a = 0
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            rho, bearing = predicted(x, match[k], z[k, 5], offset, h[a // 2])
+            s[a, rows], s[a + 1, rows] = z[k, 0] - rho, wrap_scalar(z[k, 1] - bearing)
+            a += 2
+    _h_times_rows(h, p, n, w, rows)
+    a = 0
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            _innovation_columns(w, 3 + 2 * match[k], h[a // 2], a, s)
+            s[a, a] += z[k, 2]
+            s[a, a + 1] += z[k, 3]
+            s[a + 1, a + 1] += z[k, 4]
+            a += 2
+    _cholesky(s, rows)
+    _solve(s, w, n, rows)
+    return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _landmark_rows(p: Array, n: int, m: int, out0: Array, out1: Array) -> None:
+    """Write the rows m and m + 1 of the symmetric P: left of the diagonal they stand in its columns."""
+    for j in range(m):
+        out0[j], out1[j] = p[j, m], p[j, m + 1]
+    out1[m] = p[m, m + 1]
+    for j in range(m, n):
+        out0[j] = p[m, j]
+    for j in range(m + 1, n):
+        out1[j] = p[m + 1, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _h_times_rows(h: Array, p: Array, n: int, w: Array, rows: int) -> None:
+    """Turn the observed landmarks' rows of P in ``w`` into H P, with the robot's rows of ``p``."""
+    for j in range(0, n, LANES):
+        mask = first(n - j)
+        p0, p1, p2 = load(p, (0, j), mask), load(p, (1, j), mask), load(p, (2, j), mask)
+        for k in range(0, rows, 2):
+            g, pa, pb = h[k // 2], load(w, (k, j), mask), load(w, (k + 1, j), mask)
+            for e in range(2):
+                row = times(g[e, 3], pa)
+                row = add_product(row, g[e, 4], pb)
+                row = add_product(row, g[e, 0], p0)
+                row = add_product(row, g[e, 1], p1)
+                row = add_product(row, g[e, 2], p2)
+                store(w, (k + e, j), mask, row)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _innovation_columns(w: Array, m: int, h: Array, a: int, s: Array) -> None:
+    """Write the columns a and a + 1 of H P Hᵀ down to the diagonal, H P standing in ``w``."""
+    for b in range(a + 2):
+        hp = w[b]
+        for e in range(2):
+            s[b, a + e] = (h[e, 3] * hp[m] + h[e, 4] * hp[m + 1] + h[e, 0] * hp[0]) + (
+                h[e, 1] * hp[1] + h[e, 2] * hp[2]
+            )
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _cholesky(s: Array, rows: int) -> None:
+    """Factor the upper triangle S = L Lᵀ in place, and multiply the column right of it, ν, by L⁻¹."""
+    for k in range(rows):
+        inverse = 1.0 / math.sqrt(s[k, k])
+        for j in range(k + 1, rows + 1):
+            s[k, j] *= inverse
+        s[k, k] = inverse
+        for i in range(k + 1, rows):
+            factor = s[k, i]
+            # Whole vectors: those left of the diagonal and right of ν are of no account.
+            for j in range(i - i % LANES, rows + 1, LANES):
+                store(s, (i, j), None, subtract_product(load(s, (i, j), None), factor, load(s, (k, j), None)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def _solve(s: Array, w: Array, n: int, rows: int) -> None:
+    """Multiply W by L⁻¹ in place, a few columns at a time from top to bottom."""
+    j = 0
+    while j + 2 * LANES <= n:
+        _solve_tile(s, w, j, rows, None, None)
+        j += 2 * LANES
+    if j < n:
+        _solve_tile(s, w, j, rows, first(n - j), first(n - j - LANES))
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+def _solve_tile(s: Array, w: Array, j: int, rows: int, mask0: Any, mask1: Any) -> None:
+    for i in range(rows):
+        v0, v1 = load(w, (i, j), mask0), load(w, (i, j + LANES), mask1)
+        for k in range(i):
+            factor = s[k, i]
+            v0 = subtract_product(v0, factor, load(w, (k, j), mask0))
+            v1 = subtract_product(v1, factor, load(w, (k, j + LANES), mask1))
+        store(w, (i, j), mask0, times(s[i, i], v0))
+        store(w, (i, j + LANES), mask1, times(s[i, i], v1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def add_combination(out: Array, n: int, factors: Array, w: Array) -> None:
+    """Add to ``out`` ``(≥ n,)`` the first rows of ``w``, each times its factor."""
+    for j in range(0, n, LANES):
+        mask = first(n - j)
+        v = load(out, j, mask)
+        for k in range(factors.shape[0]):
+            v = add_product(v, factors[k], load(w, (k, j), mask))
+        store(out, j, mask, v)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def downdate(p: Array, n: int, w: Array, rows: int, pairs: int) -> None:
+    """Subtract Wᵀ W from the upper triangle of p, W being the first ``rows`` (an even number) of w.
+
+    The rows that follow are ``pairs`` of a and b: of each, a bᵀ + b aᵀ is subtracted, too. The lower triangle of p
+    is undefined after.
+    """
+    whole = n - n % 8
+    for i in range(0, whole, 8):
+        j = i
+        while j + 2 * LANES <= n:
+            _downdate_tile(p, i, j, w, rows, pairs, None, None)
+            j += 2 * LANES
+        if j < n:
+            _downdate_tile(p, i, j, w, rows, pairs, first(n - j), first(n - j - LANES))
+    for i in range(whole, n):
+        for j in range(i, n):
+            for k in range(rows):
+                p[i, j] -= w[k, i] * w[k, j]
+            for k in range(rows, rows + 2 * pairs):
+                p[i, j] -= w[k ^ 1, i] * w[k, j]
+
+
+@njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+def _downdate_tile(p: Array, i: int, j: int, w: Array, rows: int, pairs: int, mask0: Any, mask1: Any) -> None:
+    """Downdate eight rows of p and two vectors of columns: as much as the registers hold."""
+    r = j + LANES
+    a0, b0 = load(p, (i, j), mask0), load(p, (i, r), mask1)
+    a1, b1 = load(p, (i + 1, j), mask0), load(p, (i + 1, r), mask1)
+    a2, b2 = load(p, (i + 2, j), mask0), load(p, (i + 2, r), mask1)
+    a3, b3 = load(p, (i + 3, j), mask0), load(p, (i + 3, r), mask1)
+    a4, b4 = load(p, (i + 4, j), mask0), load(p, (i + 4, r), mask1)
+    a5, b5 = load(p, (i + 5, j), mask0), load(p, (i + 5, r), mask1)
+    a6, b6 = load(p, (i + 6, j), mask0), load(p, (i + 6, r), mask1)
+    a7, b7 = load(p, (i + 7, j), mask0), load(p, (i + 7, r), mask1)
+    for k in range(rows + 2 * pairs):
+        left, x, y = w[k if k < rows else k ^ 1], load(w, (k, j), mask0), load(w, (k, r), mask1)
+        a0, b0 = subtract_product(a0, left[i], x), subtract_product(b0, left[i], y)
+        a1, b1 = subtract_product(a1, left[i + 1], x), subtract_product(b1, left[i + 1], y)
+        a2, b2 = subtract_product(a2, left[i + 2], x), subtract_product(b2, left[i + 2], y)
+        a3, b3 = subtract_product(a3, left[i + 3], x), subtract_product(b3, left[i + 3], y)
+        a4, b4 = subtract_product(a4, left[i + 4], x), subtract_product(b4, left[i + 4], y)
+        a5, b5 = subtract_product(a5, left[i + 5], x), subtract_product(b5, left[i + 5], y)
+        a6, b6 = subtract_product(a6, left[i + 6], x), subtract_product(b6, left[i + 6], y)
+        a7, b7 = subtract_product(a7, left[i + 7], x), subtract_product(b7, left[i + 7], y)
+    store(p, (i, j), mask0, a0)
+    store(p, (i + 1, j), mask0, a1)
+    store(p, (i + 2, j), mask0, a2)
+    store(p, (i + 3, j), mask0, a3)
+    store(p, (i + 4, j), mask0, a4)
+    store(p, (i + 5, j), mask0, a5)
+    store(p, (i + 6, j), mask0, a6)
+    store(p, (i + 7, j), mask0, a7)
+    store(p, (i, r), mask1, b0)
+    store(p, (i + 1, r), mask1, b1)
+    store(p, (i + 2, r), mask1, b2)
+    store(p, (i + 3, r), mask1, b3)
+    store(p, (i + 4, r), mask1, b4)
+    store(p, (i + 5, r), mask1, b5)
+    store(p, (i + 6, r), mask1, b6)
+    store(p, (i + 7, r), mask1, b7)
