@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from slam.ekf import EkfSlam
 from slam.geometry import wrap_scalar
 from slam.metrics import nees_pose_invariant
-from slam.stacked_update import add_combination, downdate, whiten
+from slam.stacked_update import whiten
+from slam.tiles import add_combination, downdate
 from slam.types import LINE
 
 __all__ = ["InvariantEkfSlam"]
@@ -77,7 +78,7 @@ def invariant_update(
             v[j] = -p[j, q] if j <= q else -p[q, j]
         add_combination(v, n, w[:rows, q], w)
     _add_half(a, minus_v, n, walls)
-    downdate(p, n, w, rows, 3 if walls else 1)
+    downdate(p, n, w, w, rows, 3 if walls else 1)
     return rows, nis
 
 

@@ -1,10 +1,9 @@
-"""The stacked update of EKF-SLAM: all observations of a scan at once, by Numba kernels as fast as a BLAS.
+"""The stacked update of EKF-SLAM: all observations of a scan at once, as Numba kernels.
 
     S = H P Hᵀ + R = L Lᵀ,  W = L⁻¹ H P,  x += Wᵀ L⁻¹ ν,  P ← P − Wᵀ W
 
 (theory.md A, observe; the same as P − K S Kᵀ). From fifty landmarks on most of the time goes into the last
-product. A BLAS would spread it over threads, and then round otherwise than on one; but one seed must give the same
-bits everywhere.
+product, which is :mod:`slam.tiles`'.
 """
 
 from __future__ import annotations
@@ -19,8 +18,9 @@ from numpy.typing import NDArray
 from slam.association import predicted
 from slam.geometry import wrap_scalar
 from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
+from slam.tiles import add_combination, downdate
 
-__all__ = ["SPARE_ROWS", "add_combination", "downdate", "stacked_update", "whiten", "work_space"]
+__all__ = ["SPARE_ROWS", "stacked_update", "whiten", "work_space"]
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def stacked_update(
         nis += s[k, rows] * s[k, rows]
     add_combination(x, n, s[:rows, rows], w)
     x[2] = wrap_scalar(x[2])
-    downdate(p, n, w, rows, 0)
+    downdate(p, n, w, w, rows, 0)
     return rows, nis
 
 
@@ -169,77 +169,3 @@ def _solve_tile(s: Array, w: Array, j: int, rows: int, mask0: Any, mask1: Any) -
             v1 = subtract_product(v1, factor, load(w, (k, j + LANES), mask1))
         store(w, (i, j), mask0, times(s[i, i], v0))
         store(w, (i, j + LANES), mask1, times(s[i, i], v1))
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def add_combination(out: Array, n: int, factors: Array, w: Array) -> None:
-    """Add to ``out`` ``(≥ n,)`` the first rows of ``w``, each times its factor."""
-    for j in range(0, n, LANES):
-        mask = first(n - j)
-        v = load(out, j, mask)
-        for k in range(factors.shape[0]):
-            v = add_product(v, factors[k], load(w, (k, j), mask))
-        store(out, j, mask, v)
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def downdate(p: Array, n: int, w: Array, rows: int, pairs: int) -> None:
-    """Subtract Wᵀ W from the upper triangle of p, W being the first ``rows`` (an even number) of w.
-
-    The rows that follow are ``pairs`` of a and b: of each, a bᵀ + b aᵀ is subtracted, too. The lower triangle of p
-    is undefined after.
-    """
-    whole = n - n % 8
-    for i in range(0, whole, 8):
-        j = i
-        while j + 2 * LANES <= n:
-            _downdate_tile(p, i, j, w, rows, pairs, None, None)
-            j += 2 * LANES
-        if j < n:
-            _downdate_tile(p, i, j, w, rows, pairs, first(n - j), first(n - j - LANES))
-    for i in range(whole, n):
-        for j in range(i, n):
-            for k in range(rows):
-                p[i, j] -= w[k, i] * w[k, j]
-            for k in range(rows, rows + 2 * pairs):
-                p[i, j] -= w[k ^ 1, i] * w[k, j]
-
-
-@njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
-def _downdate_tile(p: Array, i: int, j: int, w: Array, rows: int, pairs: int, mask0: Any, mask1: Any) -> None:
-    """Downdate eight rows of p and two vectors of columns: as much as the registers hold."""
-    r = j + LANES
-    a0, b0 = load(p, (i, j), mask0), load(p, (i, r), mask1)
-    a1, b1 = load(p, (i + 1, j), mask0), load(p, (i + 1, r), mask1)
-    a2, b2 = load(p, (i + 2, j), mask0), load(p, (i + 2, r), mask1)
-    a3, b3 = load(p, (i + 3, j), mask0), load(p, (i + 3, r), mask1)
-    a4, b4 = load(p, (i + 4, j), mask0), load(p, (i + 4, r), mask1)
-    a5, b5 = load(p, (i + 5, j), mask0), load(p, (i + 5, r), mask1)
-    a6, b6 = load(p, (i + 6, j), mask0), load(p, (i + 6, r), mask1)
-    a7, b7 = load(p, (i + 7, j), mask0), load(p, (i + 7, r), mask1)
-    for k in range(rows + 2 * pairs):
-        left, x, y = w[k if k < rows else k ^ 1], load(w, (k, j), mask0), load(w, (k, r), mask1)
-        a0, b0 = subtract_product(a0, left[i], x), subtract_product(b0, left[i], y)
-        a1, b1 = subtract_product(a1, left[i + 1], x), subtract_product(b1, left[i + 1], y)
-        a2, b2 = subtract_product(a2, left[i + 2], x), subtract_product(b2, left[i + 2], y)
-        a3, b3 = subtract_product(a3, left[i + 3], x), subtract_product(b3, left[i + 3], y)
-        a4, b4 = subtract_product(a4, left[i + 4], x), subtract_product(b4, left[i + 4], y)
-        a5, b5 = subtract_product(a5, left[i + 5], x), subtract_product(b5, left[i + 5], y)
-        a6, b6 = subtract_product(a6, left[i + 6], x), subtract_product(b6, left[i + 6], y)
-        a7, b7 = subtract_product(a7, left[i + 7], x), subtract_product(b7, left[i + 7], y)
-    store(p, (i, j), mask0, a0)
-    store(p, (i + 1, j), mask0, a1)
-    store(p, (i + 2, j), mask0, a2)
-    store(p, (i + 3, j), mask0, a3)
-    store(p, (i + 4, j), mask0, a4)
-    store(p, (i + 5, j), mask0, a5)
-    store(p, (i + 6, j), mask0, a6)
-    store(p, (i + 7, j), mask0, a7)
-    store(p, (i, r), mask1, b0)
-    store(p, (i + 1, r), mask1, b1)
-    store(p, (i + 2, r), mask1, b2)
-    store(p, (i + 3, r), mask1, b3)
-    store(p, (i + 4, r), mask1, b4)
-    store(p, (i + 5, r), mask1, b5)
-    store(p, (i + 6, r), mask1, b6)
-    store(p, (i + 7, r), mask1, b7)

@@ -82,7 +82,7 @@ def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
             backend.predict(odometry)
             backend.observe(seen)
     assert compressed.landmark_count > compressed._book.count
-    first = int(compressed._far_ids[0])
+    first = int(compressed._map_ids[compressed._far[0]])
     d = landmarks[first] - pose[:2] - OFFSET * np.array([math.cos(pose[2]), math.sin(pose[2])])
     far = Observations(
         np.array([[np.hypot(*d), math.atan2(d[1], d[0]) - pose[2]]]), NOISE[None], np.array([first])

@@ -14,7 +14,8 @@ from numba import njit
 
 import slam
 from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
-from slam.stacked_update import SPARE_ROWS, add_combination, downdate
+from slam.stacked_update import SPARE_ROWS
+from slam.tiles import add_combination, downdate, product
 from tests.slam.simulated import circle_twist, drive, observe_landmarks
 
 STEPS = 12
@@ -67,7 +68,7 @@ def test_downdate_is_the_plain_product(n: int, observations: int, pairs: int) ->
     rows = 2 * observations
     p, w = rng.normal(size=(n + 2, n + 2)), rng.normal(size=(rows + SPARE_ROWS, n + 2))
     out = p.copy()
-    downdate(out, n, w, rows, pairs)
+    downdate(out, n, w, w, rows, pairs)
     a, b = w[rows : rows + 2 * pairs : 2, :n], w[rows + 1 : rows + 2 * pairs : 2, :n]
     want = p[:n, :n] - w[:rows, :n].T @ w[:rows, :n] - a.T @ b - b.T @ a
     np.testing.assert_allclose(np.triu(out[:n, :n]), np.triu(want), atol=1e-12)
@@ -80,8 +81,8 @@ def test_an_entry_s_bits_do_not_depend_on_its_place_in_a_tile(n: int) -> None:
     rng = np.random.default_rng(n)
     p, w = rng.normal(size=(100, 100)), rng.normal(size=(10, 100))
     part, whole = p.copy(), p.copy()
-    downdate(part, n, w, 10, 0)
-    downdate(whole, 100, w, 10, 0)
+    downdate(part, n, w, w, 10, 0)
+    downdate(whole, 100, w, w, 10, 0)
     np.testing.assert_array_equal(np.triu(part[:n, :n]), np.triu(whole[:n, :n]))
 
 
@@ -93,6 +94,15 @@ def test_add_combination_is_the_plain_product(n: int, rows: int) -> None:
     want[:n] += factors @ w[:rows]
     add_combination(out, n, factors, w)
     np.testing.assert_allclose(out, want, atol=1e-12)
+
+
+@given(sizes, sizes, st.integers(0, 30))
+def test_product_is_the_plain_one(height: int, n: int, depth: int) -> None:
+    rng = np.random.default_rng(n)
+    a, b = rng.normal(size=(height, depth)), rng.normal(size=(depth, n + 3))
+    out = product(a, b, n)
+    np.testing.assert_allclose(out[:, :n], a @ b[:, :n], atol=1e-12)
+    assert not out[:, n:].any()
 
 
 @pytest.mark.parametrize("name", ["ekf", "compressed-ekf"])
