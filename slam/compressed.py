@@ -24,10 +24,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.ekf import EkfConfig, EkfSlam
+from slam.joint_gaussian import symmetric_block
 from slam.landmarks import KIND
 from slam.lanes import aligned_zeros
 from slam.settings import require
-from slam.tiles import add_combination, downdate, product
+from slam.stacked_update import solve
+from slam.tiles import add_combination, downdate, product, subtract
 from slam.types import LINE, Belief, Observations, Odometry, Scan
 
 __all__ = ["CompressedEkfConfig", "CompressedEkfSlam"]
@@ -78,10 +80,10 @@ class CompressedEkfSlam(EkfSlam):
     def _begin_region(self) -> None:
         n = self._n
         self._n0 = n
-        self._phi = np.zeros((n + 16, n))
-        self._phi[:n] = np.eye(n)
-        self._psi, self._theta = np.zeros((n, n)), np.zeros(n)
-        self._u = np.zeros((len(self._s), n))
+        self._phi = aligned_zeros(n + 16, n)
+        self._phi[:n, :n] = np.eye(n)
+        self._minus_psi, self._theta = aligned_zeros(n, n), np.zeros(n)  # the upper triangle of −Ψ
+        self._u = aligned_zeros(len(self._s), n)
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -111,13 +113,22 @@ class CompressedEkfSlam(EkfSlam):
         super()._correct(z, match)
         if self.nis_dof and len(self._far):
             _postpone(
-                self._phi, self._psi, self._theta, self._u, self._n, self._n0, match, self._h, self._w, self._s
+                self._phi,
+                self._minus_psi,
+                self._theta,
+                self._u,
+                self._n,
+                self._n0,
+                match,
+                self._h,
+                self._w,
+                self._s,
             )
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
-        kept = self._phi.copy(), self._psi.copy(), self._theta.copy()  # this correction is only a trial
+        kept = self._phi.copy(), self._minus_psi.copy(), self._theta.copy()  # this correction is only a trial
         value = super()._fit(z, match, scan)
-        self._phi, self._psi, self._theta = kept
+        self._phi, self._minus_psi, self._theta = kept
         return value
 
     def _add(self, z: Array, known_id: int | None) -> None:
@@ -152,7 +163,7 @@ class CompressedEkfSlam(EkfSlam):
 
     def _enlarge(self) -> None:
         super()._enlarge()
-        self._u = np.zeros((len(self._s), self._n0))
+        self._u = aligned_zeros(len(self._s), self._n0)
 
     # ---- regions -------------------------------------------------------------------------------------------
 
@@ -194,8 +205,10 @@ class CompressedEkfSlam(EkfSlam):
         if len(self._far):
             size, cross = 5 + 2 * int(self._far.max()), self._cross
             add_combination(self._map_x, size, self._theta, cross)
-            downdate(self._map_p, size, cross, product(self._psi, cross, size), self._n0, 0)
-            self._cross = product(self._phi[: self._n], cross, size)
+            psi = np.empty((self._n0, self._n0))
+            symmetric_block(-self._minus_psi, psi)
+            downdate(self._map_p, size, cross, product(psi, cross, size), self._n0, 0)
+            self._cross = product(self._phi[: self._n, : self._n0], cross, size)
         self._begin_region()
 
     def _write_back(self) -> None:
@@ -294,12 +307,12 @@ def _distance(x: Array, marks: Array, px: float, py: float) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _postpone(
-    phi: Array, psi: Array, theta: Array, u: Array, n: int, n0: int, match: NDArray[np.int64], h: Array, w: Array,
-    s: Array,
+    phi: Array, minus_psi: Array, theta: Array, u: Array, n: int, n0: int, match: NDArray[np.int64], h: Array,
+    w: Array, s: Array,
 ) -> None:  # fmt: skip
     """Gather what an update does to the rest of the map; ``w`` and ``s`` as :func:`whiten` left them.
 
-    With U = L⁻¹ H Φ: Ψ += Uᵀ U, θ += Uᵀ L⁻¹ ν, Φ −= Wᵀ U.
+    With U = L⁻¹ H Φ: Ψ += Uᵀ U, θ += Uᵀ L⁻¹ ν, Φ −= Wᵀ U. Of −Ψ only the upper triangle is kept.
     """
     rows = 0
     for k in range(match.shape[0]):
@@ -307,36 +320,16 @@ def _postpone(
             continue
         m = 3 + 2 * match[k]
         hk = h[rows // 2]
+        u[rows, :n0] = 0.0
+        u[rows + 1, :n0] = 0.0
         for e in range(2):
-            ue = u[rows + e, :n0]
-            for j in range(n0):
-                ue[j] = hk[e, 3] * phi[m, j] + hk[e, 4] * phi[m + 1, j]
-            for q in range(3):
-                factor, pq = hk[e, q], phi[q]
-                for j in range(n0):
-                    ue[j] += factor * pq[j]
+            add_combination(u[rows + e], n0, hk[e, :3], phi)
+            add_combination(u[rows + e], n0, hk[e, 3:], phi[m:])
         rows += 2
-    for i in range(rows):
-        ui = u[i, :n0]
-        for j in range(i):
-            factor, uj = s[j, i], u[j]
-            for q in range(n0):
-                ui[q] -= factor * uj[q]
-        inverse, y = s[i, i], s[i, rows]
-        for q in range(n0):
-            ui[q] *= inverse
-            theta[q] += y * ui[q]
-    for i in range(rows):
-        ui = u[i, :n0]
-        for a in range(n0):
-            factor, row = ui[a], psi[a]
-            for q in range(n0):
-                row[q] += factor * ui[q]
-        wi = w[i]
-        for a in range(n):
-            factor, row = wi[a], phi[a]
-            for q in range(n0):
-                row[q] -= factor * ui[q]
+    solve(s, u, n0, rows)
+    add_combination(theta, n0, s[:rows, rows], u)
+    downdate(minus_psi, n0, u, u, rows, 0)
+    subtract(phi, n, n0, w, u, rows)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

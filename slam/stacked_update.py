@@ -20,7 +20,7 @@ from slam.geometry import wrap_scalar
 from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
 from slam.tiles import add_combination, downdate
 
-__all__ = ["SPARE_ROWS", "stacked_update", "whiten", "work_space"]
+__all__ = ["SPARE_ROWS", "solve", "stacked_update", "whiten", "work_space"]
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def whiten(
             s[a + 1, a + 1] += z[k, 4]
             a += 2
     _cholesky(s, rows)
-    _solve(s, w, n, rows)
+    solve(s, w, n, rows)
     return rows
 
 
@@ -149,7 +149,7 @@ def _cholesky(s: Array, rows: int) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _solve(s: Array, w: Array, n: int, rows: int) -> None:
+def solve(s: Array, w: Array, n: int, rows: int) -> None:
     """Multiply W by L⁻¹ in place, a few columns at a time from top to bottom."""
     j = 0
     while j + 2 * LANES <= n:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product
 
-__all__ = ["add_combination", "downdate", "product"]
+__all__ = ["add_combination", "downdate", "product", "subtract"]
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ _HEIGHT, _WIDTH = 8, 2 * LANES  # of a tile: as much as the registers hold
 def product(a: Array, b: Array, n: int) -> Array:
     """Return a b, of whose columns the first ``n`` are computed and the others zero."""
     out = aligned_zeros(len(a), b.shape[1])
-    _product(out, np.ascontiguousarray(-a.T), a, b, n)
+    subtract(out, len(a), n, np.ascontiguousarray(-a.T), b, a.shape[1])
     return out
 
 
@@ -63,17 +63,22 @@ def downdate(p: Array, n: int, left: Array, right: Array, rows: int, pairs: int)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _product(out: Array, minus_a_t: Array, a: Array, b: Array, n: int) -> None:
-    """Add a b to ``out``; −aᵀ is given as well, since a tile takes its factors by columns, and subtracts."""
-    depth, whole = a.shape[1], a.shape[0] - a.shape[0] % _HEIGHT
+def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: int) -> None:
+    """Subtract the product Lᵀ R of two arrays' first ``rows`` from ``out[:height, :n]``."""
+    whole = height - height % _HEIGHT
     for i in range(0, whole, _HEIGHT):
         for j in range(0, n, _WIDTH):
             if j + _WIDTH <= n:
-                _tile(out, i, j, minus_a_t, b, depth, 0, None, None)
+                _tile(out, i, j, left, right, rows, 0, None, None)
             else:
-                _tile(out, i, j, minus_a_t, b, depth, 0, first(n - j), first(n - j - LANES))
-    for i in range(whole, a.shape[0]):
-        add_combination(out[i], n, a[i], b)
+                _tile(out, i, j, left, right, rows, 0, first(n - j), first(n - j - LANES))
+    for i in range(whole, height):
+        for j in range(0, n, LANES):
+            mask = first(n - j)
+            v = load(out, (i, j), mask)
+            for k in range(rows):
+                v = subtract_product(v, left[k, i], load(right, (k, j), mask))
+            store(out, (i, j), mask, v)
 
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
