@@ -27,7 +27,10 @@ else:
 
 __all__ = ["LANES", "add_product", "aligned_zeros", "first", "load", "store", "subtract_product", "times"]
 
-LANES = 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
+try:
+    LANES = 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
+except RuntimeError:  # LLVM cannot tell on every kind of machine
+    LANES = 4
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _MASK = ir.VectorType(ir.IntType(1), LANES)

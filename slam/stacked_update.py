@@ -46,14 +46,13 @@ def stacked_update(
     ``p`` is an upper triangle; the lower one is undefined after. ``h``, ``w``, ``s`` are a :func:`work_space`.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
-    if rows == 0:
-        return 0, 0.0
     nis = 0.0
     for k in range(rows):
         nis += s[k, rows] * s[k, rows]
     add_combination(x, n, s[:rows, rows], w)
     x[2] = wrap_scalar(x[2])
-    downdate(p, n, w, w, rows, 0)
+    if rows > 0:
+        downdate(p, n, w, w, rows, 0)
     return rows, nis
 
 
