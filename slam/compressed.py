@@ -105,25 +105,20 @@ class CompressedEkfSlam(EkfSlam):
         rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
         finite = rb[np.isfinite(rb[:, 0]), 0]
         self._settle(float(finite.max()) if len(finite) else 0.0)
-        if observations.ids is not None and np.isin(observations.ids, self._map_ids[self._far]).any():
-            self._choose_region(np.asarray(observations.ids))
+        if observations.ids is not None:
+            ids = np.asarray(observations.ids)
+            strangers = [int(i) for i in ids if self._book.row(int(i)) < 0]  # mostly none, which is soon seen
+            if strangers and np.isin(strangers, self._map_ids[self._far]).any():
+                self._choose_region(ids)
         super().observe(observations)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         super()._correct(z, match)
         if self.nis_dof and len(self._far):
             _postpone(
-                self._phi,
-                self._minus_psi,
-                self._theta,
-                self._u,
-                self._n,
-                self._n0,
-                match,
-                self._h,
-                self._w,
+                self._phi, self._minus_psi, self._theta, self._u, self._n, self._n0, match, self._h, self._w,
                 self._s,
-            )
+            )  # fmt: skip
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
         kept = self._phi.copy(), self._minus_psi.copy(), self._theta.copy()  # this correction is only a trial
