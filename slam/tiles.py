@@ -18,7 +18,8 @@ __all__ = ["add_combination", "downdate", "product", "subtract"]
 
 Array = NDArray[np.float64]
 
-_HEIGHT, _WIDTH = 8, 2 * LANES  # of a tile: as much as the registers hold
+# Of a tile: what sixteen registers hold, AVX2's. With the thirty-two of AVX-512 a larger one is 5 % faster.
+_HEIGHT, _WIDTH = 4, 3 * LANES
 
 
 def product(a: Array, b: Array, n: int) -> Array:
@@ -48,12 +49,16 @@ def downdate(p: Array, n: int, left: Array, right: Array, rows: int, pairs: int)
     """
     whole = n - n % _HEIGHT
     for i in range(0, whole, _HEIGHT):
-        j = i
+        j = i - i % LANES
         while j + _WIDTH <= n:
-            _tile(p, i, j, left, right, rows, pairs, None, None)
+            _tile(p, i, j, left, right, rows, pairs, None, None, None)
             j += _WIDTH
         if j < n:
-            _tile(p, i, j, left, right, rows, pairs, first(n - j), first(n - j - LANES))
+            rest = n - j
+            _tile(
+                p, i, j, left, right, rows, pairs,
+                first(rest), first(rest - LANES), first(rest - 2 * LANES),
+            )  # fmt: skip
     for i in range(whole, n):
         for j in range(i, n):
             for k in range(rows):
@@ -68,10 +73,14 @@ def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: i
     whole = height - height % _HEIGHT
     for i in range(0, whole, _HEIGHT):
         for j in range(0, n, _WIDTH):
-            if j + _WIDTH <= n:
-                _tile(out, i, j, left, right, rows, 0, None, None)
+            rest = n - j
+            if rest >= _WIDTH:
+                _tile(out, i, j, left, right, rows, 0, None, None, None)
             else:
-                _tile(out, i, j, left, right, rows, 0, first(n - j), first(n - j - LANES))
+                _tile(
+                    out, i, j, left, right, rows, 0,
+                    first(rest), first(rest - LANES), first(rest - 2 * LANES),
+                )  # fmt: skip
     for i in range(whole, height):
         for j in range(0, n, LANES):
             mask = first(n - j)
@@ -83,41 +92,33 @@ def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: i
 
 @njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
 def _tile(
-    p: Array, i: int, j: int, left: Array, right: Array, rows: int, pairs: int, mask0: Any, mask1: Any
+    p: Array, i: int, j: int, left: Array, right: Array, rows: int, pairs: int, mask0: Any, mask1: Any, mask2: Any
 ) -> None:
-    """Subtract a tile of Lᵀ R, eight rows and two vectors of columns, from p at (i, j)."""
-    r = j + LANES
-    a0, b0 = load(p, (i, j), mask0), load(p, (i, r), mask1)
-    a1, b1 = load(p, (i + 1, j), mask0), load(p, (i + 1, r), mask1)
-    a2, b2 = load(p, (i + 2, j), mask0), load(p, (i + 2, r), mask1)
-    a3, b3 = load(p, (i + 3, j), mask0), load(p, (i + 3, r), mask1)
-    a4, b4 = load(p, (i + 4, j), mask0), load(p, (i + 4, r), mask1)
-    a5, b5 = load(p, (i + 5, j), mask0), load(p, (i + 5, r), mask1)
-    a6, b6 = load(p, (i + 6, j), mask0), load(p, (i + 6, r), mask1)
-    a7, b7 = load(p, (i + 7, j), mask0), load(p, (i + 7, r), mask1)
+    """Subtract a tile of Lᵀ R, four rows and three vectors of columns, from p at (i, j)."""
+    j1, j2 = j + LANES, j + 2 * LANES
+    a0, b0, c0 = load(p, (i, j), mask0), load(p, (i, j1), mask1), load(p, (i, j2), mask2)
+    a1, b1, c1 = load(p, (i + 1, j), mask0), load(p, (i + 1, j1), mask1), load(p, (i + 1, j2), mask2)
+    a2, b2, c2 = load(p, (i + 2, j), mask0), load(p, (i + 2, j1), mask1), load(p, (i + 2, j2), mask2)
+    a3, b3, c3 = load(p, (i + 3, j), mask0), load(p, (i + 3, j1), mask1), load(p, (i + 3, j2), mask2)
     for k in range(rows + 2 * pairs):
-        f, x, y = left[k if k < rows else k ^ 1], load(right, (k, j), mask0), load(right, (k, r), mask1)
-        a0, b0 = subtract_product(a0, f[i], x), subtract_product(b0, f[i], y)
-        a1, b1 = subtract_product(a1, f[i + 1], x), subtract_product(b1, f[i + 1], y)
-        a2, b2 = subtract_product(a2, f[i + 2], x), subtract_product(b2, f[i + 2], y)
-        a3, b3 = subtract_product(a3, f[i + 3], x), subtract_product(b3, f[i + 3], y)
-        a4, b4 = subtract_product(a4, f[i + 4], x), subtract_product(b4, f[i + 4], y)
-        a5, b5 = subtract_product(a5, f[i + 5], x), subtract_product(b5, f[i + 5], y)
-        a6, b6 = subtract_product(a6, f[i + 6], x), subtract_product(b6, f[i + 6], y)
-        a7, b7 = subtract_product(a7, f[i + 7], x), subtract_product(b7, f[i + 7], y)
+        row = left[k if k < rows else k ^ 1]
+        x, y, z = load(right, (k, j), mask0), load(right, (k, j1), mask1), load(right, (k, j2), mask2)
+        f0, f1, f2, f3 = row[i], row[i + 1], row[i + 2], row[i + 3]
+        a0, a1 = subtract_product(a0, f0, x), subtract_product(a1, f1, x)
+        a2, a3 = subtract_product(a2, f2, x), subtract_product(a3, f3, x)
+        b0, b1 = subtract_product(b0, f0, y), subtract_product(b1, f1, y)
+        b2, b3 = subtract_product(b2, f2, y), subtract_product(b3, f3, y)
+        c0, c1 = subtract_product(c0, f0, z), subtract_product(c1, f1, z)
+        c2, c3 = subtract_product(c2, f2, z), subtract_product(c3, f3, z)
     store(p, (i, j), mask0, a0)
     store(p, (i + 1, j), mask0, a1)
     store(p, (i + 2, j), mask0, a2)
     store(p, (i + 3, j), mask0, a3)
-    store(p, (i + 4, j), mask0, a4)
-    store(p, (i + 5, j), mask0, a5)
-    store(p, (i + 6, j), mask0, a6)
-    store(p, (i + 7, j), mask0, a7)
-    store(p, (i, r), mask1, b0)
-    store(p, (i + 1, r), mask1, b1)
-    store(p, (i + 2, r), mask1, b2)
-    store(p, (i + 3, r), mask1, b3)
-    store(p, (i + 4, r), mask1, b4)
-    store(p, (i + 5, r), mask1, b5)
-    store(p, (i + 6, r), mask1, b6)
-    store(p, (i + 7, r), mask1, b7)
+    store(p, (i, j1), mask1, b0)
+    store(p, (i + 1, j1), mask1, b1)
+    store(p, (i + 2, j1), mask1, b2)
+    store(p, (i + 3, j1), mask1, b3)
+    store(p, (i, j2), mask2, c0)
+    store(p, (i + 1, j2), mask2, c1)
+    store(p, (i + 2, j2), mask2, c2)
+    store(p, (i + 3, j2), mask2, c3)
