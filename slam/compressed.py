@@ -9,7 +9,8 @@ small matrices: Φ, by which P_ab changes from the left, Ψ and θ, by which P_b
     flush     x_b += P_ba θ,  P_bb −= P_ba Ψ P_ab,  P_ab ← Φ P_ab
 
 The flush is exact: the result is that of the full filter. It comes when the robot leaves the region, and when the
-belief is read.
+belief is read. Every landmark has a fixed place in the map's own state and covariance, so that taking another
+region moves the rows of its landmarks only.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.blas import product
 from slam.ekf import EkfConfig, EkfSlam
 from slam.joint_gaussian import symmetric_block
 from slam.landmarks import KIND
+from slam.lanes import aligned_zeros
 from slam.settings import require
+from slam.stacked_update import solve
+from slam.tiles import add_combination, downdate, product, subtract
 from slam.types import LINE, Belief, Observations, Odometry, Scan
 
 __all__ = ["CompressedEkfConfig", "CompressedEkfSlam"]
@@ -60,23 +63,27 @@ class CompressedEkfSlam(EkfSlam):
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
-        self._far_ids = np.zeros(0, np.int64)
-        self._far_marks = np.zeros((0, 8))
-        self._far_x = np.zeros(0)
-        self._far_p = np.zeros((0, 0))  # P_bb, both triangles
-        self._cross = np.zeros((3, 0))  # P_ab of the last flush
+        # The whole map: what belongs to the region is out of date here until it is left.
+        self._map_x = np.zeros(len(self._x))
+        self._map_p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
+        self._map_ids = np.zeros(len(self._x) // 2, np.int64)
+        self._map_marks = np.zeros((len(self._map_ids), 8))
+        self._near = np.zeros(0, np.int64)  # the places of the region's landmarks, in its order
+        self._far = np.zeros(0, np.int64)  # those of all the others
+        self._free: list[int] = []  # those of landmarks that were dropped
         self._centre = (float(pose[0]), float(pose[1]))
         self._reach = 0.0  # how far the sensor sees [m]: lately, or as it says itself
         self._made_for = 0.0  # that, when the region was chosen
+        self._cross = np.zeros((3, len(self._x)))  # P_ab of the last flush; zero where b is not far
         self._begin_region()
 
     def _begin_region(self) -> None:
         n = self._n
         self._n0 = n
-        self._phi = np.zeros((n + 16, n))
-        self._phi[:n] = np.eye(n)
-        self._psi, self._theta = np.zeros((n, n)), np.zeros(n)
-        self._u = np.zeros((len(self._w), n))
+        self._phi = aligned_zeros(n + 16, n)
+        self._phi[:n, :n] = np.eye(n)
+        self._minus_psi, self._theta = aligned_zeros(n, n), np.zeros(n)  # the upper triangle of −Ψ
+        self._u = aligned_zeros(len(self._s), n)
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -98,21 +105,25 @@ class CompressedEkfSlam(EkfSlam):
         rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
         finite = rb[np.isfinite(rb[:, 0]), 0]
         self._settle(float(finite.max()) if len(finite) else 0.0)
-        if observations.ids is not None and np.isin(observations.ids, self._far_ids).any():
-            self._choose_region(np.asarray(observations.ids))
+        if observations.ids is not None:
+            ids = np.asarray(observations.ids)
+            strangers = [int(i) for i in ids if self._book.row(int(i)) < 0]  # mostly none, which is soon seen
+            if strangers and np.isin(strangers, self._map_ids[self._far]).any():
+                self._choose_region(ids)
         super().observe(observations)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         super()._correct(z, match)
-        if self.nis_dof and len(self._far_ids):
+        if self.nis_dof and len(self._far):
             _postpone(
-                self._phi, self._psi, self._theta, self._u, self._n, self._n0, match, self._h, self._w, self._s
-            )
+                self._phi, self._minus_psi, self._theta, self._u, self._n, self._n0, match, self._h, self._w,
+                self._s,
+            )  # fmt: skip
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
-        kept = self._phi.copy(), self._psi.copy(), self._theta.copy()  # this correction is only a trial
+        kept = self._phi.copy(), self._minus_psi.copy(), self._theta.copy()  # this correction is only a trial
         value = super()._fit(z, match, scan)
-        self._phi, self._psi, self._theta = kept
+        self._phi, self._minus_psi, self._theta = kept
         return value
 
     def _add(self, z: Array, known_id: int | None) -> None:
@@ -134,15 +145,20 @@ class CompressedEkfSlam(EkfSlam):
             phi[n] = phi[0] - away_y * phi[2]
             phi[n + 1] = phi[1] + away_x * phi[2]
         super()._add(z, known_id)
+        if not self._free:
+            self._free.append(len(self._near) + len(self._far))  # every place before it is taken
+        self._near = np.append(self._near, self._free.pop())
 
     def _drop(self, row: int) -> None:
         n, i = self._n, 3 + 2 * row
         self._phi[i : n - 2] = self._phi[i + 2 : n]
+        self._free.append(int(self._near[row]))
+        self._near = np.delete(self._near, row)
         super()._drop(row)
 
     def _enlarge(self) -> None:
         super()._enlarge()
-        self._u = np.zeros((len(self._w), self._n0))
+        self._u = aligned_zeros(len(self._s), self._n0)
 
     # ---- regions -------------------------------------------------------------------------------------------
 
@@ -150,7 +166,7 @@ class CompressedEkfSlam(EkfSlam):
         """Take another region where the robot has left this one, or sees farther than it was made for."""
         share, margin = self.config.leave_share, self.config.margin_m
         self._reach = max(reach, 0.95 * self._reach)
-        beyond = reach > self._made_for + margin and len(self._far_ids) > 0
+        beyond = reach > self._made_for + margin and len(self._far) > 0
         moved = math.hypot(self._x[0] - self._centre[0], self._x[1] - self._centre[1])
         if beyond or moved > share * max(self._made_for, margin) or self._reach < 0.5 * self._made_for:
             self._choose_region(np.zeros(0, np.int64))
@@ -158,39 +174,55 @@ class CompressedEkfSlam(EkfSlam):
     def _choose_region(self, also: NDArray[np.int64]) -> None:
         """Flush, and filter from now on what is near the robot, and the landmarks with these ids."""
         self.flush()
-        joint, x = self._whole(), np.concatenate([self._x[3 : self._n], self._far_x]).reshape(-1, 2)
-        marks = np.vstack([self._book.marks, self._far_marks])
-        ids = np.concatenate([self._book.ids, self._far_ids])
+        self._write_back()
+        places = np.sort(np.concatenate([self._near, self._far]))
+        marks = self._map_marks[places]
         self._centre, self._made_for = (float(self._x[0]), float(self._x[1])), self._reach
         radius = (1.0 + self.config.leave_share) * self._reach + self.config.margin_m
-        near = _distance(x, marks, *self._centre) < radius
-        near |= np.isin(ids, also)
-        rows, far = np.flatnonzero(near), np.flatnonzero(~near)
-        self._book.replace(ids[rows], marks[rows])
-        a, b = _state_rows(rows, robot=True), _state_rows(far, robot=False)
+        near = _distance(self._map_x[3:].reshape(-1, 2)[places], marks, *self._centre) < radius
+        near |= np.isin(self._map_ids[places], also)
+        self._near, self._far = places[near], places[~near]
+        self._book.replace(self._map_ids[self._near], marks[near])
+        a, b = _state_rows(self._near, robot=True), _state_rows(self._far, robot=False)
         while len(a) + 2 > len(self._x):
             self._enlarge()
         self._n = len(a)
-        self._x[3 : self._n] = x[rows].ravel()
-        self._p[: self._n, : self._n] = joint[np.ix_(a, a)]
-        self._far_ids, self._far_marks, self._far_x = ids[far], marks[far], x[far].ravel()
-        self._far_p, self._cross = joint[np.ix_(b, b)], joint[np.ix_(a, b)]
+        self._x[: self._n] = self._map_x[a]
+        rows = np.empty((len(a), self._map_p.shape[1]))
+        _read_rows(self._map_p, 3 + 2 * (len(places) + len(self._free)), a, rows)
+        self._p[: self._n, : self._n] = rows[:, a]
+        self._cross = aligned_zeros(*rows.shape)
+        self._cross[:, b] = rows[:, b]
         self._begin_region()
 
     def flush(self) -> None:
         """Bring the rest of the map up to date: what the full filter would have."""
-        self._far_x += self._cross.T @ self._theta
-        self._far_p -= product(np.ascontiguousarray(self._cross.T), product(self._psi, self._cross))
-        self._cross = product(self._phi[: self._n], self._cross)
+        if len(self._far):
+            size, cross = 5 + 2 * int(self._far.max()), self._cross
+            add_combination(self._map_x, size, self._theta, cross)
+            psi = np.empty((self._n0, self._n0))
+            symmetric_block(-self._minus_psi, psi)
+            downdate(self._map_p, size, cross, product(psi, cross, size), self._n0, 0)
+            self._cross = product(self._phi[: self._n, : self._n0], cross, size)
         self._begin_region()
 
-    def _whole(self) -> Array:
-        """Return the joint covariance, region first; right after a flush."""
-        n, m = self._n, len(self._far_x)
-        joint = np.empty((n + m, n + m))
-        symmetric_block(self._p, joint[:n, :n])
-        joint[:n, n:], joint[n:, :n], joint[n:, n:] = self._cross, self._cross.T, self._far_p
-        return joint
+    def _write_back(self) -> None:
+        """Write the region into the whole map; right after a flush."""
+        a, b = _state_rows(self._near, robot=True), _state_rows(self._far, robot=False)
+        needed = int(max(a.max(), b.max(initial=0))) + 1
+        if needed > len(self._map_x):
+            self._enlarge_map(2 * needed + 1)
+        self._map_x[a] = self._x[: self._n]
+        self._map_ids[self._near], self._map_marks[self._near] = self._book.ids, self._book.marks
+        _write_rows(self._map_p, a, b, self._p, self._cross)
+
+    def _enlarge_map(self, size: int) -> None:
+        old = len(self._map_x)
+        x, p, ids, marks = self._map_x, self._map_p, self._map_ids, self._map_marks
+        self._map_x, self._map_p = np.zeros(size), aligned_zeros(size, size)
+        self._map_ids, self._map_marks = np.zeros(size // 2, np.int64), np.zeros((size // 2, 8))
+        self._map_x[:old], self._map_p[:old, :old] = x, p[:old, :old]
+        self._map_ids[: len(ids)], self._map_marks[: len(ids)] = ids, marks
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
@@ -198,16 +230,20 @@ class CompressedEkfSlam(EkfSlam):
     def joint_cov(self) -> Array:
         """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, the region's first."""
         self.flush()
-        return self._whole()
+        self._write_back()
+        out = np.empty((self._n + 2 * len(self._far),) * 2)
+        rows = np.concatenate([_state_rows(self._near, robot=True), _state_rows(self._far, robot=False)])
+        _read_block(self._map_p, rows, out)
+        return out
 
     @property
     def landmark_count(self) -> int:
         """Number of landmarks in the map."""
-        return self._book.count + len(self._far_ids)
+        return self._book.count + len(self._far)
 
     def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
         """Return per landmark how often it was seen and its direction, in the belief's order."""
-        marks = np.vstack([self._book.marks, self._far_marks])
+        marks = np.vstack([self._book.marks, self._map_marks[self._far]])
         marks = marks[marks[:, 0] != LINE]
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
@@ -215,9 +251,9 @@ class CompressedEkfSlam(EkfSlam):
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance and grid; reading it costs a flush."""
         joint = self.joint_cov
-        marks = np.vstack([self._book.marks, self._far_marks])
-        ids = np.concatenate([self._book.ids, self._far_ids])
-        x = np.concatenate([self._x[3 : self._n], self._far_x]).reshape(-1, 2)
+        marks = np.vstack([self._book.marks, self._map_marks[self._far]])
+        ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
+        x = self._all_points()
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
         keep = _state_rows(rows, robot=True)
         joint = joint[np.ix_(keep, keep)]
@@ -236,10 +272,14 @@ class CompressedEkfSlam(EkfSlam):
         )
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
-        ids = np.concatenate([self._book.ids, self._far_ids])
+        ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
         row_of_id = np.full(max(len(self._book.row_of_id), int(ids.max(initial=0)) + 1), -1, np.int64)
         row_of_id[ids] = np.arange(len(ids))
-        return np.concatenate([self._x[3 : self._n], self._far_x]).reshape(-1, 2), row_of_id
+        return self._all_points(), row_of_id
+
+    def _all_points(self) -> Array:
+        """Return every landmark's estimate ``(n, 2)``, the region's first."""
+        return np.concatenate([self._points, self._map_x[3:].reshape(-1, 2)[self._far]])
 
 
 def _state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
@@ -262,47 +302,57 @@ def _distance(x: Array, marks: Array, px: float, py: float) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _postpone(
-    phi: Array, psi: Array, theta: Array, u: Array, n: int, n0: int, match: NDArray[np.int64], h: Array, w: Array,
-    s: Array,
+    phi: Array, minus_psi: Array, theta: Array, u: Array, n: int, n0: int, match: NDArray[np.int64], h: Array,
+    w: Array, s: Array,
 ) -> None:  # fmt: skip
     """Gather what an update does to the rest of the map; ``w`` and ``s`` as :func:`whiten` left them.
 
-    With U = L⁻¹ H Φ: Ψ += Uᵀ U, θ += Uᵀ L⁻¹ ν, Φ −= Wᵀ U.
+    With U = L⁻¹ H Φ: Ψ += Uᵀ U, θ += Uᵀ L⁻¹ ν, Φ −= Wᵀ U. Of −Ψ only the upper triangle is kept.
     """
     rows = 0
-    column = s.shape[1] - 1
     for k in range(match.shape[0]):
         if match[k] < 0:
             continue
         m = 3 + 2 * match[k]
         hk = h[rows // 2]
+        u[rows, :n0] = 0.0
+        u[rows + 1, :n0] = 0.0
         for e in range(2):
-            ue = u[rows + e, :n0]
-            for j in range(n0):
-                ue[j] = hk[e, 3] * phi[m, j] + hk[e, 4] * phi[m + 1, j]
-            for q in range(3):
-                factor, pq = hk[e, q], phi[q]
-                for j in range(n0):
-                    ue[j] += factor * pq[j]
+            add_combination(u[rows + e], n0, hk[e, :3], phi)
+            add_combination(u[rows + e], n0, hk[e, 3:], phi[m:])
         rows += 2
-    for i in range(rows):
-        ui = u[i, :n0]
-        for j in range(i):
-            factor, uj = s[i, j], u[j]
-            for q in range(n0):
-                ui[q] -= factor * uj[q]
-        inverse, y = 1.0 / s[i, i], s[i, column]
-        for q in range(n0):
-            ui[q] *= inverse
-            theta[q] += y * ui[q]
-    for i in range(rows):
-        ui = u[i, :n0]
-        for a in range(n0):
-            factor, row = ui[a], psi[a]
-            for q in range(n0):
-                row[q] += factor * ui[q]
-        wi = w[i]
-        for a in range(n):
-            factor, row = wi[a], phi[a]
-            for q in range(n0):
-                row[q] -= factor * ui[q]
+    solve(s, u, n0, rows)
+    add_combination(theta, n0, s[:rows, rows], u)
+    downdate(minus_psi, n0, u, u, rows, 0)
+    subtract(phi, n, n0, w, u, rows)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read_rows(p: Array, n: int, rows: NDArray[np.int64], out: Array) -> None:
+    """Write rows of the symmetric matrix whose upper triangle is p, their first ``n`` columns."""
+    for k in range(rows.shape[0]):
+        i = rows[k]
+        for j in range(min(i, n)):
+            out[k, j] = p[j, i]
+        for j in range(i, n):
+            out[k, j] = p[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+    """Write the block at these rows and columns of the symmetric matrix whose upper triangle is p."""
+    for a in range(rows.shape[0]):
+        for b in range(a, rows.shape[0]):
+            i, j = min(rows[a], rows[b]), max(rows[a], rows[b])
+            out[a, b] = out[b, a] = p[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _write_rows(p: Array, a: NDArray[np.int64], b: NDArray[np.int64], block: Array, cross: Array) -> None:
+    """Write P_aa, an upper triangle, and P_ab, whose columns are the map's own, into p's upper triangle."""
+    for k in range(a.shape[0]):
+        i = a[k]
+        for e in range(k, a.shape[0]):
+            p[min(i, a[e]), max(i, a[e])] = block[k, e]
+        for j in b:
+            p[min(i, j), max(i, j)] = cross[k, j]

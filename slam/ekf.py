@@ -14,24 +14,22 @@ from numpy.typing import NDArray
 
 from slam.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
 from slam.backend import Backend, BackendConfig
-from slam.blas import rank_k_downdate
 from slam.chi_square import chi2_quantile
-from slam.joint_gaussian import add_landmark, near_landmarks, stacked_update, symmetric_block
+from slam.joint_gaussian import add_landmark, near_landmarks, symmetric_block
 from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy
+from slam.lanes import aligned_zeros
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
+from slam.stacked_update import stacked_update, work_space
 from slam.types import LINE, Belief, Observations, Odometry, Scan
 
-__all__ = ["ASSOCIATIONS", "BLAS_FROM", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
+__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
 
 Array = NDArray[np.float64]
 
 ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
 within the gate; or as many as one pose can explain together (JCBB)."""
-
-BLAS_FROM = 181
-"""Size of the state from which BLAS subtracts Wᵀ W: below, its calls cost more than the loop (89 landmarks)."""
 
 _MAX_OBSERVATIONS = 64
 _MOST_NODES = 4000
@@ -78,13 +76,11 @@ class EkfSlam(Backend):
         del seed  # nothing here is drawn
         self._n = 3
         self._x = np.zeros(3 + 2 * 32)
-        self._p = np.zeros((len(self._x), len(self._x)))  # upper triangle
+        self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
         self._x[:3] = pose
         self._p[:3, :3] = np.triu(pose_cov)
         self._book = LandmarkBook(self.config.landmarks)
-        self._w = np.zeros((2 * _MAX_OBSERVATIONS + 2, len(self._x)))  # two spare rows, see _downdate
-        self._s = np.zeros((2 * _MAX_OBSERVATIONS, 2 * _MAX_OBSERVATIONS + 1))
-        self._h = np.zeros((_MAX_OBSERVATIONS, 2, 5))
+        self._h, self._w, self._s = work_space(_MAX_OBSERVATIONS, len(self._x))
         self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(_MAX_OBSERVATIONS)
         self._twist = (0.0, 0.0, 0.0)
@@ -213,12 +209,9 @@ class EkfSlam(Backend):
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""
-        n, small = self._n, self._n < BLAS_FROM
         self.nis_dof, self.nis = stacked_update(
-            self._x, self._p, n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, small
+            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s
         )
-        if not small and self.nis_dof:
-            rank_k_downdate(self._p, n, self._w, self.nis_dof)
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks`)."""
@@ -254,11 +247,11 @@ class EkfSlam(Backend):
 
     def _enlarge(self) -> None:
         size = 2 * len(self._x)
-        x, p = np.zeros(size), np.zeros((size, size))
+        x, p = np.zeros(size), aligned_zeros(size, size)
         x[: self._n] = self._x[: self._n]
         p[: self._n, : self._n] = self._p[: self._n, : self._n]
         self._x, self._p = x, p
-        self._w = np.zeros((2 * _MAX_OBSERVATIONS + 2, size))
+        self._h, self._w, self._s = work_space(_MAX_OBSERVATIONS, size)
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""

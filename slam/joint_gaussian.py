@@ -1,7 +1,7 @@
-"""The arithmetic of EKF-SLAM on a joint Gaussian of the robot and its landmarks, as Numba kernels.
+"""The joint Gaussian of the robot and its landmarks: adding to it and reading it, as Numba kernels.
 
 The covariance is the upper triangle of a square array, the robot's three states first; landmark ``i`` stands at
-index 3 + 2i. Association reads it, too (:mod:`slam.association`).
+index 3 + 2i. Association reads it, too (:mod:`slam.association`); :mod:`slam.stacked_update` corrects it.
 """
 
 from __future__ import annotations
@@ -12,169 +12,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.association import predicted
 from slam.geometry import wrap_scalar
 from slam.types import LINE
 
 __all__ = [
     "OBSERVED_LIMIT",
     "add_landmark",
-    "downdate",
     "near_landmarks",
-    "stacked_update",
     "symmetric_block",
-    "whiten",
 ]
 
 Array = NDArray[np.float64]
 
 OBSERVED_LIMIT = 1e4
 """Bound of what :func:`near_landmarks` writes, m and m²: Gymnasium asks for finite spaces."""
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def stacked_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
-    subtract: bool,
-) -> tuple[int, float]:  # fmt: skip
-    """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
-
-    S = H P Hᵀ + R = L Lᵀ, W = L⁻¹ H P, x += Wᵀ L⁻¹ ν, P ← P − Wᵀ W (theory.md A, observe; the same as
-    P − K S Kᵀ). ``p`` is an upper triangle; ``h``, ``w``, ``s`` are work space. Without ``subtract``, P − Wᵀ W is
-    left to the caller.
-    """
-    rows = whiten(x, p, n, z, match, offset, h, w, s)
-    ns = s.shape[1] - 1
-    nis = 0.0
-    for k in range(rows):
-        y = s[k, ns]
-        nis += y * y
-        wk = w[k]
-        for j in range(n):
-            x[j] += y * wk[j]
-    x[2] = wrap_scalar(x[2])
-    if subtract:
-        downdate(p, n, w, rows)
-    return rows, nis
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def whiten(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
-) -> int:  # fmt: skip
-    """Write W = L⁻¹ H P into ``w`` and L⁻¹ ν into the last column of ``s``; return the number of rows."""
-    rows = 0
-    ns = s.shape[1] - 1  # the last column holds the innovation
-    for k in range(z.shape[0]):
-        if match[k] < 0:
-            continue
-        m = 3 + 2 * match[k]
-        hk = h[rows // 2]
-        rho, bearing = predicted(x, match[k], z[k, 5], offset, hk)
-        s[rows, ns] = z[k, 0] - rho
-        s[rows + 1, ns] = wrap_scalar(z[k, 1] - bearing)
-        _h_times_p(p, n, m, hk, w[rows], w[rows + 1])
-        rows += 2
-    # S, its lower triangle: H W' row by row.
-    a = 0
-    for k in range(z.shape[0]):
-        if match[k] < 0:
-            continue
-        m = 3 + 2 * match[k]
-        hk = h[a // 2]
-        for e in range(2):
-            for b in range(a + 2):
-                v = hk[e, 3] * w[b, m] + hk[e, 4] * w[b, m + 1]
-                for q in range(3):
-                    v += hk[e, q] * w[b, q]
-                s[a + e, b] = v
-        s[a, a] += z[k, 2]
-        s[a + 1, a] += z[k, 3]
-        s[a + 1, a + 1] += z[k, 4]
-        a += 2
-    _cholesky_solve(s, rows, ns, w, n)
-    return rows
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _h_times_p(p: Array, n: int, m: int, h: Array, out0: Array, out1: Array) -> None:
-    """Write both rows of H P for the landmark at state index ``m``, reading P's upper triangle."""
-    # Left of the landmark its part of P stands in the columns m and m + 1.
-    for j in range(m):
-        a, b = p[j, m], p[j, m + 1]
-        out0[j] = h[0, 3] * a + h[0, 4] * b
-        out1[j] = h[1, 3] * a + h[1, 4] * b
-    out0[m] = h[0, 3] * p[m, m] + h[0, 4] * p[m, m + 1]
-    out1[m] = h[1, 3] * p[m, m] + h[1, 4] * p[m, m + 1]
-    right0, right1, pa, pb = out0[m + 1 : n], out1[m + 1 : n], p[m, m + 1 : n], p[m + 1, m + 1 : n]
-    for j in range(right0.shape[0]):
-        right0[j] = h[0, 3] * pa[j] + h[0, 4] * pb[j]
-        right1[j] = h[1, 3] * pa[j] + h[1, 4] * pb[j]
-    for j in range(3):
-        for q in range(3):
-            c = p[q, j] if q <= j else p[j, q]
-            out0[j] += h[0, q] * c
-            out1[j] += h[1, q] * c
-    map0, map1, p0, p1, p2 = out0[3:n], out1[3:n], p[0, 3:n], p[1, 3:n], p[2, 3:n]
-    for j in range(map0.shape[0]):
-        map0[j] += h[0, 0] * p0[j] + h[0, 1] * p1[j] + h[0, 2] * p2[j]
-        map1[j] += h[1, 0] * p0[j] + h[1, 1] * p1[j] + h[1, 2] * p2[j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def _cholesky_solve(s: Array, rows: int, column: int, w: Array, n: int) -> None:
-    """Factor S in place (lower triangle), and turn its last column and the rows of w into L⁻¹ times them."""
-    for i in range(rows):
-        wi = w[i, :n]
-        for j in range(i):
-            v = s[i, j]
-            for k in range(j):
-                v -= s[i, k] * s[j, k]
-            v /= s[j, j]
-            s[i, j] = v
-            s[i, column] -= v * s[j, column]
-            wj = w[j, :n]
-            for q in range(n):
-                wi[q] -= v * wj[q]
-        d = s[i, i]
-        for k in range(i):
-            d -= s[i, k] * s[i, k]
-        root = math.sqrt(d)
-        s[i, i] = root
-        inverse = 1.0 / root
-        s[i, column] *= inverse
-        for q in range(n):
-            wi[q] *= inverse
-
-
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-def downdate(p: Array, n: int, w: Array, rows: int) -> None:
-    """Subtract Wᵀ W from the upper triangle of p; two spare rows of w may be overwritten. ``rows`` is even.
-
-    Four rows of p and four of W at a time, to spare memory traffic; the rows are sliced first, without which the
-    inner loop does not vectorise and takes three times as long. The lower triangle is undefined after.
-    """
-    if rows % 4 != 0:
-        w[rows : rows + 2, :n] = 0.0
-    whole = n - n % 4
-    for i in range(0, whole, 4):
-        p0, p1, p2, p3 = p[i, i:n], p[i + 1, i:n], p[i + 2, i:n], p[i + 3, i:n]
-        for k in range(0, rows, 4):
-            a0, a1, a2, a3 = w[k, i], w[k + 1, i], w[k + 2, i], w[k + 3, i]
-            b0, b1, b2, b3 = w[k, i + 1], w[k + 1, i + 1], w[k + 2, i + 1], w[k + 3, i + 1]
-            c0, c1, c2, c3 = w[k, i + 2], w[k + 1, i + 2], w[k + 2, i + 2], w[k + 3, i + 2]
-            d0, d1, d2, d3 = w[k, i + 3], w[k + 1, i + 3], w[k + 2, i + 3], w[k + 3, i + 3]
-            w0, w1, w2, w3 = w[k, i:n], w[k + 1, i:n], w[k + 2, i:n], w[k + 3, i:n]
-            for j in range(p0.shape[0]):
-                x0, x1, x2, x3 = w0[j], w1[j], w2[j], w3[j]
-                p0[j] -= a0 * x0 + a1 * x1 + (a2 * x2 + a3 * x3)
-                p1[j] -= b0 * x0 + b1 * x1 + (b2 * x2 + b3 * x3)
-                p2[j] -= c0 * x0 + c1 * x1 + (c2 * x2 + c3 * x3)
-                p3[j] -= d0 * x0 + d1 * x1 + (d2 * x2 + d3 * x3)
-    for i in range(whole, n):
-        for j in range(i, n):
-            for k in range(rows):
-                p[i, j] -= w[k, i] * w[k, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

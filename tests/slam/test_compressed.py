@@ -82,13 +82,36 @@ def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
             backend.predict(odometry)
             backend.observe(seen)
     assert compressed.landmark_count > compressed._book.count
-    first = int(compressed._far_ids[0])
+    first = int(compressed._map_ids[compressed._far[0]])
     d = landmarks[first] - pose[:2] - OFFSET * np.array([math.cos(pose[2]), math.sin(pose[2])])
     far = Observations(
         np.array([[np.hypot(*d), math.atan2(d[1], d[0]) - pose[2]]]), NOISE[None], np.array([first])
     )
     for backend in (full, compressed):
         backend.observe(far)
+    compare(full.belief, compressed.belief)
+
+
+def test_the_place_of_a_dropped_landmark_is_taken_again() -> None:
+    """Landmarks are dropped on the way, in both filters; later ones stand where they stood."""
+    rng = np.random.default_rng(4)
+    landmarks = grove(4)
+    full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
+    for backend in (full, compressed):
+        backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
+    pose = np.zeros(3)
+    for k in range(110):
+        pose, odometry = drive(pose, np.array([0.8, 0.0, 0.0]), (0.02, 0.02), rng, dt=0.3)
+        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
+        for backend in (full, compressed):
+            backend.predict(odometry)
+            backend.observe(seen)
+        if k % 9 == 8:
+            dropped = int(compressed._book.ids[k % compressed._book.count])
+            for backend in (full, compressed):
+                backend._drop(backend._book.row(dropped))
+    assert len(np.unique(np.concatenate([compressed._near, compressed._far]))) == compressed.landmark_count
+    assert len(compressed._far) > 20
     compare(full.belief, compressed.belief)
 
 

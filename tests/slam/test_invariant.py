@@ -13,8 +13,8 @@ import slam
 from slam import Odometry
 from slam.geometry import compose, exp, wrap
 from slam.invariant import invariant_update
-from slam.joint_gaussian import stacked_update
 from slam.metrics import nees_band
+from slam.stacked_update import stacked_update, work_space
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import drive, observe_landmarks
 
@@ -55,10 +55,10 @@ def run(update, x: np.ndarray, p: np.ndarray, z: np.ndarray) -> tuple[np.ndarray
     n = len(x)
     x, p = x.copy(), np.triu(p)
     match = np.arange(len(z))
-    work = [np.zeros((64, 2, 5)), np.zeros((130, n)), np.zeros((128, 129))]
+    work = work_space(len(z), n)
     if update is invariant_update:
-        work = [np.zeros(((n - 3) // 2, 8)), *work, np.zeros((7, n))]
-    _, nis = update(x, p, n, z, match, OFFSET, *work, True)
+        work = (np.zeros(((n - 3) // 2, 8)), *work, np.zeros(n))
+    _, nis = update(x, p, n, z, match, OFFSET, *work)
     return x, np.triu(p) + np.triu(p, 1).T, nis
 
 
@@ -94,10 +94,10 @@ def test_turning_the_whole_map_keeps_its_shape() -> None:
 
     def update(kernel) -> np.ndarray:
         state, cov = x.copy(), np.triu(p)
-        work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
+        work = work_space(1, 9)
         if kernel is invariant_update:
-            work = [np.zeros((3, 8)), *work, np.zeros((7, 9))]
-        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work, True)
+            work = (np.zeros((3, 8)), *work, np.zeros(9))
+        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work)
         return state
 
     turned = update(invariant_update)

@@ -16,8 +16,9 @@ from slam.association import line_blocks
 from slam.features import FeatureExtractor
 from slam.geometry import compose, inverse, wrap
 from slam.invariant import invariant_update
-from slam.joint_gaussian import add_landmark, stacked_update
+from slam.joint_gaussian import add_landmark
 from slam.motion import move
+from slam.stacked_update import stacked_update, work_space
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, room_scan
 
@@ -170,12 +171,12 @@ def transform(x: np.ndarray) -> np.ndarray:
 @given(seeds)
 def test_invariant_update_of_lines_is_gain_retraction_and_reset(seed: int) -> None:
     x, p, z, marks = state_with_lines(seed)
-    work = [np.zeros((64, 2, 5)), np.zeros((130, 9)), np.zeros((128, 129))]
+    work = work_space(3, 9)
     plain_x, plain_p = x.copy(), np.triu(p)
-    stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work, True)
+    stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work)
     plain_p = np.triu(plain_p) + np.triu(plain_p, 1).T
     got_x, got_p = x.copy(), np.triu(p)
-    invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros((7, 9)), True)
+    invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros(9))
     got_p = np.triu(got_p) + np.triu(got_p, 1).T
     np.testing.assert_allclose(got_x[6::2], plain_x[6::2], atol=1e-12)  # r is added to
     np.testing.assert_allclose(wrap(got_x[5::2] - plain_x[5::2]), 0.0, atol=1e-12)
@@ -194,8 +195,7 @@ def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
     z[0, 1] -= 0.3  # the line is seen turned: it is the heading that is wrong
     z[0, 2] = 1e6
     got, cov = x.copy(), p.copy()
-    work = [np.zeros((64, 2, 5)), np.zeros((130, 7)), np.zeros((128, 129)), np.zeros((7, 7))]
-    invariant_update(got, cov, 7, z, np.array([1]), OFFSET, marks, *work, True)
+    invariant_update(got, cov, 7, z, np.array([1]), OFFSET, marks, *work_space(1, 7), np.zeros(7))
     assert got[2] == pytest.approx(0.4, abs=1e-3)
     np.testing.assert_allclose(got[5:], x[5:], atol=1e-9)
     np.testing.assert_allclose(got[:2], x[:2], atol=1e-9)
