@@ -159,8 +159,8 @@ class OccupancyGrid:
         self._prepare_for(scan)
         x, y, theta = np.asarray(sensor_pose).tolist()
         units = ends_on(
-            self.log_odds, scan.ranges, self._rays, x / self.resolution - self._col0, y / self.resolution - self._row0,
-            theta, self.resolution, scan.range_max,
+            self.log_odds, scan.ranges, self._rays, x / self.resolution - self._col0,
+            y / self.resolution - self._row0, theta, self.resolution, scan.range_max,
         )  # fmt: skip
         return UNIT_NAT * units
 

@@ -40,10 +40,10 @@ def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]
 
 PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
 
-# A cell's mark and byte make an index into what the cell becomes and what the grid's sums gain. The gains share one
-# number, from the low bits up: probability × 255 (of an unknown cell all of it) plus a bias that keeps it positive,
-# newly known, class changed, and the entropy in units of which every difference of two entropies is a multiple. So
-# the gains of eight cells are one sum, and exact in any order.
+# A cell's mark and byte make an index into what the cell becomes and what the grid's sums gain. The gains share
+# one number, from the low bits up: probability × 255 (of an unknown cell all of it) plus a bias that keeps it
+# positive, newly known, class changed, and the entropy in units of which every difference of two entropies is a
+# multiple. So the gains of eight cells are one sum, and exact in any order.
 _PROBABILITY, _BIAS = (1 << 16) - 1, 256
 _KNOWN_AT, _CHANGED_AT, _ENTROPY_AT = 16, 20, 24
 _COUNT = 15  # a field of counts: up to eight cells
