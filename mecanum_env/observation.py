@@ -25,6 +25,10 @@ MAP_SIZE = 64
 LOCAL_CELL_M = 0.1
 """Side of a pixel of ``map_local`` [m]."""
 UNKNOWN_BYTE = 128
+# For each byte of a cell its probability × 255, by which the more occupied is found; zero where never observed, which
+# gives way to what was.
+_RANK = np.maximum(PROBABILITY_BYTE, 1)
+_RANK[0] = 0
 _TWIST_LIMIT = 2.0
 _COV_LIMIT = 1e6  # m², m·rad, rad²: Gymnasium asks for finite bounds
 
@@ -160,45 +164,54 @@ def _fill_local(
 
     A pixel takes the more occupied of two points in it, a quarter pixel from its middle on one diagonal, and its
     neighbours on the other: so a wall one cell thick does not slip through, whichever way it runs.
+
+    ``log_odds`` and ``visited`` are a grid's own arrays: behind their last cell is another that is zero.
     """
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
     c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
     rows, cols = log_odds.shape
-    cells, trail = log_odds.ravel(), visited.ravel()
     half = 0.5 * size - 0.5
     quarter = np.float32(0.25)
     ax, ay = quarter * (c - s), quarter * (s + c)  # from the middle to the points, in cells
     bx, by = quarter * (c + s), quarter * (s - c)
     low_x, low_y = max(abs(ax), abs(bx)), max(abs(ay), abs(by))
     high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
-    width = np.int32(cols)
-    # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
+    width, nowhere = np.int32(cols), np.int32(rows * cols)  # what follows the last cell was never observed
+    along_x, along_y = np.empty(size, np.float32), np.empty(size, np.float32)
+    offset_x, offset_y = np.empty((2, size), np.float32), np.empty((2, size), np.float32)  # in even and odd rows
+    for j in range(size):
+        along_x[j], along_y[j] = np.float32(j) * s, np.float32(j) * c
+        for odd in range(2):
+            one_way = (odd + j) & 1 == 1
+            offset_x[odd, j], offset_y[odd, j] = ax if one_way else bx, ay if one_way else by
+    cells, trail = log_odds.view(np.uint8).ravel(), visited.ravel()
     first, second, middle = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    probability_out, observed_out, trail_out = out[0].ravel(), out[1].ravel(), out[2].ravel()
     for i in range(size):
         x0 = np.float32(x / resolution - col0 + c * (half - i) - s * half)
         y0 = np.float32(y / resolution - row0 + s * (half - i) + c * half)
+        # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
+        to_x, to_y = offset_x[i & 1], offset_y[i & 1]
         for j in range(size):
-            px, py = x0 + np.float32(j) * s, y0 - np.float32(j) * c
-            one_way = (i + j) & 1 == 1
-            dx, dy = ax if one_way else bx, ay if one_way else by
+            px, py = x0 + along_x[j], y0 - along_y[j]
+            dx, dy = to_x[j], to_y[j]
             inside = (px >= low_x) & (py >= low_y) & (px < high_x) & (py < high_y)
-            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else -1
-            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else -1
-            middle[j] = np.int32(py) * width + np.int32(px) if inside else -1
-        probability_row, observed_row, trail_row = out[0, i], out[1, i], out[2, i]
-        for j in range(size):
-            # Without branches, which the processor would guess wrongly all along a map's edge. Unsigned indices:
-            # others are tested for being negative.
-            there = np.int64(first[j] >= 0)
-            v0 = cells[np.uint32(max(first[j], 0))] * there
-            v1 = cells[np.uint32(max(second[j], 0))] * there
-            # Zero means never observed: it gives way to what was.
-            best = max(v0, v1) + min(v0, v1) * np.int64(max(v0, v1) == 0)
-            observed = 255 * np.int64(best != 0)
-            probability_row[j] = PROBABILITY_BYTE[np.uint64(best & 255)]  # of 0, one half
-            observed_row[j] = observed
-            trail_row[j] = observed * trail[np.uint32(max(middle[j], 0))]
+            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else nowhere
+            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else nowhere
+            middle[j] = np.int32(py) * width + np.int32(px) if inside else nowhere
+        # Unsigned indices: others are tested for being negative.
+        for j in range(np.uint64(size)):
+            pixel = np.uint64(i * size) + j
+            probability_out[pixel] = max(_RANK[cells[np.uint32(first[j])]], _RANK[cells[np.uint32(second[j])]])
+            trail_out[pixel] = trail[np.uint32(middle[j])]
+    # One loop for each channel: these vectorise.
+    for k in range(size * size):
+        observed_out[k] = 255 if probability_out[k] != 0 else 0
+    for k in range(size * size):
+        trail_out[k] = observed_out[k] * (trail_out[k] != 0)
+    for k in range(size * size):
+        probability_out[k] |= UNKNOWN_BYTE * (probability_out[k] == 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -75,8 +75,7 @@ class OccupancyGrid:
         self.resolution = float(resolution)
         self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0)
         shape = (2 * _CHUNK, 2 * _CHUNK)
-        self.log_odds = _unobserved(shape)
-        self.visited = np.zeros(shape, np.uint8)
+        self.log_odds, self.visited = _blank(shape).view(np.int8), _blank(shape)
         self.known_cells = 0
         self.entropy_bit = 0.0
         self.revision = 0
@@ -277,7 +276,7 @@ class OccupancyGrid:
             new_col1 = math.ceil((col1 + spare) / _CHUNK) * _CHUNK
         r, c = self._row0 - new_row0, self._col0 - new_col0
         shape = (new_row1 - new_row0, new_col1 - new_col0)
-        log_odds, visited = _unobserved(shape), np.zeros(shape, np.uint8)
+        log_odds, visited = _blank(shape).view(np.int8), _blank(shape)
         log_odds[r : r + rows, c : c + cols] = self.log_odds
         visited[r : r + rows, c : c + cols] = self.visited
         self.log_odds, self.visited = log_odds, visited
@@ -304,7 +303,7 @@ class OccupancyGrid:
         return self._overview[0], self._overview[1], self._overview[2]
 
 
-def _unobserved(shape: tuple[int, int]) -> NDArray[np.int8]:
-    """Return cells never observed, with a window's bytes to spare behind them: see ``_take_unsettled``."""
+def _blank(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return a plane of zeros with some more behind it, which kernels may read: see ``_take_unsettled``."""
     size = shape[0] * shape[1]
-    return np.zeros(size + WINDOW, np.int8)[:size].reshape(shape)
+    return np.zeros(size + WINDOW, np.uint8)[:size].reshape(shape)
