@@ -25,8 +25,8 @@ MAP_SIZE = 64
 LOCAL_CELL_M = 0.1
 """Side of a pixel of ``map_local`` [m]."""
 UNKNOWN_BYTE = 128
-# For each byte of a cell its probability × 255, by which the more occupied is found; zero where never observed, which
-# gives way to what was.
+# For each byte of a cell its probability × 255, by which the more occupied is found; zero where never observed,
+# which gives way to what was.
 _RANK = np.maximum(PROBABILITY_BYTE, 1)
 _RANK[0] = 0
 _TWIST_LIMIT = 2.0
@@ -53,12 +53,22 @@ def observation_space(config: EnvConfig) -> spaces.Dict:
 
 def map_frame(grid: OccupancyGrid) -> tuple[float, float, float]:
     """Return the centre (x, y) [m] of ``map_global`` in the belief's frame, and its half extent [m]."""
-    known, _, _ = grid.overview()
-    x0, y0 = grid.origin
-    pixel = grid.overview_block * grid.resolution
-    top, left = (MAP_SIZE - known.shape[0]) // 2, (MAP_SIZE - known.shape[1]) // 2
+    _, rows, cols = grid.overview_sums.shape
+    row0, col0 = grid.lattice_origin
+    return _map_frame(row0, col0, rows, cols, grid.overview_block, grid.resolution)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _map_frame(
+    row0: int, col0: int, rows: int, cols: int, block: int, resolution: float
+) -> tuple[float, float, float]:
+    pixel = block * resolution
+    top, left = (MAP_SIZE - rows) // 2, (MAP_SIZE - cols) // 2
     half_size = MAP_SIZE // 2
-    return x0 + (half_size - left) * pixel, y0 + (half_size - top) * pixel, half_size * pixel
+    return (
+        col0 * resolution + (half_size - left) * pixel, row0 * resolution + (half_size - top) * pixel,
+        half_size * pixel,
+    )  # fmt: skip
 
 
 def observe(
@@ -83,20 +93,16 @@ def observe(
         Fraction of the episode's time used.
     """
     grid, robot = backend.grid, config.robot
-    centre_x, centre_y, half = map_frame(grid)
     row0, col0 = grid.lattice_origin
-    known, probability, visited = grid.overview()
-    vx, vy, omega = np.asarray(twist).tolist()
+    vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
     maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
     ranges = np.empty(len(scan.ranges), np.float32)
     numbers = np.empty(15, np.float32)
     landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
     _fill(
-        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution,
-        known, probability, visited, grid.overview_block, centre_x, centre_y, half,
-        scan.ranges, scan.range_max, pose, pose_cov,
-        vx / robot.max_speed_m_s, vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s,
-        time_used, grid.known_area_m2 / (4.0 * half * half),
+        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution, grid.overview_sums,
+        grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov, vx / robot.max_speed_m_s,
+        vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2,
     )  # fmt: skip
     backend.near_landmarks(landmarks)
     return {
@@ -115,18 +121,16 @@ def observe(
 def _fill(
     maps: NDArray[np.uint8], ranges_out: NDArray[np.float32], numbers: NDArray[np.float32],
     log_odds: NDArray[np.int8], trail: NDArray[np.uint8], row0: int, col0: int, resolution: float,
-    known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32], block: int,
-    centre_x: float, centre_y: float, half: float, ranges: Array, range_max: float, pose: Array, cov: Array,
-    vx: float, vy: float, omega: float, time_used: float, known_share: float,
+    overview: NDArray[np.int32], block: int, ranges: Array, range_max: float, pose: Array, cov: Array,
+    vx: float, vy: float, omega: float, time_used: float, known_area_m2: float,
 ) -> None:  # fmt: skip
     """Fill everything but the landmarks, in one call."""
+    centre_x, centre_y, half = _map_frame(row0, col0, overview.shape[1], overview.shape[2], block, resolution)
     _fill_local(maps[0], log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
-    _fill_global(
-        maps[1], known, probability, visited, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half
-    )
+    _fill_global(maps[1], overview, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half)
     _fill_numbers(
         numbers, ranges_out, ranges, range_max, pose, cov, centre_x, centre_y, half, vx, vy, omega, time_used,
-        known_share,
+        known_area_m2 / (4.0 * half * half),
     )  # fmt: skip
 
 
@@ -216,11 +220,11 @@ def _fill_local(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_global(
-    out: NDArray[np.uint8], known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32],
-    block: int, x: float, y: float,
-) -> None:  # fmt: skip
+    out: NDArray[np.uint8], overview: NDArray[np.int32], block: int, x: float, y: float
+) -> None:
     """Fill the whole map in the start frame: row 0 at the highest y, the overview in the middle."""
     size = out.shape[1]
+    known, probability, visited = overview[0], overview[1], overview[2]
     rows, cols = known.shape
     top, left = (size - rows) // 2, (size - cols) // 2
     area, shift = block * block, 0

@@ -65,6 +65,10 @@ class OccupancyGrid:
         Number of cells ever observed.
     entropy_bit : float
         Entropy of the observed cells less one bit each: 0 at the start, falling as the map grows sure.
+    overview_sums : NDArray[np.int32]
+        ``(3, rows, cols)``, per block: observed cells, the sum of their probability × 255, visited cells.
+    overview_block : int
+        Cells a side of a block.
     revision : int
         Goes up when the whole map was redrawn, so that whoever follows ``take_changes`` starts over.
     """
@@ -73,7 +77,8 @@ class OccupancyGrid:
         if not (math.isfinite(resolution) and 0.0 < resolution <= 10.0):
             raise ValueError(f"grid resolution must be in (0, 10] m, got {resolution}")
         self.resolution = float(resolution)
-        self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0)
+        self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0) …
+        self._col1 = self._row1 = _CHUNK  # … and of the one beyond the last
         shape = (2 * _CHUNK, 2 * _CHUNK)
         self.log_odds, self.visited = _blank(shape).view(np.int8), _blank(shape)
         self.known_cells = 0
@@ -177,7 +182,7 @@ class OccupancyGrid:
     def mark_visited(self, x: float, y: float, radius: float) -> None:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
         x, y, radius = self._make_room_for(x, y, radius)
-        mark_disc(self.visited, self._overview, self._overview_shift, y - self._row0, x - self._col0, radius)
+        mark_disc(self.visited, self.overview_sums, self._overview_shift, y - self._row0, x - self._col0, radius)
 
     def integrate(
         self, sensor_pose: Array | tuple[float, float, float], scan: Scan,
@@ -203,7 +208,7 @@ class OccupancyGrid:
         self._prepare_for(scan)
         resolution, reach = self.resolution, self._reach
         mask, polygon, beams = self._mask, self._polygon, self._beams
-        x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
+        x, y, theta = sensor_pose if isinstance(sensor_pose, tuple) else sensor_pose.tolist()
         # The sensor is near the mask's middle; its columns lie eight cells to a word of the grid's.
         mask_row = math.floor(y / resolution) - reach
         mask_col = (math.floor(x / resolution) - reach) & -WORD
@@ -229,7 +234,7 @@ class OccupancyGrid:
             self._changes = grown
         self._change_count, known, entropy = draw(
             mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
-            self._col0, self._overview, self._overview_shift, self._changes, self._change_count,
+            self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
             body_y - self._row0, body_x - self._col0, radius,
         )  # fmt: skip
         self.known_cells += known
@@ -261,10 +266,10 @@ class OccupancyGrid:
 
     def _grow(self, row0: int, col0: int, row1: int, col1: int) -> None:
         """Make room for lattice cells [row0, row1) × [col0, col1), in chunks and with some to spare."""
-        rows, cols = self.shape
-        if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row0 + rows and col1 <= self._col0 + cols:
+        if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row1 and col1 <= self._col1:
             return
-        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row0 + rows, self._col0 + cols
+        rows, cols = self.shape
+        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row1, self._col1
         spare = 2 * _CHUNK
         if row0 < new_row0:
             new_row0 = math.floor((row0 - spare) / _CHUNK) * _CHUNK
@@ -280,7 +285,7 @@ class OccupancyGrid:
         log_odds[r : r + rows, c : c + cols] = self.log_odds
         visited[r : r + rows, c : c + cols] = self.visited
         self.log_odds, self.visited = log_odds, visited
-        self._row0, self._col0 = new_row0, new_col0
+        self._row0, self._col0, self._row1, self._col1 = new_row0, new_col0, new_row1, new_col1
         self._build_overview()
 
     # ---- overview ------------------------------------------------------------------------------------------
@@ -295,12 +300,8 @@ class OccupancyGrid:
             # Beyond 2048 cells a side: the last block of a row may be short, which the padding stands for.
             rows, cols = -(-rows // block) * block, -(-cols // block) * block
         self.overview_block, self._overview_shift = block, block.bit_length() - 1
-        self._overview = np.zeros((3, rows // block, cols // block), np.int32)
-        sum_blocks(self.log_odds, self.visited, self._overview_shift, self._overview)
-
-    def overview(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return per block: observed cells, the sum of their probability × 255, visited cells. Live arrays."""
-        return self._overview[0], self._overview[1], self._overview[2]
+        self.overview_sums = np.zeros((3, rows // block, cols // block), np.int32)
+        sum_blocks(self.log_odds, self.visited, self._overview_shift, self.overview_sums)
 
 
 def _blank(shape: tuple[int, int]) -> NDArray[np.uint8]:

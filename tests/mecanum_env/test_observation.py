@@ -50,7 +50,7 @@ def test_local_map_against_the_simple_version(pose: tuple[float, float, float], 
 def local_map_simply(
     grid: OccupancyGrid, resolution: float, x: float, y: float, theta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Probabilities and trail of the local map, a whole picture at a time, with the kernel's float32 arithmetic."""
+    """Probabilities and trail of the local map, a whole picture at a time, in the kernel's float32."""
     step = LOCAL_CELL_M / resolution
     c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
     half = MAP_SIZE / 2 - 0.5
@@ -108,11 +108,10 @@ def test_the_local_map_is_heading_up() -> None:
 
 def test_the_global_map_puts_the_robot_where_the_pose_says() -> None:
     grid = room_grid()
-    known, probability, visited = grid.overview()
     out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
     cx, cy, half = map_frame(grid)
     x, y = 4.0, 3.0
-    _fill_global(out, known, probability, visited, grid.overview_block, (x - cx) / half, (y - cy) / half)
+    _fill_global(out, grid.overview_sums, grid.overview_block, (x - cx) / half, (y - cy) / half)
     row, col = np.argwhere(out[2] == 255).mean(axis=0)
     assert abs((MAP_SIZE / 2 - row - 0.5) / (MAP_SIZE / 2) * half + cy - y) <= half / MAP_SIZE * 2
     assert abs((col + 0.5 - MAP_SIZE / 2) / (MAP_SIZE / 2) * half + cx - x) <= half / MAP_SIZE * 2

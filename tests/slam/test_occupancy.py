@@ -59,12 +59,12 @@ def test_bookkeeping_agrees_with_a_full_count(pose: np.ndarray) -> None:
     p = grid.probability()[grid.log_odds != 0].astype(float)
     entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p)) - 1
     assert grid.entropy_bit == pytest.approx(entropy.sum(), rel=1e-4)
-    kept = [a.copy() for a in grid.overview()]
+    kept = grid.overview_sums.copy()
     grid._build_overview()
     byte = np.round(255 * grid.probability().astype(float)) * (grid.log_odds != 0)
-    block, (rows, cols) = grid.overview_block, grid.overview()[0].shape
+    block, (rows, cols) = grid.overview_block, grid.overview_sums.shape[1:]
     for incremental, anew, cells in zip(
-        kept, grid.overview(), (grid.log_odds != 0, byte, grid.visited), strict=True
+        kept, grid.overview_sums, (grid.log_odds != 0, byte, grid.visited), strict=True
     ):
         np.testing.assert_array_equal(incremental, anew)
         simple = cells.astype(int).reshape(rows, block, cols, block).sum(axis=(1, 3))
