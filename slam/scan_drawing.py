@@ -160,8 +160,10 @@ def _step_of(marks: np.uint64, cells: np.uint64, k: int) -> np.uint64:
 def _take_unsettled(
     mask: NDArray[np.uint8], cells: NDArray[np.uint8], down: int, ahead: int, top: int, left: int, bottom: int,
     right: int,
-) -> NDArray[np.uint64]:  # fmt: skip
-    """Wipe a box of the mask; return ``(m, 3)`` the words with marks that change their cell: marks, row, column.
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:  # fmt: skip
+    """Wipe a box of the mask; return its windows with marks that change a cell, and which words these are.
+
+    A row of the windows is eight words of such marks, then the row and column that they begin at in the grid.
 
     Most of a known map is settled: its cells are at the limit that a scan pushes them to. Nothing here branches
     on what a cell holds, which the processor would guess wrongly along every rim.
@@ -172,9 +174,8 @@ def _take_unsettled(
     u = np.uint64  # as indices, others are tested for being negative
     words_each = u(WINDOW // WORD)
     most = (bottom - top + 1) * ((right - left) // WINDOW + 1)
-    windows = np.empty((most, WINDOW), np.uint8)  # the marks of cells that are not settled, zero elsewhere
-    places = np.empty((most, 2), np.uint64)
-    mask_words, window_words = mask.view(np.uint64), windows.view(np.uint64)
+    windows = np.empty((most, WINDOW // WORD + 2), np.uint64)
+    mask_words, unsettled_marks = mask.view(np.uint64), windows.view(np.uint8)
     n = u(0)
     for i in range(u(top), u(bottom + 1)):
         for j in range(u(left), u(right + 1), u(WINDOW)):
@@ -185,20 +186,19 @@ def _take_unsettled(
                 unsettled = ((mark == IN_FREE) & (cell != _SURELY_FREE)) | (
                     (mark == IN_SURFACE) & (cell != _SURELY_OCCUPIED)
                 )
-                windows[n, k] = mark if unsettled else 0
+                unsettled_marks[n, k] = mark if unsettled else 0
                 any_unsettled |= unsettled
             for k in range(words_each):
                 mask_words[i, j // u(WORD) + k] = 0
-            places[n, 0], places[n, 1] = row, col
+            windows[n, words_each], windows[n, words_each + u(1)] = row, col
             n += u(any_unsettled)
-    out = np.empty((n * words_each, 3), np.uint64)
+    todo = np.empty(n * words_each, np.uint32)
     m = u(0)
     for i in range(n):
         for k in range(words_each):
-            out[m, 0] = window_words[i, k]
-            out[m, 1], out[m, 2] = places[i, 0], places[i, 1] + u(WORD) * k
-            m += u(window_words[i, k] != 0)
-    return out[:m]
+            todo[m] = i * words_each + k
+            m += u(windows[i, k] != 0)
+    return windows, todo[:m]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -213,14 +213,17 @@ def fuse(
     for one more than there are cells in the box.
     """
     u = np.uint64  # as indices, others are tested for being negative
+    words_each = u(WINDOW // WORD)
     words = log_odds.view(np.uint64)
-    todo = _take_unsettled(
+    windows, todo = _take_unsettled(
         mask, log_odds.view(np.uint8), mask_row - lattice_row, mask_col - lattice_col, top, left, bottom, right
     )
     width = min(1 << shift, WORD)  # cells of a word within one block of the overview
     known = entropy = 0
     for t in range(u(todo.shape[0])):
-        marks, row, col = todo[t, 0], todo[t, 1], todo[t, 2]
+        window, word = u(todo[t]) // words_each, u(todo[t]) % words_each
+        marks, row = windows[window, word], windows[window, words_each]
+        col = windows[window, words_each + u(1)] + u(WORD) * word
         before, after = words[row, col // u(WORD)], u(0)
         gain = 0
         for k in range(WORD):
@@ -296,7 +299,7 @@ def mark_disc(
         return
     for i in range(int(y - radius), int(y + radius) + 1):
         for j in range(int(x - radius), int(x + radius) + 1):
-            if (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius and visited[i, j] == 0:
+            if visited[i, j] == 0 and (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius:
                 visited[i, j] = 1
                 overview[2, i >> shift, j >> shift] += 1
 
