@@ -219,9 +219,7 @@ def _fill_local(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_global(
-    out: NDArray[np.uint8], overview: NDArray[np.int32], block: int, x: float, y: float
-) -> None:
+def _fill_global(out: NDArray[np.uint8], overview: NDArray[np.int32], block: int, x: float, y: float) -> None:
     """Fill the whole map in the start frame: row 0 at the highest y, the overview in the middle."""
     size = out.shape[1]
     known, probability, visited = overview[0], overview[1], overview[2]

@@ -11,7 +11,7 @@ that lie on a straight surface between two beams, gain.
 from __future__ import annotations
 
 import math
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -88,6 +88,13 @@ class OccupancyGrid:
         self._change_count = 0
         self._lidar: tuple[int, float, float, float] | None = None
         self._build_overview()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make a copy or a pickle whole: its planes came without the bytes behind them."""
+        self.__dict__.update(state)
+        self.log_odds = _blank(self.shape).view(np.int8)
+        self.visited = _blank(self.shape)
+        self.log_odds[:], self.visited[:] = state["log_odds"], state["visited"]
 
     @classmethod
     def from_classes(cls, classes: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> Self:
