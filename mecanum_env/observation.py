@@ -25,6 +25,10 @@ MAP_SIZE = 64
 LOCAL_CELL_M = 0.1
 """Side of a pixel of ``map_local`` [m]."""
 UNKNOWN_BYTE = 128
+# For each byte of a cell its probability × 255, by which the more occupied is found; zero where never observed,
+# which gives way to what was.
+_RANK = np.maximum(PROBABILITY_BYTE, 1)
+_RANK[0] = 0
 _TWIST_LIMIT = 2.0
 _COV_LIMIT = 1e6  # m², m·rad, rad²: Gymnasium asks for finite bounds
 
@@ -49,12 +53,22 @@ def observation_space(config: EnvConfig) -> spaces.Dict:
 
 def map_frame(grid: OccupancyGrid) -> tuple[float, float, float]:
     """Return the centre (x, y) [m] of ``map_global`` in the belief's frame, and its half extent [m]."""
-    known, _, _ = grid.overview()
-    x0, y0 = grid.origin
-    pixel = grid.overview_block * grid.resolution
-    top, left = (MAP_SIZE - known.shape[0]) // 2, (MAP_SIZE - known.shape[1]) // 2
+    _, rows, cols = grid.overview_sums.shape
+    row0, col0 = grid.lattice_origin
+    return _map_frame(row0, col0, rows, cols, grid.overview_block, grid.resolution)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _map_frame(
+    row0: int, col0: int, rows: int, cols: int, block: int, resolution: float
+) -> tuple[float, float, float]:
+    pixel = block * resolution
+    top, left = (MAP_SIZE - rows) // 2, (MAP_SIZE - cols) // 2
     half_size = MAP_SIZE // 2
-    return x0 + (half_size - left) * pixel, y0 + (half_size - top) * pixel, half_size * pixel
+    return (
+        col0 * resolution + (half_size - left) * pixel, row0 * resolution + (half_size - top) * pixel,
+        half_size * pixel,
+    )  # fmt: skip
 
 
 def observe(
@@ -79,20 +93,16 @@ def observe(
         Fraction of the episode's time used.
     """
     grid, robot = backend.grid, config.robot
-    centre_x, centre_y, half = map_frame(grid)
     row0, col0 = grid.lattice_origin
-    known, probability, visited = grid.overview()
-    vx, vy, omega = np.asarray(twist).tolist()
+    vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
     maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
     ranges = np.empty(len(scan.ranges), np.float32)
     numbers = np.empty(15, np.float32)
     landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
     _fill(
-        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution,
-        known, probability, visited, grid.overview_block, centre_x, centre_y, half,
-        scan.ranges, scan.range_max, pose, pose_cov,
-        vx / robot.max_speed_m_s, vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s,
-        time_used, grid.known_area_m2 / (4.0 * half * half),
+        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution, grid.overview_sums,
+        grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov, vx / robot.max_speed_m_s,
+        vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2,
     )  # fmt: skip
     backend.near_landmarks(landmarks)
     return {
@@ -111,18 +121,16 @@ def observe(
 def _fill(
     maps: NDArray[np.uint8], ranges_out: NDArray[np.float32], numbers: NDArray[np.float32],
     log_odds: NDArray[np.int8], trail: NDArray[np.uint8], row0: int, col0: int, resolution: float,
-    known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32], block: int,
-    centre_x: float, centre_y: float, half: float, ranges: Array, range_max: float, pose: Array, cov: Array,
-    vx: float, vy: float, omega: float, time_used: float, known_share: float,
+    overview: NDArray[np.int32], block: int, ranges: Array, range_max: float, pose: Array, cov: Array,
+    vx: float, vy: float, omega: float, time_used: float, known_area_m2: float,
 ) -> None:  # fmt: skip
     """Fill everything but the landmarks, in one call."""
+    centre_x, centre_y, half = _map_frame(row0, col0, overview.shape[1], overview.shape[2], block, resolution)
     _fill_local(maps[0], log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
-    _fill_global(
-        maps[1], known, probability, visited, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half
-    )
+    _fill_global(maps[1], overview, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half)
     _fill_numbers(
         numbers, ranges_out, ranges, range_max, pose, cov, centre_x, centre_y, half, vx, vy, omega, time_used,
-        known_share,
+        known_area_m2 / (4.0 * half * half),
     )  # fmt: skip
 
 
@@ -160,54 +168,61 @@ def _fill_local(
 
     A pixel takes the more occupied of two points in it, a quarter pixel from its middle on one diagonal, and its
     neighbours on the other: so a wall one cell thick does not slip through, whichever way it runs.
+
+    ``log_odds`` and ``visited`` are a grid's own arrays: behind their last cell is another that is zero.
     """
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
     c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
     rows, cols = log_odds.shape
-    cells, trail = log_odds.ravel(), visited.ravel()
     half = 0.5 * size - 0.5
     quarter = np.float32(0.25)
     ax, ay = quarter * (c - s), quarter * (s + c)  # from the middle to the points, in cells
     bx, by = quarter * (c + s), quarter * (s - c)
     low_x, low_y = max(abs(ax), abs(bx)), max(abs(ay), abs(by))
     high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
-    width = np.int32(cols)
-    # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
+    width, nowhere = np.int32(cols), np.int32(rows * cols)  # what follows the last cell was never observed
+    along_x, along_y = np.empty(size, np.float32), np.empty(size, np.float32)
+    offset_x, offset_y = np.empty((2, size), np.float32), np.empty((2, size), np.float32)  # in even and odd rows
+    for j in range(size):
+        along_x[j], along_y[j] = np.float32(j) * s, np.float32(j) * c
+        for odd in range(2):
+            one_way = (odd + j) & 1 == 1
+            offset_x[odd, j], offset_y[odd, j] = ax if one_way else bx, ay if one_way else by
+    cells, trail = log_odds.view(np.uint8).ravel(), visited.ravel()
     first, second, middle = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    probability_out, observed_out, trail_out = out[0].ravel(), out[1].ravel(), out[2].ravel()
     for i in range(size):
         x0 = np.float32(x / resolution - col0 + c * (half - i) - s * half)
         y0 = np.float32(y / resolution - row0 + s * (half - i) + c * half)
+        # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
+        to_x, to_y = offset_x[i & 1], offset_y[i & 1]
         for j in range(size):
-            px, py = x0 + np.float32(j) * s, y0 - np.float32(j) * c
-            one_way = (i + j) & 1 == 1
-            dx, dy = ax if one_way else bx, ay if one_way else by
+            px, py = x0 + along_x[j], y0 - along_y[j]
+            dx, dy = to_x[j], to_y[j]
             inside = (px >= low_x) & (py >= low_y) & (px < high_x) & (py < high_y)
-            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else -1
-            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else -1
-            middle[j] = np.int32(py) * width + np.int32(px) if inside else -1
-        probability_row, observed_row, trail_row = out[0, i], out[1, i], out[2, i]
-        for j in range(size):
-            # Without branches, which the processor would guess wrongly all along a map's edge. Unsigned indices:
-            # others are tested for being negative.
-            there = np.int64(first[j] >= 0)
-            v0 = cells[np.uint32(max(first[j], 0))] * there
-            v1 = cells[np.uint32(max(second[j], 0))] * there
-            # Zero means never observed: it gives way to what was.
-            best = max(v0, v1) + min(v0, v1) * np.int64(max(v0, v1) == 0)
-            observed = 255 * np.int64(best != 0)
-            probability_row[j] = PROBABILITY_BYTE[np.uint64(best & 255)]  # of 0, one half
-            observed_row[j] = observed
-            trail_row[j] = observed * trail[np.uint32(max(middle[j], 0))]
+            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else nowhere
+            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else nowhere
+            middle[j] = np.int32(py) * width + np.int32(px) if inside else nowhere
+        # Unsigned indices: others are tested for being negative.
+        for j in range(np.uint64(size)):
+            pixel = np.uint64(i * size) + j
+            probability_out[pixel] = max(_RANK[cells[np.uint32(first[j])]], _RANK[cells[np.uint32(second[j])]])
+            trail_out[pixel] = trail[np.uint32(middle[j])]
+    # One loop for each channel: these vectorise.
+    for k in range(size * size):
+        observed_out[k] = 255 if probability_out[k] != 0 else 0
+    for k in range(size * size):
+        trail_out[k] = observed_out[k] * (trail_out[k] != 0)
+    for k in range(size * size):
+        probability_out[k] |= UNKNOWN_BYTE * (probability_out[k] == 0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_global(
-    out: NDArray[np.uint8], known: NDArray[np.int32], probability: NDArray[np.int32], visited: NDArray[np.int32],
-    block: int, x: float, y: float,
-) -> None:  # fmt: skip
+def _fill_global(out: NDArray[np.uint8], overview: NDArray[np.int32], block: int, x: float, y: float) -> None:
     """Fill the whole map in the start frame: row 0 at the highest y, the overview in the middle."""
     size = out.shape[1]
+    known, probability, visited = overview[0], overview[1], overview[2]
     rows, cols = known.shape
     top, left = (size - rows) // 2, (size - cols) // 2
     area, shift = block * block, 0

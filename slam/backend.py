@@ -137,8 +137,7 @@ class Backend(abc.ABC):
         body_x, body_y, theta = self.pose.tolist()
         offset = config.lidar_offset_m
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
-        grid.integrate((x, y, theta), scan, surface)
-        grid.mark_visited(body_x, body_y, config.body_radius_m)
+        grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
         if self.key_scans.wants(x, y, theta):
             ids, points = self._landmarks_in_view()
             self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, points)

@@ -78,7 +78,7 @@ class KeyScans:
             self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
             self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
             self._anchor_local = np.vstack([self._anchor_local, np.zeros_like(self._anchor_local)])
-        _hang(sensor_pose, ids, points, self._poses[n], self._anchor_ids[n], self._anchor_local[n])
+        _hang(sensor_pose, ids, points, n, self._poses, self._anchor_ids, self._anchor_local)
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan, surface.copy()))
 
@@ -114,16 +114,16 @@ class KeyScans:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
-    sensor_pose: Array, ids: NDArray[np.int64], points: Array, pose: Array, anchor_ids: NDArray[np.int64],
-    anchor_local: Array,
+    sensor_pose: Array, ids: NDArray[np.int64], points: Array, n: int, poses: Array,
+    anchor_ids: NDArray[np.int64], anchor_local: Array,
 ) -> None:  # fmt: skip
-    """Write a key scan's pose, and its landmarks in that pose's frame."""
-    pose[:] = sensor_pose
+    """Write the n-th key scan's pose, and its landmarks in that pose's frame."""
+    poses[n] = sensor_pose
     c, s = math.cos(sensor_pose[2]), math.sin(sensor_pose[2])
-    for k in range(min(ids.shape[0], anchor_ids.shape[0])):
+    for k in range(min(ids.shape[0], anchor_ids.shape[1])):
         dx, dy = points[k, 0] - sensor_pose[0], points[k, 1] - sensor_pose[1]
-        anchor_ids[k] = ids[k]
-        anchor_local[k, 0], anchor_local[k, 1] = c * dx + s * dy, -s * dx + c * dy
+        anchor_ids[n, k] = ids[k]
+        anchor_local[n, k, 0], anchor_local[n, k, 1] = c * dx + s * dy, -s * dx + c * dy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -11,7 +11,7 @@ that lie on a straight surface between two beams, gain.
 from __future__ import annotations
 
 import math
-from typing import Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -29,9 +29,10 @@ from slam.scan_drawing import (
     PROBABILITY_BYTE,
     UNIT_NAT,
     UNKNOWN,
+    WINDOW,
     WORD,
+    draw,
     ends_on,
-    mark_and_fuse,
     mark_disc,
     outline,
     sum_blocks,
@@ -64,6 +65,10 @@ class OccupancyGrid:
         Number of cells ever observed.
     entropy_bit : float
         Entropy of the observed cells less one bit each: 0 at the start, falling as the map grows sure.
+    overview_sums : NDArray[np.int32]
+        ``(3, rows, cols)``, per block: observed cells, the sum of their probability × 255, visited cells.
+    overview_block : int
+        Cells a side of a block.
     revision : int
         Goes up when the whole map was redrawn, so that whoever follows ``take_changes`` starts over.
     """
@@ -72,22 +77,24 @@ class OccupancyGrid:
         if not (math.isfinite(resolution) and 0.0 < resolution <= 10.0):
             raise ValueError(f"grid resolution must be in (0, 10] m, got {resolution}")
         self.resolution = float(resolution)
-        self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0)
+        self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0) …
+        self._col1 = self._row1 = _CHUNK  # … and of the one beyond the last
         shape = (2 * _CHUNK, 2 * _CHUNK)
-        self.log_odds = np.zeros(shape, np.int8)
-        self.visited = np.zeros(shape, np.uint8)
+        self.log_odds, self.visited = _blank(shape).view(np.int8), _blank(shape)
         self.known_cells = 0
         self.entropy_bit = 0.0
         self.revision = 0
-        self._mask = np.zeros((1, WORD), np.uint8)
-        self._mask_words = self._mask.view(np.uint64)
-        self._polygon = np.zeros((1, 2), np.int32)
-        self._full_circle = True
         self._changes = np.zeros((1024, 4), np.int32)
         self._change_count = 0
-        self._rays = np.zeros((0, 2))
-        self._rays_of: tuple[int, float, float] = (0, 0.0, 0.0)
+        self._lidar: tuple[int, float, float, float] | None = None
         self._build_overview()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make a copy or a pickle whole: its planes came without the bytes behind them."""
+        self.__dict__.update(state)
+        self.log_odds = _blank(self.shape).view(np.int8)
+        self.visited = _blank(self.shape)
+        self.log_odds[:], self.visited[:] = state["log_odds"], state["visited"]
 
     @classmethod
     def from_classes(cls, classes: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> Self:
@@ -160,11 +167,11 @@ class OccupancyGrid:
 
         It compares poses of one scan by how well each fits the map; unknown cells count for nothing.
         """
-        rays = self._ray_table(len(scan.ranges), scan.angle_min, scan.angle_increment)
+        self._prepare_for(scan)
         x, y, theta = np.asarray(sensor_pose).tolist()
         units = ends_on(
-            self.log_odds, scan.ranges, rays, x / self.resolution - self._col0, y / self.resolution - self._row0,
-            theta, self.resolution, scan.range_max,
+            self.log_odds, scan.ranges, self._rays, x / self.resolution - self._col0,
+            y / self.resolution - self._row0, theta, self.resolution, scan.range_max,
         )  # fmt: skip
         return UNIT_NAT * units
 
@@ -181,17 +188,12 @@ class OccupancyGrid:
 
     def mark_visited(self, x: float, y: float, radius: float) -> None:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
-        cell = self.resolution
-        x, y, radius = x / cell, y / cell, radius / cell
-        row, col, reach = math.floor(y), math.floor(x), math.ceil(radius) + 1
-        self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
-        mark_disc(
-            self.visited, self._overview_visited, self._overview_shift, y - self._row0, x - self._col0, radius
-        )
+        x, y, radius = self._make_room_for(x, y, radius)
+        mark_disc(self.visited, self.overview_sums, self._overview_shift, y - self._row0, x - self._col0, radius)
 
     def integrate(
         self, sensor_pose: Array | tuple[float, float, float], scan: Scan,
-        surface: NDArray[np.int16] | None = None,
+        surface: NDArray[np.int16] | None = None, *, body: tuple[float, float, float] | None = None,
     ) -> None:  # fmt: skip
         """Draw one scan taken from ``sensor_pose`` ``(3,)`` in the grid's frame.
 
@@ -205,63 +207,76 @@ class OccupancyGrid:
         surface : NDArray[np.int16], optional
             ``(beams,)``: the straight surface each beam ended on (see :mod:`slam.features`), negative for
             none. Hits on one surface are joined, which closes walls seen at a flat angle.
+        body : tuple, optional
+            Where the robot's body was, x and y [m], and its radius [m]: :meth:`mark_visited` in the same breath.
         """
         if surface is None:
             surface = NO_SURFACE
-        ranges, range_max, resolution = scan.ranges, scan.range_max, self.resolution
-        rays = self._ray_table(len(ranges), scan.angle_min, scan.angle_increment)
-        reach = math.ceil(range_max / resolution) + 3
-        mask, polygon = self._mask, self._polygon
-        if mask.shape[0] < 2 * reach + 1:
-            mask = self._mask = np.zeros((2 * reach + 1, (2 * reach // WORD + 3) * WORD), np.uint8)
-            self._mask_words = mask.view(np.uint64)
-        x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
+        self._prepare_for(scan)
+        resolution, reach = self.resolution, self._reach
+        mask, polygon, beams = self._mask, self._polygon, self._beams
+        x, y, theta = sensor_pose if isinstance(sensor_pose, tuple) else sensor_pose.tolist()
         # The sensor is near the mask's middle; its columns lie eight cells to a word of the grid's.
         mask_row = math.floor(y / resolution) - reach
         mask_col = (math.floor(x / resolution) - reach) & -WORD
         count, r0, c0, r1, c1 = outline(
-            polygon, ranges, rays, surface, x, y, theta, resolution, range_max, mask_row, mask_col,
-            self._full_circle,
+            polygon, beams, scan.ranges, self._rays, surface, x, y, theta, resolution, scan.range_max, mask_row,
+            mask_col, self._full_circle,
         )  # fmt: skip
         if count < 3:
+            if body is not None:
+                self.mark_visited(*body)
             return
-        c0, c1 = c0 & -WORD, c1 | (WORD - 1)
         rim = [polygon[:count]]
         cv2.fillPoly(mask, rim, IN_FREE, cv2.LINE_8, FIXED_POINT)
         # The rim runs along surfaces: the cells under it are not known to be free. Without this, walls seen at a
         # flat angle, where hits are sparse, would be erased between the hits.
         cv2.polylines(mask, rim, True, 0, 1, cv2.LINE_8, FIXED_POINT)
         self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
-        most = self._change_count + (r1 + 1 - r0) * (c1 + 1 - c0)
+        body_x, body_y, radius = (0.0, 0.0, -1.0) if body is None else self._make_room_for(*body)
+        most = self._change_count + (r1 + 1 - r0) * (c1 + 1 - c0) + 1
         if len(self._changes) < most:
             grown = np.zeros((2 * most, 4), np.int32)
             grown[: self._change_count] = self._changes[: self._change_count]
             self._changes = grown
-        self._change_count, known, entropy = mark_and_fuse(
-            ranges, rays, surface, x, y, theta, resolution, mask, self._mask_words, mask_row, mask_col,
-            r0, c0, r1, c1, self.log_odds, self._log_odds_words, self._row0, self._col0,
-            self._overview_probability, self._overview_known, self._overview_shift, self._changes,
-            self._change_count,
+        self._change_count, known, entropy = draw(
+            mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
+            self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
+            body_y - self._row0, body_x - self._col0, radius,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
 
-    def _ray_table(self, n: int, angle_min: float, angle_increment: float) -> Array:
-        key = (n, angle_min, angle_increment)
-        if key != self._rays_of:
-            angles = angle_min + angle_increment * np.arange(n)
-            self._rays = np.column_stack([np.cos(angles), np.sin(angles)])
-            self._polygon = np.empty((n + 1, 2), np.int32)
-            self._full_circle = n * angle_increment > 2 * math.pi - 1.5 * angle_increment
-            self._rays_of = key
-        return self._rays
+    def _prepare_for(self, scan: Scan) -> None:
+        """Make the tables and buffers for scans of this one's lidar, where the last one was of another."""
+        n, increment = len(scan.ranges), scan.angle_increment
+        lidar = (n, scan.angle_min, increment, scan.range_max)
+        if lidar == self._lidar:
+            return
+        self._lidar = lidar
+        angles = scan.angle_min + increment * np.arange(n)
+        self._rays = np.stack([np.cos(angles), np.sin(angles)])
+        self._full_circle = n * increment > 2 * math.pi - 1.5 * increment
+        self._polygon = np.empty((n + 1, 2), np.int32)
+        self._beams = np.empty((4, n))
+        self._reach = math.ceil(scan.range_max / self.resolution) + 3
+        # As wide as that again and a window more, into which the kernel may look beyond the box of a scan.
+        self._mask = np.zeros((2 * self._reach + 1, (2 * self._reach // WORD + 3) * WORD + WINDOW), np.uint8)
+
+    def _make_room_for(self, x: float, y: float, radius: float) -> tuple[float, float, float]:
+        """Make room for a disc [m]; return it in cells of the lattice."""
+        cell = self.resolution
+        x, y, radius = x / cell, y / cell, radius / cell
+        row, col, reach = math.floor(y), math.floor(x), math.ceil(radius) + 1
+        self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
+        return x, y, radius
 
     def _grow(self, row0: int, col0: int, row1: int, col1: int) -> None:
         """Make room for lattice cells [row0, row1) × [col0, col1), in chunks and with some to spare."""
-        rows, cols = self.shape
-        if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row0 + rows and col1 <= self._col0 + cols:
+        if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row1 and col1 <= self._col1:
             return
-        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row0 + rows, self._col0 + cols
+        rows, cols = self.shape
+        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row1, self._col1
         spare = 2 * _CHUNK
         if row0 < new_row0:
             new_row0 = math.floor((row0 - spare) / _CHUNK) * _CHUNK
@@ -273,11 +288,11 @@ class OccupancyGrid:
             new_col1 = math.ceil((col1 + spare) / _CHUNK) * _CHUNK
         r, c = self._row0 - new_row0, self._col0 - new_col0
         shape = (new_row1 - new_row0, new_col1 - new_col0)
-        log_odds, visited = np.zeros(shape, np.int8), np.zeros(shape, np.uint8)
+        log_odds, visited = _blank(shape).view(np.int8), _blank(shape)
         log_odds[r : r + rows, c : c + cols] = self.log_odds
         visited[r : r + rows, c : c + cols] = self.visited
         self.log_odds, self.visited = log_odds, visited
-        self._row0, self._col0 = new_row0, new_col0
+        self._row0, self._col0, self._row1, self._col1 = new_row0, new_col0, new_row1, new_col1
         self._build_overview()
 
     # ---- overview ------------------------------------------------------------------------------------------
@@ -292,16 +307,11 @@ class OccupancyGrid:
             # Beyond 2048 cells a side: the last block of a row may be short, which the padding stands for.
             rows, cols = -(-rows // block) * block, -(-cols // block) * block
         self.overview_block, self._overview_shift = block, block.bit_length() - 1
-        self._log_odds_words = self.log_odds.view(np.uint64)
-        shape = (rows // block, cols // block)
-        self._overview_known = np.zeros(shape, np.int32)
-        self._overview_probability = np.zeros(shape, np.int32)
-        self._overview_visited = np.zeros(shape, np.int32)
-        sum_blocks(
-            self.log_odds, self.visited, self._overview_shift, self._overview_known, self._overview_probability,
-            self._overview_visited,
-        )  # fmt: skip
+        self.overview_sums = np.zeros((3, rows // block, cols // block), np.int32)
+        sum_blocks(self.log_odds, self.visited, self._overview_shift, self.overview_sums)
 
-    def overview(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return per block: observed cells, the sum of their probability × 255, visited cells. Live arrays."""
-        return self._overview_known, self._overview_probability, self._overview_visited
+
+def _blank(shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return a plane of zeros with some more behind it, which kernels may read: see ``_take_unsettled``."""
+    size = shape[0] * shape[1]
+    return np.zeros(size + WINDOW, np.uint8)[:size].reshape(shape)

@@ -1,6 +1,6 @@
 """How a scan is drawn into an occupancy grid: cell values, and the Numba kernels behind the grid.
 
-OpenCV fills the polygon between :func:`outline` and :func:`fuse`.
+OpenCV fills the polygon between :func:`outline` and :func:`draw`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ HIT, MISS = 17, -13  # 0.85 and -0.65 nat: p = 0.70 and 0.34
 MAX_LOG_ODDS, MIN_LOG_ODDS = 70, -39  # p = 0.97 and 0.12
 OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 
-WORD = 8  # cells that the kernel looks at together
+WORD = 8  # cells that the kernel updates together
+WINDOW = 64  # cells that it looks at together: vectors of bytes
 FIXED_POINT = 4  # fractional bits of the polygon's vertices
 IN_FREE, IN_SURFACE = 1, 2  # marks in the scan's own mask
 
@@ -38,48 +39,78 @@ def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]
 
 
 PROBABILITY_BYTE, ENTROPY_BIT, CLASS_OF = _tables()
-_NO_MARKS = np.uint64(0)
-_ALL_FREE = np.full(WORD, IN_FREE, np.uint8).view(np.uint64)[0]
-_EVERY_BYTE = np.full(WORD, 1, np.uint8).view(np.uint64)[0]
-_FULL_BYTE, _ONE = np.uint64(255), np.uint64(1)
-_ALL_SURELY_FREE = np.full(WORD, MIN_LOG_ODDS, np.int8).view(np.uint64)[0]
-_ALL_SURELY_OCCUPIED = np.full(WORD, MAX_LOG_ODDS, np.int8).view(np.uint64)[0]
 
+# A cell's mark and byte make an index into what the cell becomes and what the grid's sums gain. The gains share
+# one number, from the low bits up: probability × 255 (of an unknown cell all of it) plus a bias that keeps it
+# positive, newly known, class changed, and the entropy in units of which every difference of two entropies is a
+# multiple. So the gains of eight cells are one sum, and exact in any order.
+_PROBABILITY, _BIAS = (1 << 16) - 1, 256
+_KNOWN_AT, _CHANGED_AT, _ENTROPY_AT = 16, 20, 24
+_COUNT = 15  # a field of counts: up to eight cells
+_ENTROPY_UNITS = float(1 << 26)  # to a bit
+
+
+def _steps() -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return, for each mark × 256 + byte of a cell: its byte afterwards, and what the sums gain."""
+    old = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.int64)
+    new = np.stack([old, np.maximum(old + MISS, MIN_LOG_ODDS), np.minimum(old + HIT, MAX_LOG_ODDS)])
+    new[1:][new[1:] == 0] = -1  # zero means never observed
+    before, after = old & 255, new & 255
+    probability = PROBABILITY_BYTE.astype(np.int64)
+    gain = probability[after] - np.where(old == 0, 0, probability[before])
+    gain += (old == 0).astype(np.int64) << _KNOWN_AT
+    gain += (CLASS_OF[after] != CLASS_OF[before]).astype(np.int64) << _CHANGED_AT
+    entropy = (ENTROPY_BIT[after] - ENTROPY_BIT[before]) * _ENTROPY_UNITS
+    gain += np.round(entropy).astype(np.int64) << _ENTROPY_AT
+    return after.astype(np.uint8).ravel(), (_BIAS + np.where(new == old, 0, gain)).ravel()
+
+
+_NEXT, _GAIN = _steps()
+_SURELY_FREE, _SURELY_OCCUPIED = np.uint8(MIN_LOG_ODDS & 255), np.uint8(MAX_LOG_ODDS)
 
 NO_SURFACE = np.zeros(0, np.int16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def outline(
-    polygon: NDArray[np.int32], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
-    theta: float, resolution: float, range_max: float, mask_row: int, mask_col: int, full_circle: bool,
+    polygon: NDArray[np.int32], beams: Array, ranges: Array, rays: Array, surface: NDArray[np.int16], x: float,
+    y: float, theta: float, resolution: float, range_max: float, mask_row: int, mask_col: int, full_circle: bool,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Write the scan's free polygon in fixed-point mask cells; return its length and the box it needs."""
+    """Write the scan's free polygon in fixed-point mask cells; return its length and the box it needs.
+
+    ``beams`` ``(4, n)`` is for :func:`draw`: its last two rows become the cells that beams ended in, or ``nan``.
+    """
     scale = float(1 << FIXED_POINT)
     c, s = math.cos(theta), math.sin(theta)
-    x0 = x / resolution - mask_col - 0.5  # OpenCV's pixel (0, 0) is centred on (0, 0)
-    y0 = y / resolution - mask_row - 0.5
+    x0, y0 = x / resolution - mask_col, y / resolution - mask_row
+    n = ranges.shape[0]
+    # What needs no branches first, in a loop that vectorises.
+    for i in range(n):
+        r = ranges[i]
+        along_x, along_y = c * rays[0, i] - s * rays[1, i], s * rays[0, i] + c * rays[1, i]
+        reach = (range_max if r > range_max else r) / resolution
+        beams[0, i], beams[1, i] = along_x * reach, along_y * reach
+        # What stopped the beam lies behind the point it returned from: a quarter of a cell deeper.
+        deeper = reach + 0.25 if r <= range_max else math.nan
+        beams[2, i], beams[3, i] = x0 + along_x * deeper, y0 + along_y * deeper
+    x0, y0 = x0 - 0.5, y0 - 0.5  # OpenCV's pixel (0, 0) is centred on (0, 0)
     low_x = high_x = x0
     low_y = high_y = y0
     count = 0
     lost = 0
-    n = ranges.shape[0]
     joined = surface.shape[0] == n
     for i in range(n):
-        r = ranges[i]
         if joined and 0 < i < n - 1 and surface[i] >= 0 and surface[i - 1] == surface[i] == surface[i + 1]:
             continue  # within a straight surface: its two ends say it all
-        if math.isnan(r):
+        dx, dy = beams[0, i], beams[1, i]
+        if math.isnan(dx):
             # One or two lost beams are bridged by their neighbours; a run of them is not known to be free.
             lost += 1
             if lost != 3:
                 continue
-            reach = 0.0
+            dx = dy = 0.0
         else:
             lost = 0
-            reach = (range_max if r > range_max else r) / resolution
-        dx = (c * rays[i, 0] - s * rays[i, 1]) * reach
-        dy = (s * rays[i, 0] + c * rays[i, 1]) * reach
         polygon[count, 0] = round((x0 + dx) * scale)
         polygon[count, 1] = round((y0 + dy) * scale)
         count += 1
@@ -89,182 +120,188 @@ def outline(
         polygon[count, 0] = round(x0 * scale)
         polygon[count, 1] = round(y0 * scale)
         count += 1
-    # Two cells of margin: half for the rounding, one and a half for the surfaces beyond the rim.
+    # Two cells of margin: half for the rounding, one and a half for the surfaces beyond the rim. Whole words.
     return (
-        count, max(int(low_y) - 2, 0), max(int(low_x) - 2, 0), int(high_y) + 3, int(high_x) + 3
+        count, max(int(low_y) - 2, 0), max(int(low_x) - 2, 0) & -WORD, int(high_y) + 3,
+        (int(high_x) + 3) | (WORD - 1),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_surfaces(
-    mask: NDArray[np.uint8], ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float,
-    theta: float, resolution: float, mask_row: int, mask_col: int,
-) -> None:  # fmt: skip
+def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16]) -> None:
     """Mark the cells that beams ended in, and those between two hits on one straight surface."""
-    c, s = math.cos(theta), math.sin(theta)
-    x0, y0 = x / resolution - mask_col, y / resolution - mask_row
-    n = ranges.shape[0]
+    n = beams.shape[1]
     joined = surface.shape[0] == n
     last_x = last_y = 0.0
     last_surface = -1
     for i in range(n):
-        r = ranges[i]
-        if not math.isfinite(r):
+        px, py = beams[2, i], beams[3, i]
+        if math.isnan(px):
             continue
-        # What stopped the beam lies behind the point it returned from: a quarter of a cell deeper.
-        reach = r / resolution + 0.25
-        px = x0 + (c * rays[i, 0] - s * rays[i, 1]) * reach
-        py = y0 + (s * rays[i, 0] + c * rays[i, 1]) * reach
-        mask[int(py), int(px)] = IN_SURFACE
+        mask[np.uint32(py), np.uint32(px)] = IN_SURFACE
         here = int(surface[i]) if joined else -1
         if here >= 0 and here == last_surface:
             dx, dy = px - last_x, py - last_y
             steps = int(max(abs(dx), abs(dy)) * 1.5)
             for k in range(1, steps + 1):
                 f = k / (steps + 1)
-                mask[int(last_y + f * dy), int(last_x + f * dx)] = IN_SURFACE
+                mask[np.uint32(last_y + f * dy), np.uint32(last_x + f * dx)] = IN_SURFACE
         last_x, last_y, last_surface = px, py, here
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _step_of(marks: np.uint64, cells: np.uint64, k: int) -> np.uint64:
+    """Return the index into the steps for the k-th cell of a word (little-endian, as x86 and ARM are)."""
+    at = np.uint64(8 * k)
+    return ((marks >> at) & np.uint64(255)) << np.uint64(8) | ((cells >> at) & np.uint64(255))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take_unsettled(
+    mask: NDArray[np.uint8], cells: NDArray[np.uint8], down: int, ahead: int, top: int, left: int, bottom: int,
+    right: int,
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:  # fmt: skip
+    """Wipe a box of the mask; return its windows with marks that change a cell, and which words these are.
+
+    A row of the windows is eight words of such marks, then the row and column that they begin at in the grid.
+
+    Most of a known map is settled: its cells are at the limit that a scan pushes them to. Nothing here branches
+    on what a cell holds, which the processor would guess wrongly along every rim.
+
+    A window may reach beyond the box: the mask is wide enough for it and bears no marks there, and
+    :data:`WINDOW` bytes to spare follow the grid.
+    """
+    u = np.uint64  # as indices, others are tested for being negative
+    words_each = u(WINDOW // WORD)
+    most = (bottom - top + 1) * ((right - left) // WINDOW + 1)
+    windows = np.empty((most, WINDOW // WORD + 2), np.uint64)
+    mask_words, unsettled_marks = mask.view(np.uint64), windows.view(np.uint8)
+    n = u(0)
+    for i in range(u(top), u(bottom + 1)):
+        for j in range(u(left), u(right + 1), u(WINDOW)):
+            row, col = i + u(down), j + u(ahead)
+            any_unsettled = False
+            for k in range(u(WINDOW)):
+                mark, cell = mask[i, j + k], cells[row, col + k]
+                unsettled = ((mark == IN_FREE) & (cell != _SURELY_FREE)) | (
+                    (mark == IN_SURFACE) & (cell != _SURELY_OCCUPIED)
+                )
+                unsettled_marks[n, k] = mark if unsettled else 0
+                any_unsettled |= unsettled
+            for k in range(words_each):
+                mask_words[i, j // u(WORD) + k] = 0
+            windows[n, words_each], windows[n, words_each + u(1)] = row, col
+            n += u(any_unsettled)
+    todo = np.empty(n * words_each, np.uint32)
+    m = u(0)
+    for i in range(n):
+        for k in range(words_each):
+            todo[m] = i * words_each + k
+            m += u(windows[i, k] != 0)
+    return windows, todo[:m]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fuse(
-    mask_words: NDArray[np.uint64], mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
-    log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], lattice_row: int, lattice_col: int,
-    overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], shift: int,
+    mask: NDArray[np.uint8], mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
+    log_odds: NDArray[np.int8], lattice_row: int, lattice_col: int, overview: NDArray[np.int32], shift: int,
     changes: NDArray[np.int32], count: int,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Add the box [top, bottom] × [left, right] of a scan's mask to the grid and wipe it.
 
-    Return the number of changes, and by how much the known cells and the entropy went up. Eight cells at a time
-    are passed over where the scan says nothing, or nothing new of cells at their limits: most of a known map.
+    Return the number of changes, and by how much the known cells and the entropy went up. ``changes`` needs room
+    for one more than there are cells in the box.
     """
-    known = 0
-    entropy = 0.0
-    first_word, end_word = left // WORD, (right + 1) // WORD
-    words_ahead = (mask_col - lattice_col) // WORD  # from a word of the mask to its place in the grid
+    u = np.uint64  # as indices, others are tested for being negative
+    words_each = u(WINDOW // WORD)
+    words = log_odds.view(np.uint64)
+    windows, todo = _take_unsettled(
+        mask, log_odds.view(np.uint8), mask_row - lattice_row, mask_col - lattice_col, top, left, bottom, right
+    )
     width = min(1 << shift, WORD)  # cells of a word within one block of the overview
-    for i in range(top, bottom + 1):
-        line = mask_words[i]
-        row = mask_row + i - lattice_row
-        word = first_word - 1
-        while True:
-            word += 1
-            while word + 4 <= end_word and (line[word] | line[word + 1]) | (line[word + 2] | line[word + 3]) == 0:
-                word += 4
-            if word >= end_word:
-                break
-            marks = line[word]
-            if marks == _NO_MARKS:
-                continue
-            line[word] = _NO_MARKS
-            at = words_ahead + word
-            first = WORD * at
-            cells = log_odds_words[row, at]
-            free = (marks & _EVERY_BYTE) * _FULL_BYTE
-            surface = ((marks >> _ONE) & _EVERY_BYTE) * _FULL_BYTE
-            unsettled = (cells ^ _ALL_SURELY_FREE) & free | (cells ^ _ALL_SURELY_OCCUPIED) & surface
-            if unsettled == _NO_MARKS:
-                continue
-            if marks == _ALL_FREE:
-                value = cells & np.uint64(255)
-                if cells == value * _EVERY_BYTE:
-                    # Eight cells alike, as in a room just seen: reckon once.
-                    old = int(log_odds[row, first])
-                    new: int = max(old + MISS, MIN_LOG_ODDS)
-                    if new == 0:
-                        new = -1
-                    log_odds_words[row, at] = np.uint64(new & 255) * _EVERY_BYTE
-                    entropy += WORD * (ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255])
-                    delta = int(PROBABILITY_BYTE[new & 255]) - (
-                        int(PROBABILITY_BYTE[old & 255]) if old != 0 else 0
-                    )
-                    for c in range(first >> shift, ((first + WORD - 1) >> shift) + 1):
-                        overview_probability[row >> shift, c] += width * delta
-                        if old == 0:
-                            overview_known[row >> shift, c] += width
-                    if old == 0:
-                        known += WORD
-                    if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
-                        for col in range(first, first + WORD):
-                            changes[count, 0] = lattice_row + row
-                            changes[count, 1] = lattice_col + col
-                            changes[count, 2] = CLASS_OF[old & 255]
-                            changes[count, 3] = CLASS_OF[new & 255]
-                            count += 1
-                    continue
+    known = entropy = 0
+    for t in range(u(todo.shape[0])):
+        window, word = u(todo[t]) // words_each, u(todo[t]) % words_each
+        marks, row = windows[window, word], windows[window, words_each]
+        col = windows[window, words_each + u(1)] + u(WORD) * word
+        before, after = words[row, col // u(WORD)], u(0)
+        gain = 0
+        for k in range(WORD):
+            step = _step_of(marks, before, k)
+            after |= u(_NEXT[step]) << u(8 * k)
+            gain += _GAIN[step]
+        words[row, col // u(WORD)] = after
+        known += (gain >> _KNOWN_AT) & _COUNT
+        entropy += gain >> _ENTROPY_AT
+        r = row >> u(shift)
+        if width == WORD:
+            overview[0, r, col >> u(shift)] += (gain >> _KNOWN_AT) & _COUNT
+            overview[1, r, col >> u(shift)] += (gain & _PROBABILITY) - WORD * _BIAS
+        else:
             for k in range(WORD):
-                mark = (marks >> np.uint64(8 * k)) & np.uint64(255)  # little-endian, as x86 and ARM are
-                if mark == 0:
-                    continue
-                col = first + k
-                old = int(log_odds[row, col])
-                new = min(old + HIT, MAX_LOG_ODDS) if mark == IN_SURFACE else max(old + MISS, MIN_LOG_ODDS)
-                if new == old:
-                    continue
-                if new == 0:
-                    new = -1  # zero means never observed
-                log_odds[row, col] = new
-                r, c = row >> shift, col >> shift
-                delta = int(PROBABILITY_BYTE[new & 255])
-                entropy += ENTROPY_BIT[new & 255] - ENTROPY_BIT[old & 255]
-                if old == 0:
-                    known += 1
-                    overview_known[r, c] += 1
-                else:
-                    delta -= int(PROBABILITY_BYTE[old & 255])
-                overview_probability[r, c] += delta
-                if CLASS_OF[old & 255] != CLASS_OF[new & 255]:
-                    changes[count, 0] = lattice_row + row
-                    changes[count, 1] = lattice_col + col
-                    changes[count, 2] = CLASS_OF[old & 255]
-                    changes[count, 3] = CLASS_OF[new & 255]
-                    count += 1
-    return count, known, entropy
+                own = _GAIN[_step_of(marks, before, k)]
+                overview[0, r, (col + u(k)) >> u(shift)] += (own >> _KNOWN_AT) & _COUNT
+                overview[1, r, (col + u(k)) >> u(shift)] += (own & _PROBABILITY) - _BIAS
+        if (gain >> _CHANGED_AT) & _COUNT:
+            for k in range(WORD):
+                class_before = CLASS_OF[(before >> u(8 * k)) & u(255)]
+                class_after = CLASS_OF[(after >> u(8 * k)) & u(255)]
+                # Written in any case, and kept if it is one.
+                changes[u(count), 0] = lattice_row + np.int64(row)
+                changes[u(count), 1] = lattice_col + np.int64(col) + k
+                changes[u(count), 2] = class_before
+                changes[u(count), 3] = class_after
+                count += class_before != class_after
+    return count, known, entropy / _ENTROPY_UNITS
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_and_fuse(
-    ranges: Array, rays: Array, surface: NDArray[np.int16], x: float, y: float, theta: float, resolution: float,
-    mask: NDArray[np.uint8], mask_words: NDArray[np.uint64], mask_row: int, mask_col: int, top: int, left: int,
-    bottom: int, right: int, log_odds: NDArray[np.int8], log_odds_words: NDArray[np.uint64], lattice_row: int,
-    lattice_col: int, overview_probability: NDArray[np.int32], overview_known: NDArray[np.int32], shift: int,
-    changes: NDArray[np.int32], count: int,
+def draw(
+    mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
+    left: int, bottom: int, right: int, log_odds: NDArray[np.int8], visited: NDArray[np.uint8], lattice_row: int,
+    lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
+    x: float, radius: float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Mark a scan's surfaces in its mask, then add the mask to the grid: all that follows OpenCV, in one call."""
-    mark_surfaces(mask, ranges, rays, surface, x, y, theta, resolution, mask_row, mask_col)
+    """Do all that follows OpenCV, in one call: surfaces into the mask, the mask into the grid, and the body.
+
+    Arguments and return value are those of :func:`mark_surfaces`, :func:`fuse` and :func:`mark_disc`.
+    """
+    mark_surfaces(mask, beams, surface)
+    mark_disc(visited, overview, shift, y, x, radius)
     return fuse(
-        mask_words, mask_row, mask_col, top, left, bottom, right, log_odds, log_odds_words, lattice_row,
-        lattice_col, overview_probability, overview_known, shift, changes, count,
+        mask, mask_row, mask_col, top, left, bottom, right, log_odds, lattice_row, lattice_col, overview, shift,
+        changes, count,
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sum_blocks(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], shift: int, known: NDArray[np.int32],
-    probability: NDArray[np.int32], trail: NDArray[np.int32],
-) -> None:  # fmt: skip
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], shift: int, overview: NDArray[np.int32]
+) -> None:
     """Add up blocks of 2^shift cells a side: observed cells, their probability × 255, visited cells."""
     for i in range(log_odds.shape[0]):
         r = i >> shift
         for j in range(log_odds.shape[1]):
             v = log_odds[i, j]
             if v != 0:
-                known[r, j >> shift] += 1
-                probability[r, j >> shift] += PROBABILITY_BYTE[np.uint64(v & 255)]
+                overview[0, r, j >> shift] += 1
+                overview[1, r, j >> shift] += PROBABILITY_BYTE[np.uint64(v & 255)]
             if visited[i, j] != 0:
-                trail[r, j >> shift] += 1
+                overview[2, r, j >> shift] += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_disc(
     visited: NDArray[np.uint8], overview: NDArray[np.int32], shift: int, y: float, x: float, radius: float
 ) -> None:
-    """Mark the cells whose centre lies within ``radius`` of (x, y), all in cells of the grid."""
+    """Mark the cells whose centre lies within ``radius`` of (x, y), all in cells of the grid; none if negative."""
+    if radius < 0.0:
+        return
     for i in range(int(y - radius), int(y + radius) + 1):
         for j in range(int(x - radius), int(x + radius) + 1):
-            if (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius and visited[i, j] == 0:
+            if visited[i, j] == 0 and (i + 0.5 - y) ** 2 + (j + 0.5 - x) ** 2 <= radius * radius:
                 visited[i, j] = 1
-                overview[i >> shift, j >> shift] += 1
+                overview[2, i >> shift, j >> shift] += 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -279,8 +316,8 @@ def ends_on(
         r = ranges[i]
         if not r < range_max:  # lost (nan) and without return
             continue
-        col = math.floor(x + (c * rays[i, 0] - s * rays[i, 1]) * r / resolution)
-        row = math.floor(y + (s * rays[i, 0] + c * rays[i, 1]) * r / resolution)
+        col = math.floor(x + (c * rays[0, i] - s * rays[1, i]) * r / resolution)
+        row = math.floor(y + (s * rays[0, i] + c * rays[1, i]) * r / resolution)
         if 0 <= row < log_odds.shape[0] and 0 <= col < log_odds.shape[1]:
             total += log_odds[row, col]
     return total

@@ -47,6 +47,54 @@ def test_local_map_against_the_simple_version(pose: tuple[float, float, float], 
     assert differing <= 3  # fixed-point rounding at the edge of a cell, and of the grid
 
 
+def local_map_simply(
+    grid: OccupancyGrid, resolution: float, x: float, y: float, theta: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Probabilities and trail of the local map, a whole picture at a time, in the kernel's float32."""
+    step = LOCAL_CELL_M / resolution
+    c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
+    half = MAP_SIZE / 2 - 0.5
+    i, j = np.indices((MAP_SIZE, MAP_SIZE))
+    row0, col0 = grid.lattice_origin
+    x0 = (x / resolution - col0 + float(c) * (half - i) - float(s) * half).astype(np.float32)
+    y0 = (y / resolution - row0 + float(s) * (half - i) + float(c) * half).astype(np.float32)
+    px, py = x0 + j.astype(np.float32) * s, y0 - j.astype(np.float32) * c
+    quarter = np.float32(0.25)
+    one_way = (i + j) % 2 == 1
+    dx = np.where(one_way, quarter * (c - s), quarter * (c + s))
+    dy = np.where(one_way, quarter * (s + c), quarter * (s - c))
+    reach_x, reach_y = np.abs(dx).max(), np.abs(dy).max()
+    rows, cols = grid.shape
+    inside = (px >= reach_x) & (py >= reach_y)
+    inside &= (px < np.float32(cols) - reach_x) & (py < np.float32(rows) - reach_y)
+
+    def at(plane: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        cells = plane[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
+        return np.where(inside, cells, plane.dtype.type(0))
+
+    first, second = at(grid.log_odds, px + dx, py + dy), at(grid.log_odds, px - dx, py - dy)
+    best = np.where(first == 0, second, np.where(second == 0, first, np.maximum(first, second)))
+    trail = np.where((best != 0) & (at(grid.visited, px, py) != 0), 255, 0)
+    return PROBABILITY_BYTE[best.view(np.uint8)], trail
+
+
+@given(poses, st.sampled_from([0.05, 0.1]), st.integers(0, 2**32 - 1))
+def test_local_map_equals_one_made_a_whole_picture_at_a_time(
+    pose: tuple[float, float, float], resolution: float, seed: int
+) -> None:
+    grid = room_grid(resolution)
+    rng = np.random.default_rng(seed)
+    speckled = rng.random(grid.shape) < 0.5
+    grid.log_odds[speckled] = rng.integers(-39, 71, np.count_nonzero(speckled))
+    grid.visited[:] = rng.random(grid.shape) < 0.3
+    out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
+    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, resolution, *pose)
+    probability, trail = local_map_simply(grid, resolution, *pose)
+    np.testing.assert_array_equal(out[0], probability)
+    np.testing.assert_array_equal(out[1] == 255, probability != UNKNOWN_BYTE)
+    np.testing.assert_array_equal(out[2], trail)
+
+
 def test_the_local_map_is_heading_up() -> None:
     grid = OccupancyGrid()
     pose = np.array([2.0, 2.5, math.pi / 2])  # facing +y: the wall ahead is 2.5 m away, the left one 2 m
@@ -60,11 +108,10 @@ def test_the_local_map_is_heading_up() -> None:
 
 def test_the_global_map_puts_the_robot_where_the_pose_says() -> None:
     grid = room_grid()
-    known, probability, visited = grid.overview()
     out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
     cx, cy, half = map_frame(grid)
     x, y = 4.0, 3.0
-    _fill_global(out, known, probability, visited, grid.overview_block, (x - cx) / half, (y - cy) / half)
+    _fill_global(out, grid.overview_sums, grid.overview_block, (x - cx) / half, (y - cy) / half)
     row, col = np.argwhere(out[2] == 255).mean(axis=0)
     assert abs((MAP_SIZE / 2 - row - 0.5) / (MAP_SIZE / 2) * half + cy - y) <= half / MAP_SIZE * 2
     assert abs((col + 0.5 - MAP_SIZE / 2) / (MAP_SIZE / 2) * half + cx - x) <= half / MAP_SIZE * 2

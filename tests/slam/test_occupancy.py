@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import copy
 import math
+import pickle
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -9,7 +12,19 @@ from hypothesis import strategies as st
 
 from slam import Scan
 from slam.features import FeatureExtractor
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.scan_drawing import (
+    ENTROPY_BIT,
+    HIT,
+    IN_FREE,
+    IN_SURFACE,
+    MAX_LOG_ODDS,
+    MIN_LOG_ODDS,
+    MISS,
+    WINDOW,
+    WORD,
+    fuse,
+)
 from tests.slam.simulated import ANGLE_MIN, BEAMS, INCREMENT, room_scan
 
 inside = st.tuples(st.floats(1, 5), st.floats(1, 4), st.floats(-3.1, 3.1)).map(np.array)
@@ -59,16 +74,80 @@ def test_bookkeeping_agrees_with_a_full_count(pose: np.ndarray) -> None:
     p = grid.probability()[grid.log_odds != 0].astype(float)
     entropy = -(p * np.log2(p) + (1 - p) * np.log2(1 - p)) - 1
     assert grid.entropy_bit == pytest.approx(entropy.sum(), rel=1e-4)
-    kept = [a.copy() for a in grid.overview()]
+    kept = grid.overview_sums.copy()
     grid._build_overview()
     byte = np.round(255 * grid.probability().astype(float)) * (grid.log_odds != 0)
-    block, (rows, cols) = grid.overview_block, grid.overview()[0].shape
+    block, (rows, cols) = grid.overview_block, grid.overview_sums.shape[1:]
     for incremental, anew, cells in zip(
-        kept, grid.overview(), (grid.log_odds != 0, byte, grid.visited), strict=True
+        kept, grid.overview_sums, (grid.log_odds != 0, byte, grid.visited), strict=True
     ):
         np.testing.assert_array_equal(incremental, anew)
         simple = cells.astype(int).reshape(rows, block, cols, block).sum(axis=(1, 3))
         np.testing.assert_array_equal(anew, simple)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([64, 100, 200, 300]), st.floats(0.0, 1.0))
+def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    grid = OccupancyGrid()
+    grid._grow(-side // 2, -side // 2, side // 2, side // 2)
+    settled = rng.choice([MIN_LOG_ODDS, 0, MAX_LOG_ODDS], grid.shape)
+    any_value = rng.integers(MIN_LOG_ODDS, MAX_LOG_ODDS + 1, grid.shape)
+    before = np.where(rng.random(grid.shape) < share, settled, any_value)
+    grid.log_odds[:] = before
+    grid._build_overview()
+    # A mask that lies somewhere over the grid, with marks in a box of whole words.
+    rows, cols = 40, 12 * WORD
+    row, col = rng.integers(0, grid.shape[0] - rows + 1), WORD * rng.integers(-4, grid.shape[1] // WORD - 8 + 1)
+    left = WORD * int(rng.integers(4, 8))
+    right = min(left + WORD * int(rng.integers(1, 8)), cols, grid.shape[1] - col) - 1
+    top, bottom = 3, 35
+    mask = np.zeros((rows, cols + WINDOW), np.uint8)
+    box = (slice(top, bottom + 1), slice(left, right + 1))
+    mask[box] = rng.choice([0, IN_FREE, IN_SURFACE], mask[box].shape)
+    marks = np.zeros(grid.shape, np.uint8)
+    marks[row + top : row + bottom + 1, col + left : col + right + 1] = mask[box]
+
+    changes = np.zeros((marks.size + 1, 4), np.int32)
+    lattice_row, lattice_col = grid.lattice_origin
+    count, known, entropy = fuse(
+        mask, lattice_row + row, lattice_col + col, top, left, bottom, right, grid.log_odds, lattice_row,
+        lattice_col, grid.overview_sums, grid._overview_shift, changes, 0,
+    )  # fmt: skip
+
+    after = np.where(marks == IN_FREE, np.maximum(before + MISS, MIN_LOG_ODDS), before)
+    after = np.where(marks == IN_SURFACE, np.minimum(before + HIT, MAX_LOG_ODDS), after)
+    after[(marks != 0) & (after == 0)] = -1
+    np.testing.assert_array_equal(grid.log_odds, after)
+    assert not mask.any()
+    assert known == np.count_nonzero(after) - np.count_nonzero(before)
+    gained = ENTROPY_BIT[after & 255] - ENTROPY_BIT[before & 255]
+    assert entropy == gained.astype(np.float64).sum()  # exactly: the order does not matter
+    class_before, class_after = CLASS_OF[before & 255], CLASS_OF[after & 255]
+    r, c = np.nonzero(class_before != class_after)
+    want = np.column_stack([r + lattice_row, c + lattice_col, class_before[r, c], class_after[r, c]])
+    np.testing.assert_array_equal(changes[:count], want)
+    kept = grid.overview_sums.copy()
+    grid._build_overview()
+    np.testing.assert_array_equal(kept, grid.overview_sums)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda grid: pickle.loads(pickle.dumps(grid))])
+def test_a_copy_goes_its_own_way_and_has_the_bytes_that_kernels_read_behind_the_cells(
+    duplicate: Callable[[OccupancyGrid], OccupancyGrid],
+) -> None:
+    pose = np.array([3.0, 2.0, 0.4])
+    grid = mapped(pose)
+    copied, before = duplicate(grid), grid.log_odds.copy()
+    np.testing.assert_array_equal(copied.log_odds, before)
+    copied.integrate(pose, room_scan(pose), body=(3.0, 2.0, 0.25))
+    np.testing.assert_array_equal(grid.log_odds, before)
+    assert copied.visited.any() and not grid.visited.any()
+    for plane in (copied.log_odds, copied.visited):
+        owner = plane
+        while owner.base is not None:
+            owner = owner.base
+        assert owner.nbytes >= plane.nbytes + WINDOW
 
 
 def test_growing_keeps_every_cell_where_it_was() -> None:
