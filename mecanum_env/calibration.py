@@ -17,7 +17,7 @@ _PERSISTENCE = 10.0
 
 # What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), with something to spare:
 # a robot that stands must not become certain of it.
-_FLOOR_M_S = 0.0003
+_FLOOR_M_S = 0.0001
 
 
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:

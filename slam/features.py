@@ -68,12 +68,12 @@ class FeatureConfig:
     edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
     # 1σ of a corner along each axis that the model of straight walls leaves out. When it was chosen, over
     # apartments of the training seeds 0-15, the average pose NEES/3 was 0.98 with it and 0.63 with 2 mm.
-    sigma_floor_m: float = 0.001
+    sigma_floor_m: float = 0.0005
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: float = 0.6
     wall_points: int = 10
-    wall_sigma_m: float = 0.001  # 1σ that the model of a straight wall leaves out, across it …
-    wall_sigma_rad: float = 0.0005  # … and in its direction
+    wall_sigma_m: float = 0.0005  # 1σ that the model of a straight wall leaves out, across it …
+    wall_sigma_rad: float = 0.0002  # … and in its direction
 
     def __post_init__(self) -> None:
         require(self.range_sigma_m >= 0, "FeatureConfig.range_sigma_m must be ≥ 0")
