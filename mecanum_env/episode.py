@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,18 +35,18 @@ class EpisodeRecord:
         self.path_length_m = 0.0
         self.collisions = 0
 
-    def append(
-        self, time_s: float, true_pose: Sequence[float], estimate: Sequence[float], coverage: float, nees: float
-    ) -> None:
-        """Add one step (poses x, y, θ); the first row is the start itself."""
-        if self._count == len(self._rows):
+    def append(self, row: tuple[float, ...]) -> None:
+        """Add one step: true and believed pose (x, y, θ), time [s], coverage, NEES; the first is the start itself."""
+        count = self._count
+        if count == len(self._rows):
             self._rows = np.vstack([self._rows, np.empty_like(self._rows)])
-        x, y = true_pose[0], true_pose[1]
-        self._rows[self._count] = (*true_pose, *estimate, time_s, coverage, nees)
-        if self._count:
-            self.path_length_m += math.hypot(x - self._last[0], y - self._last[1])
-        self._last = (x, y)
-        self._count += 1
+        self._rows[count] = row
+        x, y = row[0], row[1]
+        if count:
+            last_x, last_y = self._last
+            self.path_length_m += math.hypot(x - last_x, y - last_y)
+        self._last = x, y
+        self._count = count + 1
 
     @property
     def times(self) -> Array:

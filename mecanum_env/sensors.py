@@ -44,12 +44,17 @@ def _measure(
 
 @njit(cache=True, nogil=True)
 def _sweep(
-    segments: Array, circles: Array, x: float, y: float, theta: float, offset: float, directions: Array,
-    angle_min: float, angle_increment: float, range_max: float, range_min: float, sigma: float, dropout: float,
-    normals: Array, uniforms: Array, out: Array,
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, normals: Array,
+    uniforms: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes."""
-    x, y = x + offset * math.cos(theta), y + offset * math.sin(theta)
+    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes.
+
+    ``limits`` are those of :class:`Lidar`.
+    """
+    offset, angle_min, angle_increment = limits[0], limits[1], limits[2]
+    range_max, range_min, sigma, dropout = limits[3], limits[4], limits[5], limits[6]
+    theta = pose[2]
+    x, y = pose[0] + offset * math.cos(theta), pose[1] + offset * math.sin(theta)
     cast_rays(segments, circles, x, y, theta, directions, angle_min, angle_increment, range_max, out)
     _measure(out, normals, uniforms, sigma, dropout, range_min, range_max)
 
@@ -71,6 +76,13 @@ class Lidar:
         self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
         self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
         self._normals, self._uniforms = np.empty(config.beams), np.empty(config.beams)
+        # One array, since each argument of a call takes time to unpack.
+        self._limits = np.array([
+            config.offset_m, self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m,
+            noise.range_sigma_m, noise.dropout,
+        ])  # fmt: skip
+        self._beams = config.beams
+        self._of_scan = self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m
 
     def true_ranges(self, segments: Array, circles: Array, pose: ArrayLike) -> Array:
         """Return the exact range of each beam ``(beams,)`` [m], ``inf`` beyond ``range_max_m``.
@@ -104,18 +116,12 @@ class Lidar:
 
         ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
         """
-        config, noise = self.config, self.noise
-        angle_min, increment = self._angle_min, self._angle_increment
-        x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
-        ranges = np.empty(config.beams)
+        ranges = np.empty(self._beams)
         rng.standard_normal(out=self._normals)
         rng.random(out=self._uniforms)
-        _sweep(
-            segments, circles, x, y, theta, config.offset_m, self._directions, angle_min, increment,
-            config.range_max_m, config.range_min_m, noise.range_sigma_m, noise.dropout, self._normals,
-            self._uniforms, ranges,
-        )  # fmt: skip
-        return Scan(ranges, angle_min, increment, config.range_max_m, config.range_min_m)
+        pose = np.asarray(pose, dtype=np.float64)
+        _sweep(segments, circles, pose, self._directions, self._limits, self._normals, self._uniforms, ranges)
+        return Scan(ranges, *self._of_scan)
 
 
 class WheelEncoders:
@@ -146,6 +152,8 @@ class WheelEncoders:
         self.robot = robot
         self.noise = noise
         self._forward = forward_matrix(robot)  # (3, 4)
+        self._normals = np.empty(4)
+        self._sigma, self._rolling = noise.encoder, 1.0 - noise.slip
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
@@ -164,9 +172,8 @@ class WheelEncoders:
         """
         increments = np.asarray(wheel_increments, dtype=np.float64)
         twist = np.empty(3)
-        noise = self.noise
-        gain = (1.0 - noise.slip) / dt
-        _read_encoders(self._forward, increments, rng.standard_normal(4), noise.encoder, gain, twist)
+        rng.standard_normal(out=self._normals)
+        _read_encoders(self._forward, increments, self._normals, self._sigma, self._rolling / dt, twist)
         return Odometry(twist, dt)
 
 
