@@ -33,6 +33,7 @@ from mecanum_env.config import (
 )
 from mecanum_env.episode import EpisodeRecord
 from mecanum_env.ground_truth import Coverage, GroundTruth
+from mecanum_env.noise import noise_stream
 from mecanum_env.observation import Observation, observation_space, observe
 from mecanum_env.reward import StepOutcome, reward_terms
 from mecanum_env.robot import WheelTargets
@@ -198,7 +199,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         world_seed, sensor_seed = np.random.SeedSequence(episode_seed).spawn(2)
         world_rng = np.random.Generator(np.random.PCG64(world_seed))
-        self._sensor_rng = np.random.Generator(np.random.PCG64(sensor_seed))
+        self._sensor_rng = noise_stream(sensor_seed)
         room_seed = options.get("room_seed")
         plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
         config = self.config

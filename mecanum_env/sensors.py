@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
+from mecanum_env.noise import RandomNumbers
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.robot import forward_matrix
 from slam.types import Odometry, Scan
@@ -111,7 +112,7 @@ class Lidar:
         )
         return out
 
-    def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: np.random.Generator) -> Scan:
+    def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: RandomNumbers) -> Scan:
         """Return one sweep from a robot at ``pose``; arguments as in :meth:`true_ranges`.
 
         ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
@@ -158,7 +159,7 @@ class WheelEncoders:
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
 
-    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: np.random.Generator) -> Odometry:
+    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
         """Return the body twist that the wheels' measured rotation stands for.
 
         Parameters
