@@ -21,6 +21,10 @@ Array = NDArray[np.float64]
 
 _TWO_PI = 2.0 * math.pi
 _BEARING_ERROR = 4e-5  # [rad], above what a difference of two results of _bearing can be wrong by
+# Rows of what is known of the segments as the sensor sees them: whether they are too far (0), edge on (-1) or neither;
+# the beams, not whole numbers, at which they start and stop; the coefficients of their inverse range; their ends [m].
+_SEEN, _START, _STOP, _P, _Q, _AX, _AY, _BX, _BY = range(9)
+_ROWS = 9
 _SEAM_M = 1e-9  # a beam that passes an end point within this hits it: no ray slips through where walls meet
 
 
@@ -62,38 +66,51 @@ def _edge_beams(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _segment(
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    angle_min: float,
-    angle_increment: float,
-    directions: Array,
-    inverse: Array,
-) -> None:
-    """Draw a segment, given in the sensor frame, into the buffer; ``angle_min`` in [-π, π)."""
-    cross = ax * by - ay * bx
-    if cross < 0.0:
-        ax, ay, bx, by, cross = bx, by, ax, ay, -cross
-    if cross <= 1e-12 * (abs(bx - ax) + abs(by - ay)):
-        _edge_on(ax, ay, bx, by, angle_min, angle_increment, directions, inverse)
-        return
-    # Seen counter-clockwise from a to b, the segment spans less than half a turn.
-    bearing_a, bearing_b = _bearing(ax, ay), _bearing(bx, by)
-    span = bearing_b - bearing_a if bearing_b >= bearing_a else bearing_b - bearing_a + _TWO_PI
-    if span > math.pi + 0.01:
-        span = 0.0  # the error of two nearly equal bearings
-    per_radian = 1.0 / angle_increment
-    turn = _TWO_PI * per_radian  # beams to a full turn; beam k + turn is beam k
-    doubt = _BEARING_ERROR * per_radian
-    start = (bearing_a - angle_min) * per_radian
-    stop = start + span * per_radian
-    scale = 1.0 / cross
-    p, q = (by - ay) * scale, (bx - ax) * scale
+def _locate(
+    segments: Array, x: float, y: float, theta: float, range_max: float, angle_min: float, per_radian: float,
+    where: Array,
+) -> None:  # fmt: skip
+    """Write for each segment where the sensor sees it into the rows of ``where``; ``angle_min`` in [-π, π).
+
+    A loop of its own, without a branch, so that it vectorises: four segments at a time.
+    """
+    c, s = math.cos(theta), math.sin(theta)
+    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian
+    for i in range(segments.shape[0]):
+        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
+        beside = ((ax > range_max) & (bx > range_max)) | ((ax < -range_max) & (bx < -range_max))
+        beyond = ((ay > range_max) & (by > range_max)) | ((ay < -range_max) & (by < -range_max))
+        cross = ax * by - ay * bx
+        length_squared = (bx - ax) ** 2 + (by - ay) ** 2
+        # … or its whole line is too far.
+        away = beside | beyond | (cross * cross > range_max * range_max * length_squared)
+        ax, ay, bx, by = c * ax + s * ay, c * ay - s * ax, c * bx + s * by, c * by - s * bx
+        cross = ax * by - ay * bx
+        turned = cross < 0.0
+        ax, ay, bx, by = bx if turned else ax, by if turned else ay, ax if turned else bx, ay if turned else by
+        cross = -cross if turned else cross
+        on_line = cross <= 1e-12 * (abs(bx - ax) + abs(by - ay))
+        # Seen counter-clockwise from a to b, the segment spans less than half a turn.
+        bearing_a, bearing_b = _bearing(ax, ay), _bearing(bx, by)
+        span = bearing_b - bearing_a
+        span = span if bearing_b >= bearing_a else span + _TWO_PI
+        span = 0.0 if span > math.pi + 0.01 else span  # the error of two nearly equal bearings
+        start = (bearing_a - angle_min) * per_radian
+        stop = start + span * per_radian
+        past = stop + doubt >= turn
+        scale = 1.0 / cross
+        where[_SEEN, i] = 0.0 if away else -1.0 if on_line else 1.0
+        where[_START, i], where[_STOP, i] = start - turn if past else start, stop - turn if past else stop
+        where[_P, i], where[_Q, i] = (by - ay) * scale, (bx - ax) * scale
+        where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i] = ax, ay, bx, by
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _segment(where: Array, i: int, turn: float, doubt: float, directions: Array, inverse: Array) -> None:
+    """Draw segment ``i``, which does not lie edge on, into the buffer."""
+    ax, ay, bx, by = where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i]
+    start, stop, p, q = where[_START, i], where[_STOP, i], where[_P, i], where[_Q, i]
     beams = inverse.shape[0]
-    if stop + doubt >= turn:
-        start, stop = start - turn, stop - turn
     while start - doubt < beams:
         # Beams first to last may meet it; those from inner_first to inner_last do.
         first, last = max(math.ceil(start - doubt), 0), min(math.floor(stop + doubt), beams - 1)
@@ -206,30 +223,19 @@ def cast_rays(
     """
     out[:] = 0.0
     angle_min = wrap_scalar(angle_min)
-    c, s = math.cos(theta), math.sin(theta)
+    per_radian = 1.0 / angle_increment
+    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian  # beam k + turn is beam k
+    where = np.empty((_ROWS, segments.shape[0]))
+    _locate(segments, x, y, theta, range_max, angle_min, per_radian, where)
     for i in range(segments.shape[0]):
-        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
-        if (
-            min(ax, bx) > range_max
-            or max(ax, bx) < -range_max
-            or min(ay, by) > range_max
-            or max(ay, by) < -range_max
-        ):
-            continue
-        cross = ax * by - ay * bx
-        length_squared = (bx - ax) ** 2 + (by - ay) ** 2
-        if cross * cross > range_max * range_max * length_squared:  # its whole line is too far
-            continue
-        _segment(
-            c * ax + s * ay,
-            c * ay - s * ax,
-            c * bx + s * by,
-            c * by - s * bx,
-            angle_min,
-            angle_increment,
-            directions,
-            out,
-        )
+        if where[_SEEN, i] > 0.0:
+            _segment(where, i, turn, doubt, directions, out)
+        elif where[_SEEN, i] < 0.0:
+            _edge_on(
+                where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i], angle_min, angle_increment, directions,
+                out,
+            )  # fmt: skip
+    c, s = math.cos(theta), math.sin(theta)
     for i in range(circles.shape[0]):
         cx, cy, radius = circles[i, 0] - x, circles[i, 1] - y, circles[i, 2]
         if cx * cx + cy * cy <= (range_max + radius) ** 2:
