@@ -24,7 +24,7 @@ except ImportError:  # private to Numba: then NumPy's own generator does
     _FI = _WI = np.zeros(256)
     _KI = np.zeros(0, np.uint64)
 
-__all__ = ["NoiseStream", "RandomNumbers", "noise_stream"]
+__all__ = ["NoiseStream", "RandomNumbers", "fill_normal", "fill_uniform", "noise_stream"]
 
 Array = NDArray[np.float64]
 Words = NDArray[np.uint64]
@@ -36,7 +36,14 @@ _LANES = 4
 
 
 class NoiseStream:
-    """Yields what ``np.random.Generator(bits)`` would yield; ``bits`` itself stays where it is."""
+    """Yields what ``np.random.Generator(bits)`` would yield; ``bits`` itself stays where it is.
+
+    Attributes
+    ----------
+    words : NDArray[np.uint64]
+        ``(5, 2)``: the state, which every kernel that draws advances in place, then multiplier and offset of one
+        step and of four; of each the high word and the low one.
+    """
 
     def __init__(self, bits: np.random.PCG64) -> None:
         state = bits.state["state"]
@@ -48,16 +55,15 @@ class NoiseStream:
             offset = (offset * _MULTIPLIER + increment) % 2**128
             if k in (1, _LANES):
                 numbers += [multiplier, offset]
-        # The state, then multiplier and offset of one step and of four; each the high word, then the low one.
-        self._words = np.array([[v >> 64, v & _MASK] for v in numbers], np.uint64)
+        self.words = np.array([[v >> 64, v & _MASK] for v in numbers], np.uint64)
 
     def standard_normal(self, *, out: Array) -> None:
         """Fill ``out`` ``(n,)`` with normal numbers."""
-        _fill_normal(self._words, out)
+        fill_normal(self.words, out)
 
     def random(self, *, out: Array) -> None:
         """Fill ``out`` ``(n,)`` with uniform numbers in [0, 1)."""
-        _fill_uniform(self._words, out)
+        fill_uniform(self.words, out)
 
 
 RandomNumbers = np.random.Generator | NoiseStream
@@ -136,7 +142,8 @@ def _to_uniform(word: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _fill_uniform(words: Words, out: Array) -> None:
+def fill_uniform(words: Words, out: Array) -> None:
+    """Fill ``out`` with uniform numbers in [0, 1)."""
     n = out.shape[0]
     raw = np.empty(n, np.uint64)
     _fill_raw(words, raw, n)
@@ -145,7 +152,7 @@ def _fill_uniform(words: Words, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _fill_normal(words: Words, out: Array) -> None:
+def fill_normal(words: Words, out: Array) -> None:
     """Fill ``out`` by the ziggurat as NumPy does; each number takes a word, one in eighty takes more."""
     n = out.shape[0]
     raw = np.empty(n, np.uint64)

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
-from mecanum_env.noise import RandomNumbers
+from mecanum_env.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.robot import forward_matrix
 from slam.types import Odometry, Scan
@@ -60,6 +60,18 @@ def _sweep(
     _measure(out, normals, uniforms, sigma, dropout, range_min, range_max)
 
 
+@njit(cache=True, nogil=True)
+def _noisy_sweep(
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, words: NDArray[np.uint64],
+    out: Array,
+) -> None:  # fmt: skip
+    """Draw the noise of a sweep from the words of a :class:`NoiseStream`, and do :func:`_sweep`."""
+    noise = np.empty((2, out.shape[0]))
+    fill_normal(words, noise[0])
+    fill_uniform(words, noise[1])
+    _sweep(segments, circles, pose, directions, limits, noise[0], noise[1], out)
+
+
 class Lidar:
     """A planar lidar at A, ``offset_m`` ahead of the robot's centre (theory.md A).
 
@@ -76,7 +88,6 @@ class Lidar:
         self.noise = noise
         self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
         self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
-        self._normals, self._uniforms = np.empty(config.beams), np.empty(config.beams)
         # One array, since each argument of a call takes time to unpack.
         self._limits = np.array([
             config.offset_m, self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m,
@@ -117,11 +128,12 @@ class Lidar:
 
         ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
         """
-        ranges = np.empty(self._beams)
-        rng.standard_normal(out=self._normals)
-        rng.random(out=self._uniforms)
-        pose = np.asarray(pose, dtype=np.float64)
-        _sweep(segments, circles, pose, self._directions, self._limits, self._normals, self._uniforms, ranges)
+        ranges, pose = np.empty(self._beams), np.asarray(pose, dtype=np.float64)
+        if isinstance(rng, NoiseStream):
+            _noisy_sweep(segments, circles, pose, self._directions, self._limits, rng.words, ranges)
+        else:
+            normals, uniforms = rng.standard_normal(self._beams), rng.random(self._beams)
+            _sweep(segments, circles, pose, self._directions, self._limits, normals, uniforms, ranges)
         return Scan(ranges, *self._of_scan)
 
 
@@ -153,7 +165,6 @@ class WheelEncoders:
         self.robot = robot
         self.noise = noise
         self._forward = forward_matrix(robot)  # (3, 4)
-        self._normals = np.empty(4)
         self._sigma, self._rolling = noise.encoder, 1.0 - noise.slip
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
@@ -173,8 +184,11 @@ class WheelEncoders:
         """
         increments = np.asarray(wheel_increments, dtype=np.float64)
         twist = np.empty(3)
-        rng.standard_normal(out=self._normals)
-        _read_encoders(self._forward, increments, self._normals, self._sigma, self._rolling / dt, twist)
+        gain = self._rolling / dt
+        if isinstance(rng, NoiseStream):
+            _read_noisy_encoders(self._forward, increments, rng.words, self._sigma, gain, twist)
+        else:
+            _read_encoders(self._forward, increments, rng.standard_normal(4), self._sigma, gain, twist)
         return Odometry(twist, dt)
 
 
@@ -188,3 +202,13 @@ def _read_encoders(
         for k in range(4):
             total += forward[i, k] * (increments[k] * (1.0 + sigma * normals[k]))
         twist[i] = gain * total
+
+
+@njit(cache=True, nogil=True)
+def _read_noisy_encoders(
+    forward: Array, increments: Array, words: NDArray[np.uint64], sigma: float, gain: float, twist: Array
+) -> None:
+    """Draw the normals from the words of a :class:`NoiseStream`, and do :func:`_read_encoders`."""
+    normals = np.empty(4)
+    fill_normal(words, normals)
+    _read_encoders(forward, increments, normals, sigma, gain, twist)

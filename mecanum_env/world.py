@@ -45,6 +45,7 @@ MAX_TRAVEL_M = 0.005
 """pymunk's steps are cut so that the robot, at its limits, goes no further in one: hence no deeper into a wall."""
 
 _MARGIN_M = 1e-3  # nothing within it: no contact, whatever the rounding
+_AHEAD = 64  # control steps whose slip is drawn at once: a draw of four numbers takes 1.5 µs, of 256 two
 _PERSISTENCE = 4  # steps after which pymunk has forgotten a contact (its collision_persistence is 3)
 
 
@@ -174,8 +175,8 @@ class World:
     robot, noise
         The nominal robot; of ``noise`` the slip, the floor's friction and its patches.
     rng
-        Draws the patches now and four numbers per control step: the wheels' slip. The same generator state and
-        the same actions give the same path to the last bit, in any process.
+        Draws the patches now and four numbers per control step: the wheels' slip, 64 steps ahead. The same
+        generator state and the same actions give the same path to the last bit, in any process.
     true_radii, true_lever
         The robot's true wheel radii ``(4,)`` [m] and lever [m], where they differ from the nominal ones
         (:class:`mecanum_env.sensors.WheelEncoders` draws them).
@@ -205,6 +206,7 @@ class World:
         self.plan, self.robot, self.noise = plan, robot, noise
         self.floor = build_floor(plan, noise, rng)
         self._rng = rng
+        self._slips, self._slips_left = np.empty((_AHEAD, 4)), 0
         self._shortcut = shortcut
         self._fixed = fixed = np.zeros(_FIXED_SIZE)
         fixed[_RADII] = robot.wheel_radius_m if true_radii is None else true_radii
@@ -249,7 +251,11 @@ class World:
         """
         steps, dt, substeps = _divide(step_s, physics_step_s)
         self._work[_TARGETS] = wheel_targets
-        self._rng.random(out=self._work[_LOST])  # even where slip is zero: the stream must not depend on it
+        if self._slips_left == 0:
+            self._rng.random(out=self._slips)  # even where slip is zero: the stream must not depend on it
+            self._slips_left = _AHEAD
+        self._work[_LOST] = self._slips[-self._slips_left]
+        self._slips_left -= 1
         clear = self._shortcut and self._forgotten >= _PERSISTENCE
         done = self._drive_clear(dt, substeps, steps if clear else 0)
         if done:

@@ -259,11 +259,8 @@ class EkfSlam(Backend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
-        n, i = self._n, 3 + 2 * row
-        self._x[i : n - 2] = self._x[i + 2 : n]
-        keep = np.r_[0:i, i + 2 : n]
-        self._p[: n - 2, : n - 2] = self._p[np.ix_(keep, keep)]
-        self._n = n - 2
+        _leave_out(self._x, self._p, self._n, 3 + 2 * row)
+        self._n -= 2
         self._book.drop(row)
 
     def _enlarge(self) -> None:
@@ -361,6 +358,17 @@ class EkfSlam(Backend):
         n = np.column_stack([np.cos(alpha), np.sin(alpha)])
         along = np.column_stack([-n[:, 1], n[:, 0]])
         return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _leave_out(x: Array, p: Array, n: int, i: int) -> None:
+    """Move up what stands behind the two states from ``i`` on; ``p`` is an upper triangle."""
+    for a in range(n - 2):
+        above = a if a < i else a + 2
+        for b in range(a, n - 2):
+            p[a, b] = p[above, b if b < i else b + 2]
+    for a in range(i, n - 2):
+        x[a] = x[a + 2]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
