@@ -53,10 +53,9 @@ def _bearing(x: float, y: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _edge_beams(
-    first: int, last: int, ax: float, ay: float, bx: float, by: float, directions: Array, inverse: Array
-) -> None:
-    """Draw a segment into beams ``first`` to ``last``, which may or may not pass between its ends."""
+def _edge_beams(first: int, last: int, where: Array, i: int, directions: Array, inverse: Array) -> None:
+    """Draw segment ``i`` into beams ``first`` to ``last``, which may or may not pass between its ends."""
+    ax, ay, bx, by = where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i]
     cross = ax * by - ay * bx
     for k in range(first, last + 1):
         dx, dy = directions[0, k], directions[1, k]
@@ -72,12 +71,15 @@ def _locate(
 ) -> None:  # fmt: skip
     """Write for each segment where the sensor sees it into the rows of ``where``; ``angle_min`` in [-π, π).
 
-    A loop of its own, without a branch, so that it vectorises: four segments at a time.
+    A loop of its own, without a branch and over columns, so that it vectorises: four segments at a time.
     """
+    for i in range(segments.shape[0]):
+        where[_AX, i], where[_AY, i] = segments[i, 0], segments[i, 1]
+        where[_BX, i], where[_BY, i] = segments[i, 2], segments[i, 3]
     c, s = math.cos(theta), math.sin(theta)
     turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian
     for i in range(segments.shape[0]):
-        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
+        ax, ay, bx, by = where[_AX, i] - x, where[_AY, i] - y, where[_BX, i] - x, where[_BY, i] - y
         beside = ((ax > range_max) & (bx > range_max)) | ((ax < -range_max) & (bx < -range_max))
         beyond = ((ay > range_max) & (by > range_max)) | ((ay < -range_max) & (by < -range_max))
         cross = ax * by - ay * bx
@@ -103,30 +105,6 @@ def _locate(
         where[_START, i], where[_STOP, i] = start - turn if past else start, stop - turn if past else stop
         where[_P, i], where[_Q, i] = (by - ay) * scale, (bx - ax) * scale
         where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i] = ax, ay, bx, by
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _segment(where: Array, i: int, turn: float, doubt: float, directions: Array, inverse: Array) -> None:
-    """Draw segment ``i``, which does not lie edge on, into the buffer."""
-    ax, ay, bx, by = where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i]
-    start, stop, p, q = where[_START, i], where[_STOP, i], where[_P, i], where[_Q, i]
-    beams = inverse.shape[0]
-    while start - doubt < beams:
-        # Beams first to last may meet it; those from inner_first to inner_last do.
-        first, last = max(math.ceil(start - doubt), 0), min(math.floor(stop + doubt), beams - 1)
-        inner_first, inner_last = max(math.ceil(start + doubt), 0), min(math.floor(stop - doubt), beams - 1)
-        if inner_first > inner_last:
-            _edge_beams(first, last, ax, ay, bx, by, directions, inverse)
-        else:
-            if first < inner_first:
-                _edge_beams(first, inner_first - 1, ax, ay, bx, by, directions, inverse)
-            if inner_last < last:
-                _edge_beams(inner_last + 1, last, ax, ay, bx, by, directions, inverse)
-            # Unsigned, or Numba's check for negative indices keeps the loop from being vectorised: 3 × slower.
-            for k in range(np.uint64(inner_first), np.uint64(inner_last + 1)):
-                value = directions[0, k] * p - directions[1, k] * q
-                inverse[k] = value if value > inverse[k] else inverse[k]
-        start, stop = start + turn, stop + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -156,6 +134,45 @@ def _edge_on(
             and directions[0, k] * ax + directions[1, k] * ay > 0.0
         ):
             inverse[k] = max(inverse[k], 1.0 / near)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_segments(
+    where: Array, angle_min: float, angle_increment: float, directions: Array, inverse: Array
+) -> None:
+    """Draw the segments that :func:`_locate` has found into the buffer.
+
+    All in one function: called for each segment, it took a third longer.
+    """
+    per_radian = 1.0 / angle_increment
+    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian  # beam k + turn is beam k
+    beams = inverse.shape[0]
+    for i in range(where.shape[1]):
+        if where[_SEEN, i] == 0.0:
+            continue
+        if where[_SEEN, i] < 0.0:
+            _edge_on(
+                where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i], angle_min, angle_increment, directions,
+                inverse,
+            )  # fmt: skip
+            continue
+        start, stop, p, q = where[_START, i], where[_STOP, i], where[_P, i], where[_Q, i]
+        while start - doubt < beams:
+            # Beams first to last may meet it; those from inner_first to inner_last do.
+            first, last = max(math.ceil(start - doubt), 0), min(math.floor(stop + doubt), beams - 1)
+            inner_first, inner_last = max(math.ceil(start + doubt), 0), min(math.floor(stop - doubt), beams - 1)
+            if inner_first > inner_last:
+                _edge_beams(first, last, where, i, directions, inverse)
+            else:
+                if first < inner_first:
+                    _edge_beams(first, inner_first - 1, where, i, directions, inverse)
+                if inner_last < last:
+                    _edge_beams(inner_last + 1, last, where, i, directions, inverse)
+                # Unsigned, or Numba's check for negative indices keeps the loop from being vectorised: 3 × slower.
+                for k in range(np.uint64(inner_first), np.uint64(inner_last + 1)):
+                    value = directions[0, k] * p - directions[1, k] * q
+                    inverse[k] = value if value > inverse[k] else inverse[k]
+            start, stop = start + turn, stop + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -223,18 +240,9 @@ def cast_rays(
     """
     out[:] = 0.0
     angle_min = wrap_scalar(angle_min)
-    per_radian = 1.0 / angle_increment
-    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian  # beam k + turn is beam k
     where = np.empty((_ROWS, segments.shape[0]))
-    _locate(segments, x, y, theta, range_max, angle_min, per_radian, where)
-    for i in range(segments.shape[0]):
-        if where[_SEEN, i] > 0.0:
-            _segment(where, i, turn, doubt, directions, out)
-        elif where[_SEEN, i] < 0.0:
-            _edge_on(
-                where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i], angle_min, angle_increment, directions,
-                out,
-            )  # fmt: skip
+    _locate(segments, x, y, theta, range_max, angle_min, 1.0 / angle_increment, where)
+    _draw_segments(where, angle_min, angle_increment, directions, out)
     c, s = math.cos(theta), math.sin(theta)
     for i in range(circles.shape[0]):
         cx, cy, radius = circles[i, 0] - x, circles[i, 1] - y, circles[i, 2]
