@@ -40,12 +40,12 @@ def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy")
 def points_in_order(
     ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
-    rows: Array, beam: NDArray[np.int64], apart: NDArray[np.int64],
+    reach: Array, beam: NDArray[np.int64], apart: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π.
 
-    ``rows`` ``(3, n)`` get x, y and range apart, as loops over many points want them; ``apart`` whether a point and
-    the next cannot lie on one surface. Returns the number of points.
+    ``reach`` gets their ranges, ``apart`` whether a point and the next cannot lie on one surface. Returns the number
+    of points.
     """
     n = ranges.shape[0]
     start = 0
@@ -66,21 +66,21 @@ def points_in_order(
             i -= n
         r = ranges[i]
         if r >= range_min and r < np.inf:
-            xy[count, 0] = rows[0, count] = r * rays[i, 0]
-            xy[count, 1] = rows[1, count] = r * rays[i, 1]
-            rows[2, count] = r
+            xy[count, 0] = r * rays[i, 0]
+            xy[count, 1] = r * rays[i, 1]
+            reach[count] = r
             beam[count] = i
             count += 1
         else:
             apart[n - 1 - holes] = count - 1  # the point before the hole: there is room, as there is a point less
             holes += 1
-    _mark_breaks(rows, count, gaps, limits[SIGMA], apart, n, holes, beam)
+    _mark_breaks(reach, count, gaps, limits[SIGMA], apart, n, holes, beam)
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_breaks(
-    rows: Array, count: int, gaps: Array, sigma: float, apart: NDArray[np.int64], beams: int, holes: int,
+    reach: Array, count: int, gaps: Array, sigma: float, apart: NDArray[np.int64], beams: int, holes: int,
     beam: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Write :func:`_breaks` of each point and the next; whom beams were lost between stands at the end of ``apart``.
@@ -89,7 +89,7 @@ def _mark_breaks(
     """
     share, cosine, slack = gaps[0, 0], gaps[0, 1], 4.0 * sigma
     for k in range(np.uint64(max(count - 1, 0))):
-        r0, r1 = rows[2, k], rows[2, k + np.uint64(1)]
+        r0, r1 = reach[k], reach[k + np.uint64(1)]
         limit = (r0 if r0 < r1 else r1) * share + slack
         distance_squared = (r0 - r1) * (r0 - r1) + r0 * r1 * cosine
         apart[k] = np.int64((limit < 0.0) | (distance_squared > limit * limit))
@@ -99,17 +99,17 @@ def _mark_breaks(
             step = beam[k + 1] - beam[k]
             if step < 0:
                 step += beams
-            apart[k] = _breaks(rows[2, k], rows[2, k + 1], step, gaps, sigma)
+            apart[k] = _breaks(reach[k], reach[k + 1], step, gaps, sigma)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def split(
-    rows: Array, n: int, limits: Array, apart: NDArray[np.int64], stack: NDArray[np.int64],
+    xy: Array, n: int, limits: Array, apart: NDArray[np.int64], stack: NDArray[np.int64],
     pieces: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number.
 
-    ``rows`` and ``apart`` are those of :func:`points_in_order`.
+    ``xy`` and ``apart`` are those of :func:`points_in_order`.
     """
     threshold = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
     count = 0
@@ -125,14 +125,14 @@ def split(
         while depth > 0:
             depth -= 1
             first, last = stack[depth, 0], stack[depth, 1]
-            middle = _farthest(rows, first, last, threshold)
+            middle = _farthest(xy, first, last, threshold)
             if middle > 0:
                 # Depth first, left part on top: the pieces come out in order.
                 stack[depth, 0], stack[depth, 1] = middle, last
                 stack[depth + 1, 0], stack[depth + 1, 1] = first, middle
                 depth += 2
                 continue
-            if goes_on == 1 and _one_line(rows, pieces[count - 1, 0], first, last, threshold):
+            if goes_on == 1 and _one_line(xy, pieces[count - 1, 0], first, last, threshold):
                 pieces[count - 1, 1] = last
             else:
                 pieces[count, 0], pieces[count, 1], pieces[count, 2] = first, last, goes_on
@@ -142,35 +142,29 @@ def split(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
-def _farthest(rows: Array, first: int, last: int, threshold: float) -> int:
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"}, forceinline=True)
+def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
     if last - first < 2:
         return -1
-    x0, y0 = rows[0, first], rows[1, first]
-    dx, dy = rows[0, last] - x0, rows[1, last] - y0
-    limit = threshold * math.sqrt(dx * dx + dy * dy)
-    # Whether any is first, in a loop that vectorises (unsigned: other indices are tested for being negative); a
-    # maximum would have each point wait for the one before.
-    beyond = 0
+    x0, y0 = xy[first, 0], xy[first, 1]
+    dx, dy = xy[last, 0] - x0, xy[last, 1] - y0
+    farthest, largest = -1, threshold * math.sqrt(dx * dx + dy * dy)
+    # A branch, seldom taken and well foreseen: computing a maximum, each point would wait for the one before.
+    # Unsigned, since other indices are tested for being negative.
     for i in range(np.uint64(first + 1), np.uint64(last)):
-        beyond += abs(dx * (rows[1, i] - y0) - dy * (rows[0, i] - x0)) > limit
-    if beyond == 0:
-        return -1
-    farthest, largest = -1, limit
-    for i in range(first + 1, last):
-        distance = abs(dx * (rows[1, i] - y0) - dy * (rows[0, i] - x0))
+        distance = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
         if distance > largest:
-            farthest, largest = i, distance
+            farthest, largest = np.int64(i), distance
     return farthest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _one_line(rows: Array, first: int, middle: int, last: int, threshold: float) -> bool:
+def _one_line(xy: Array, first: int, middle: int, last: int, threshold: float) -> bool:
     """Tell whether two pieces that share ``middle`` are one after all (the merge of split and merge)."""
     if last - first < 3 or middle - first < 2 or last - middle < 2:
         return False
-    return _farthest(rows, first, last, 0.75 * threshold) < 0
+    return _farthest(xy, first, last, 0.75 * threshold) < 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
