@@ -58,7 +58,8 @@ _MOTION = slice(30, 33)  # of the last physics step: displacement [m, m], rotati
 _MU = slice(33, 37)  # friction under each wheel
 _MOTOR = slice(37, 44)  # from :func:`mecanum_env.robot.motor_constants`
 _UNDO = slice(44, 44 + STATE_SIZE)  # the state before the physics step
-_WORK_SIZE = 44 + STATE_SIZE
+_WRAPPED = slice(62, 65)  # the pose, its heading in [-π, π)
+_WORK_SIZE = 65
 # … and what stays the same for a whole episode.
 _RADII = slice(0, 4)  # [m]
 _CONSTANTS = slice(4, 14)  # from :func:`mecanum_env.robot.dynamics_constants`
@@ -74,12 +75,12 @@ def _wheel_step(
 ) -> None:
     """Run :func:`wheel_dynamics` over a physics step with the μ that the wheels stand on at its start."""
     state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
+    wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
     c, s = math.cos(state[2]), math.sin(state[2])
     rows, cols = friction.shape
     for i in range(4):
-        wheel_x, wheel_y = fixed[17 + i], fixed[21 + i]
-        x = state[0] + c * wheel_x - s * wheel_y
-        y = state[1] + s * wheel_x + c * wheel_y
+        x = state[0] + c * wheels_x[i] - s * wheels_y[i]
+        y = state[1] + s * wheels_x[i] + c * wheels_y[i]
         col = min(max(int((x - raster[0]) * raster[2]), 0), cols - 1)
         row = min(max(int((y - raster[1]) * raster[2]), 0), rows - 1)
         mu[i] = friction[row, col]
@@ -126,10 +127,11 @@ def _drive_clear(
     body at the step's end, it would have found none. Returns the number of steps taken; the one in which
     something may be touched is undone. What ``work`` holds of the control step is filled for whoever goes on.
     """
-    state, undo, motion = work[_STATE], work[_UNDO], work[_MOTION]
+    state, undo, motion, wrapped = work[_STATE], work[_UNDO], work[_MOTION], work[_WRAPPED]
     state[INCREMENTS] = 0.0
+    radii, ground_radii, lost = fixed[_RADII], work[_GROUND_RADII], work[_LOST]
     for i in range(4):
-        work[26 + i] = fixed[i] * (1.0 - 2.0 * fixed[_SLIP] * work[22 + i])
+        ground_radii[i] = radii[i] * (1.0 - 2.0 * fixed[_SLIP] * lost[i])
     h = dt / substeps
     motor_constants(fixed[_CONSTANTS], h, work[_MOTOR])
     raster, half_x, half_y = fixed[_RASTER], fixed[_HALF_X], fixed[_HALF_Y]
@@ -147,14 +149,11 @@ def _drive_clear(
         far = 0 <= row < rows and 0 <= col < cols and clearance[row, col] > circumscribed + travel
         if not far and not _box_is_clear(x, y, theta, half_x + travel, half_y + travel, segments, circles):
             state[:] = undo
-            return step
+            steps = step
+            break
         state[0], state[1], state[2] = x, y, theta
+    wrapped[0], wrapped[1], wrapped[2] = state[0], state[1], wrap_scalar(state[2])
     return steps
-
-
-@njit(cache=True, nogil=True)
-def _wrapped_pose(state: Array, out: Array) -> None:
-    out[0], out[1], out[2] = state[0], state[1], wrap_scalar(state[2])
 
 
 @lru_cache(maxsize=16)
@@ -221,6 +220,7 @@ class World:
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
         self._work = np.zeros(_WORK_SIZE)
         self._work[POSE] = plan.start if start is None else start
+        self._wrap_pose()
         self._contacts = Contacts()
         self._space = build_space(plan, self._contacts)
         self._body = add_robot(self._space, robot)
@@ -264,6 +264,11 @@ class World:
         if done < steps:
             for _ in range(steps - done):
                 self._drive_near(dt, substeps)
+            self._wrap_pose()
+
+    def _wrap_pose(self) -> None:
+        x, y, theta = self._work[POSE].tolist()
+        self._work[_WRAPPED] = x, y, wrap_scalar(theta)
 
     def _drive_clear(self, dt: float, substeps: int, steps: int) -> int:
         floor = self.floor
@@ -310,9 +315,7 @@ class World:
     @property
     def pose(self) -> Array:
         """The robot's true pose ``(3,)`` in the world frame: x [m], y [m], θ [rad] in [-π, π)."""
-        out = np.empty(3)
-        _wrapped_pose(self._work, out)
-        return out
+        return self._work[_WRAPPED].copy()
 
     @property
     def twist(self) -> Array:
