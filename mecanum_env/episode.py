@@ -38,7 +38,7 @@ class EpisodeRecord:
         self.collisions = 0
 
     def append(self, row: tuple[float, ...]) -> None:
-        """Add one step: true and believed pose (x, y, θ), time [s], coverage, NEES; the first is the start itself."""
+        """Add one step: true and believed pose (x, y, θ), time [s], coverage, NEES; first the start itself."""
         self._numbers.extend(row)
         x, y = row[0], row[1]
         if self._count:

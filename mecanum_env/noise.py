@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ Words = NDArray[np.uint64]
 _MASK = 2**64 - 1
 _MULTIPLIER = (2549297995355413924 << 64) + 4865540595714422341  # PCG64's
 _TAIL, _INVERSE_TAIL = 3.6541528853610087963519472518, 0.27366123732975827203338247596
-_LANES = 4
+_LANES = 4  # states side by side in _fill_raw
 
 
 class NoiseStream:
@@ -88,25 +88,24 @@ def _high_word(typing_context: Any, a: Any, b: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _advance(high: int, low: int, m_high: int, m_low: int, c_high: int, c_low: int) -> tuple[int, int]:
+def _advance(high: int, low: int, m_high: int, m_low: int, c_high: int, c_low: int) -> tuple[Any, Any]:
     """Return m · state + c modulo 2¹²⁸."""
     new_low = low * m_low + c_low
     carry = np.uint64(new_low < c_low)
-    return _high_word(low, m_low) + high * m_low + low * m_high + c_high + carry, new_low
+    above: Any = _high_word(low, m_low)  # type: ignore[call-arg]
+    return above + high * m_low + low * m_high + c_high + carry, new_low
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _output(high: int, low: int) -> int:
+def _output(high: int, low: int) -> Any:
     """Return the word that PCG64 makes of a state: its halves' exclusive or, turned by its six highest bits."""
     value, turn = high ^ low, high >> np.uint64(58)
     return (value >> turn) | (value << ((np.uint64(64) - turn) & np.uint64(63)))
 
 
 @njit(cache=True, nogil=True)
-def _next(words: Words) -> int:
-    high, low = _advance(
-        words[0, 0], words[0, 1], words[1, 0], words[1, 1], words[2, 0], words[2, 1]
-    )
+def _next(words: Words) -> Any:
+    high, low = _advance(words[0, 0], words[0, 1], words[1, 0], words[1, 1], words[2, 0], words[2, 1])
     words[0, 0], words[0, 1] = high, low
     return _output(high, low)
 

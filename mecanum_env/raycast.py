@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 
 _TWO_PI = 2.0 * math.pi
 _BEARING_ERROR = 4e-5  # [rad], above what a difference of two results of _bearing can be wrong by
-# Rows of what is known of the segments as the sensor sees them: whether they are too far (0), edge on (-1) or neither;
-# the beams, not whole numbers, at which they start and stop; the coefficients of their inverse range; their ends [m].
+# Rows of what is known of the segments as the sensor sees them: whether they are too far (0), edge on (-1) or
+# neither; the beams, not whole numbers, at which they start and stop; the coefficients of their inverse range;
+# their ends [m].
 _SEEN, _START, _STOP, _P, _Q, _AX, _AY, _BX, _BY = range(9)
 _ROWS = 9
 _SEAM_M = 1e-9  # a beam that passes an end point within this hits it: no ray slips through where walls meet

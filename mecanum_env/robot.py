@@ -95,7 +95,8 @@ class WheelTargets:
     Parameters
     ----------
     robot
-        Its limits are ``max_speed_m_s`` along x and along y, ``max_turn_rate_rad_s`` and ``max_wheel_speed_rad_s``.
+        Its limits are ``max_speed_m_s`` along x and along y, ``max_turn_rate_rad_s`` and
+        ``max_wheel_speed_rad_s``.
     """
 
     def __init__(self, robot: RobotConfig) -> None:

@@ -70,9 +70,7 @@ _FIXED_SIZE = 28
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _wheel_step(
-    work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int
-) -> None:
+def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
     """Run :func:`wheel_dynamics` over a physics step with the μ that the wheels stand on at its start."""
     state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
     wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]

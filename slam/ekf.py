@@ -235,12 +235,12 @@ class EkfSlam(Backend):
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks`)."""
         book, offset = self._book, self.config.lidar_offset_m
         if scan is None:
-            new, contradicted = book.review(self._x, offset, z, match).tolist(), []
+            new, gone = book.review(self._x, offset, z, match).tolist(), list[int]()
         else:
-            new, contradicted = book.review_scan(self._x, offset, z, match, scan)
+            new, gone = book.review_scan(self._x, offset, z, match, scan)
         for k in new:
             self._add(z[k], None)
-        for row in contradicted:
+        for row in gone:
             self._drop(row)
 
     def _add(self, z: Array, known_id: int | None) -> None:
@@ -379,7 +379,5 @@ def _match_and_recall(
     """Match by nearest neighbour; return what :meth:`slam.landmarks.LandmarkBook.recently_seen` says of it."""
     gate, near, max_turn = gates[0], gates[1], gates[2]
     h = np.empty((2, 5))
-    nearest_neighbour(
-        x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h
-    )
+    nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)
     return count_recent(marks, match, now)

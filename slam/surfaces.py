@@ -44,8 +44,8 @@ def points_in_order(
 ) -> int:  # fmt: skip
     """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π.
 
-    ``reach`` gets their ranges, ``apart`` whether a point and the next cannot lie on one surface. Returns the number
-    of points.
+    ``reach`` gets their ranges, ``apart`` whether a point and the next cannot lie on one surface. Returns the
+    number of points.
     """
     n = ranges.shape[0]
     start = 0
@@ -83,7 +83,7 @@ def _mark_breaks(
     reach: Array, count: int, gaps: Array, sigma: float, apart: NDArray[np.int64], beams: int, holes: int,
     beam: NDArray[np.int64],
 ) -> None:  # fmt: skip
-    """Write :func:`_breaks` of each point and the next; whom beams were lost between stands at the end of ``apart``.
+    """Write :func:`_breaks` of each point and the next; after which points beams were lost, ``apart`` ends with.
 
     As though no beam had been lost first, in a loop that vectorises, then anew where some were.
     """
@@ -155,7 +155,7 @@ def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     for i in range(np.uint64(first + 1), np.uint64(last)):
         distance = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
         if distance > largest:
-            farthest, largest = np.int64(i), distance
+            farthest, largest = np.int64(i), distance  # type: ignore[assignment]
     return farthest
 
 
