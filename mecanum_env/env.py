@@ -256,9 +256,9 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         success = coverage >= config.coverage_target
         terminated = success or (config.terminate_on_collision and world.collisions > 0)
         if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
-            info["is_success"] = success
+            info["is_success"] = bool(success)
             info["episode_metrics"] = self.episode_metrics()
-        return self._observe(), sum(terms.values()), terminated, False, info
+        return self._observe(), float(sum(terms.values())), bool(terminated), False, info
 
     def render(self) -> Any:
         """Return truth beside belief as an RGB image ``(h, w, 3)``."""
