@@ -33,9 +33,10 @@ from mecanum_env.config import (
 )
 from mecanum_env.episode import EpisodeRecord
 from mecanum_env.ground_truth import Coverage, GroundTruth
+from mecanum_env.noise import noise_stream
 from mecanum_env.observation import Observation, observation_space, observe
 from mecanum_env.reward import StepOutcome, reward_terms
-from mecanum_env.robot import action_to_wheels, twist_action_to_wheels
+from mecanum_env.robot import WheelTargets
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensors import Lidar, WheelEncoders
@@ -174,7 +175,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan,
         )  # fmt: skip
         self.render_mode = render_mode
-        self._action = action
+        targets = WheelTargets(self.config.robot)
+        self._to_wheels = targets.of_wheels if action == "wheels" else targets.of_twist
         self.action_space = spaces.Box(-1.0, 1.0, (ACTIONS[action],), np.float32)
         self.observation_space = cast("spaces.Space[Observation]", observation_space(self.config))
         self.backend = make_backend(self.config)
@@ -197,7 +199,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         world_seed, sensor_seed = np.random.SeedSequence(episode_seed).spawn(2)
         world_rng = np.random.Generator(np.random.PCG64(world_seed))
-        self._sensor_rng = np.random.Generator(np.random.PCG64(sensor_seed))
+        self._sensor_rng = noise_stream(sensor_seed)
         room_seed = options.get("room_seed")
         plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
         config = self.config
@@ -301,39 +303,40 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return plan
 
     def _wheel_targets(self, action: NDArray[np.float32]) -> Array:
-        if self._action == "wheels":
-            return action_to_wheels(self.config.robot, action)
-        return twist_action_to_wheels(self.config.robot, action)
+        return self._to_wheels(action)
 
     def _remember(self) -> None:
         """Keep what the next step's reward compares with."""
         grid = self.backend.grid
-        self._before = (grid.known_cells, grid.entropy_bit, float(_entropy(self._pose_cov)))
+        self._before = grid.known_cells, grid.entropy_bit, _entropy(self._pose_cov)
 
     def _outcome(self, collisions: int) -> StepOutcome:
         known_before, map_entropy_before, pose_entropy_before = self._before
         self._remember()
         known, map_entropy, pose_entropy = self._before
-        cell = self.backend.grid.resolution**2
+        config = self.config
+        cell = config.grid_resolution_m**2
         vx, vy, omega = np.asarray(self._odometry.twist).tolist()
-        robot = self.config.robot
+        robot = config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
+        # By position: names would take as long again.
         return StepOutcome(
-            area_m2=(known - known_before) * cell,
-            pose_entropy_loss_nat=pose_entropy_before - pose_entropy,
-            map_entropy_loss_bit_m2=(map_entropy_before - map_entropy) * cell,
-            collisions=collisions,
-            effort=min(speed, 1.0),
-            dt=self.config.step_s,
+            (known - known_before) * cell,
+            pose_entropy_before - pose_entropy,
+            (map_entropy_before - map_entropy) * cell,
+            collisions,
+            min(speed, 1.0),
+            config.step_s,
         )
 
     def _info(self, coverage: float, true_pose: Array) -> dict[str, Any]:
         nees = self.backend.pose_nees(true_pose)
-        x, y, theta = estimate = self._pose.tolist()
-        true_x, true_y, true_theta = truth = true_pose.tolist()
-        record, collisions = self.truth.record, self.truth.world.collisions
+        x, y, theta = self._pose.tolist()
+        true_x, true_y, true_theta = true_pose.tolist()
+        truth = self.truth
+        record, collisions = truth.record, truth.world.collisions
         time_s = self._steps * self.config.step_s
-        record.append(time_s, truth, estimate, coverage, nees)
+        record.append((true_x, true_y, true_theta, x, y, theta, time_s, coverage, nees))
         record.collisions = collisions
         return {
             "coverage": coverage,

@@ -21,6 +21,11 @@ Array = NDArray[np.float64]
 
 _TWO_PI = 2.0 * math.pi
 _BEARING_ERROR = 4e-5  # [rad], above what a difference of two results of _bearing can be wrong by
+# Rows of what is known of the segments as the sensor sees them: whether they are too far (0), edge on (-1) or
+# neither; the beams, not whole numbers, at which they start and stop; the coefficients of their inverse range;
+# their ends [m].
+_SEEN, _START, _STOP, _P, _Q, _AX, _AY, _BX, _BY = range(9)
+_ROWS = 9
 _SEAM_M = 1e-9  # a beam that passes an end point within this hits it: no ray slips through where walls meet
 
 
@@ -49,10 +54,9 @@ def _bearing(x: float, y: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _edge_beams(
-    first: int, last: int, ax: float, ay: float, bx: float, by: float, directions: Array, inverse: Array
-) -> None:
-    """Draw a segment into beams ``first`` to ``last``, which may or may not pass between its ends."""
+def _edge_beams(first: int, last: int, where: Array, i: int, directions: Array, inverse: Array) -> None:
+    """Draw segment ``i`` into beams ``first`` to ``last``, which may or may not pass between its ends."""
+    ax, ay, bx, by = where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i]
     cross = ax * by - ay * bx
     for k in range(first, last + 1):
         dx, dy = directions[0, k], directions[1, k]
@@ -62,54 +66,46 @@ def _edge_beams(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _segment(
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    angle_min: float,
-    angle_increment: float,
-    directions: Array,
-    inverse: Array,
-) -> None:
-    """Draw a segment, given in the sensor frame, into the buffer; ``angle_min`` in [-π, π)."""
-    cross = ax * by - ay * bx
-    if cross < 0.0:
-        ax, ay, bx, by, cross = bx, by, ax, ay, -cross
-    if cross <= 1e-12 * (abs(bx - ax) + abs(by - ay)):
-        _edge_on(ax, ay, bx, by, angle_min, angle_increment, directions, inverse)
-        return
-    # Seen counter-clockwise from a to b, the segment spans less than half a turn.
-    bearing_a, bearing_b = _bearing(ax, ay), _bearing(bx, by)
-    span = bearing_b - bearing_a if bearing_b >= bearing_a else bearing_b - bearing_a + _TWO_PI
-    if span > math.pi + 0.01:
-        span = 0.0  # the error of two nearly equal bearings
-    per_radian = 1.0 / angle_increment
-    turn = _TWO_PI * per_radian  # beams to a full turn; beam k + turn is beam k
-    doubt = _BEARING_ERROR * per_radian
-    start = (bearing_a - angle_min) * per_radian
-    stop = start + span * per_radian
-    scale = 1.0 / cross
-    p, q = (by - ay) * scale, (bx - ax) * scale
-    beams = inverse.shape[0]
-    if stop + doubt >= turn:
-        start, stop = start - turn, stop - turn
-    while start - doubt < beams:
-        # Beams first to last may meet it; those from inner_first to inner_last do.
-        first, last = max(math.ceil(start - doubt), 0), min(math.floor(stop + doubt), beams - 1)
-        inner_first, inner_last = max(math.ceil(start + doubt), 0), min(math.floor(stop - doubt), beams - 1)
-        if inner_first > inner_last:
-            _edge_beams(first, last, ax, ay, bx, by, directions, inverse)
-        else:
-            if first < inner_first:
-                _edge_beams(first, inner_first - 1, ax, ay, bx, by, directions, inverse)
-            if inner_last < last:
-                _edge_beams(inner_last + 1, last, ax, ay, bx, by, directions, inverse)
-            # Unsigned, or Numba's check for negative indices keeps the loop from being vectorised: 3 × slower.
-            for k in range(np.uint64(inner_first), np.uint64(inner_last + 1)):
-                value = directions[0, k] * p - directions[1, k] * q
-                inverse[k] = value if value > inverse[k] else inverse[k]
-        start, stop = start + turn, stop + turn
+def _locate(
+    segments: Array, x: float, y: float, theta: float, range_max: float, angle_min: float, per_radian: float,
+    where: Array,
+) -> None:  # fmt: skip
+    """Write for each segment where the sensor sees it into the rows of ``where``; ``angle_min`` in [-π, π).
+
+    A loop of its own, without a branch and over columns, so that it vectorises: four segments at a time.
+    """
+    for i in range(segments.shape[0]):
+        where[_AX, i], where[_AY, i] = segments[i, 0], segments[i, 1]
+        where[_BX, i], where[_BY, i] = segments[i, 2], segments[i, 3]
+    c, s = math.cos(theta), math.sin(theta)
+    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian
+    for i in range(segments.shape[0]):
+        ax, ay, bx, by = where[_AX, i] - x, where[_AY, i] - y, where[_BX, i] - x, where[_BY, i] - y
+        beside = ((ax > range_max) & (bx > range_max)) | ((ax < -range_max) & (bx < -range_max))
+        beyond = ((ay > range_max) & (by > range_max)) | ((ay < -range_max) & (by < -range_max))
+        cross = ax * by - ay * bx
+        length_squared = (bx - ax) ** 2 + (by - ay) ** 2
+        # … or its whole line is too far.
+        away = beside | beyond | (cross * cross > range_max * range_max * length_squared)
+        ax, ay, bx, by = c * ax + s * ay, c * ay - s * ax, c * bx + s * by, c * by - s * bx
+        cross = ax * by - ay * bx
+        turned = cross < 0.0
+        ax, ay, bx, by = bx if turned else ax, by if turned else ay, ax if turned else bx, ay if turned else by
+        cross = -cross if turned else cross
+        on_line = cross <= 1e-12 * (abs(bx - ax) + abs(by - ay))
+        # Seen counter-clockwise from a to b, the segment spans less than half a turn.
+        bearing_a, bearing_b = _bearing(ax, ay), _bearing(bx, by)
+        span = bearing_b - bearing_a
+        span = span if bearing_b >= bearing_a else span + _TWO_PI
+        span = 0.0 if span > math.pi + 0.01 else span  # the error of two nearly equal bearings
+        start = (bearing_a - angle_min) * per_radian
+        stop = start + span * per_radian
+        past = stop + doubt >= turn
+        scale = 1.0 / cross
+        where[_SEEN, i] = 0.0 if away else -1.0 if on_line else 1.0
+        where[_START, i], where[_STOP, i] = start - turn if past else start, stop - turn if past else stop
+        where[_P, i], where[_Q, i] = (by - ay) * scale, (bx - ax) * scale
+        where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i] = ax, ay, bx, by
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -139,6 +135,45 @@ def _edge_on(
             and directions[0, k] * ax + directions[1, k] * ay > 0.0
         ):
             inverse[k] = max(inverse[k], 1.0 / near)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _draw_segments(
+    where: Array, angle_min: float, angle_increment: float, directions: Array, inverse: Array
+) -> None:
+    """Draw the segments that :func:`_locate` has found into the buffer.
+
+    All in one function: called for each segment, it took a third longer.
+    """
+    per_radian = 1.0 / angle_increment
+    turn, doubt = _TWO_PI * per_radian, _BEARING_ERROR * per_radian  # beam k + turn is beam k
+    beams = inverse.shape[0]
+    for i in range(where.shape[1]):
+        if where[_SEEN, i] == 0.0:
+            continue
+        if where[_SEEN, i] < 0.0:
+            _edge_on(
+                where[_AX, i], where[_AY, i], where[_BX, i], where[_BY, i], angle_min, angle_increment, directions,
+                inverse,
+            )  # fmt: skip
+            continue
+        start, stop, p, q = where[_START, i], where[_STOP, i], where[_P, i], where[_Q, i]
+        while start - doubt < beams:
+            # Beams first to last may meet it; those from inner_first to inner_last do.
+            first, last = max(math.ceil(start - doubt), 0), min(math.floor(stop + doubt), beams - 1)
+            inner_first, inner_last = max(math.ceil(start + doubt), 0), min(math.floor(stop - doubt), beams - 1)
+            if inner_first > inner_last:
+                _edge_beams(first, last, where, i, directions, inverse)
+            else:
+                if first < inner_first:
+                    _edge_beams(first, inner_first - 1, where, i, directions, inverse)
+                if inner_last < last:
+                    _edge_beams(inner_last + 1, last, where, i, directions, inverse)
+                # Unsigned, or Numba's check for negative indices keeps the loop from being vectorised: 3 × slower.
+                for k in range(np.uint64(inner_first), np.uint64(inner_last + 1)):
+                    value = directions[0, k] * p - directions[1, k] * q
+                    inverse[k] = value if value > inverse[k] else inverse[k]
+            start, stop = start + turn, stop + turn
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -206,30 +241,10 @@ def cast_rays(
     """
     out[:] = 0.0
     angle_min = wrap_scalar(angle_min)
+    where = np.empty((_ROWS, segments.shape[0]))
+    _locate(segments, x, y, theta, range_max, angle_min, 1.0 / angle_increment, where)
+    _draw_segments(where, angle_min, angle_increment, directions, out)
     c, s = math.cos(theta), math.sin(theta)
-    for i in range(segments.shape[0]):
-        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
-        if (
-            min(ax, bx) > range_max
-            or max(ax, bx) < -range_max
-            or min(ay, by) > range_max
-            or max(ay, by) < -range_max
-        ):
-            continue
-        cross = ax * by - ay * bx
-        length_squared = (bx - ax) ** 2 + (by - ay) ** 2
-        if cross * cross > range_max * range_max * length_squared:  # its whole line is too far
-            continue
-        _segment(
-            c * ax + s * ay,
-            c * ay - s * ax,
-            c * bx + s * by,
-            c * by - s * bx,
-            angle_min,
-            angle_increment,
-            directions,
-            out,
-        )
     for i in range(circles.shape[0]):
         cx, cy, radius = circles[i, 0] - x, circles[i, 1] - y, circles[i, 2]
         if cx * cx + cy * cy <= (range_max + radius) ** 2:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import njit
@@ -24,12 +23,15 @@ __all__ = [
     "SUBSTEP_S",
     "TWIST",
     "WHEELS",
+    "WheelTargets",
     "action_to_wheels",
     "dynamics_constants",
     "forward_kinematics",
     "forward_matrix",
     "inverse_kinematics",
     "inverse_matrix",
+    "motor_constants",
+    "turn_wheels",
     "twist_action_to_wheels",
     "wheel_dynamics",
     "wheel_positions",
@@ -87,6 +89,39 @@ def wheel_positions(robot: RobotConfig) -> Array:
     return np.array([[x, y], [x, -y], [-x, y], [-x, -y]])
 
 
+class WheelTargets:
+    """Wheel speed targets ``(4,)`` [rad/s] from the actions for one robot, whose limits are looked up only once.
+
+    Parameters
+    ----------
+    robot
+        Its limits are ``max_speed_m_s`` along x and along y, ``max_turn_rate_rad_s`` and
+        ``max_wheel_speed_rad_s``.
+    """
+
+    def __init__(self, robot: RobotConfig) -> None:
+        self._limits = np.array([
+            robot.max_speed_m_s, robot.max_turn_rate_rad_s, robot.lever_m, 1.0 / robot.wheel_radius_m,
+            robot.max_wheel_speed_rad_s,
+        ])  # fmt: skip
+
+    def of_twist(self, action: ArrayLike) -> Array:
+        """Return the targets for a body twist ``(3,)`` in fractions of the limits; see above."""
+        wheels = np.empty(4)
+        fractions = _numbers(action)
+        if fractions.shape != (3,) or not _twist_to_wheels(fractions, self._limits, wheels):
+            raise _no_action(action, 3)
+        return wheels
+
+    def of_wheels(self, action: ArrayLike) -> Array:
+        """Return the targets for wheel speeds ``(4,)`` in fractions of the limit, clipped."""
+        wheels = np.empty(4)
+        fractions = _numbers(action)
+        if fractions.shape != (4,) or not _scale_wheels(fractions, self._limits, wheels):
+            raise _no_action(action, 4)
+        return wheels
+
+
 def twist_action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
     """Return wheel speed targets ``(4,)`` [rad/s] for a body twist in fractions of the robot's limits.
 
@@ -102,33 +137,52 @@ def twist_action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
     Array
         Where a wheel would have to exceed its limit, all are slowed alike: the motion keeps its direction.
     """
-    # Plain numbers: for four wheels NumPy's calls would take five times as long.
-    fx, fy, fw = _fractions(action, 3)
-    scale = 1.0 / robot.wheel_radius_m
-    vx, vy = fx * robot.max_speed_m_s * scale, fy * robot.max_speed_m_s * scale
-    turn = fw * robot.max_turn_rate_rad_s * robot.lever_m * scale
-    wheels = (vx - vy - turn, vx + vy + turn, vx + vy - turn, vx - vy + turn)
-    excess = max(max(wheels), -min(wheels)) / robot.max_wheel_speed_rad_s
-    return np.array([w / excess for w in wheels] if excess > 1.0 else wheels)
+    return WheelTargets(robot).of_twist(action)
 
 
 def action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
     """Return wheel speed targets ``(4,)`` [rad/s] for wheel speeds in fractions of the limit, clipped."""
-    return np.array(_fractions(action, 4)) * robot.max_wheel_speed_rad_s
+    return WheelTargets(robot).of_wheels(action)
 
 
-def _fractions(action: ArrayLike, size: int) -> list[float]:
-    numbers = action.tolist() if isinstance(action, np.ndarray) else np.asarray(action, np.float64).tolist()
-    if not isinstance(numbers, list) or len(numbers) != size or not _all_finite(numbers):
-        raise ValueError(f"an action must be {size} finite numbers in [-1, 1], got {action!r}")
-    return [-1.0 if v < -1.0 else 1.0 if v > 1.0 else v for v in numbers]
-
-
-def _all_finite(numbers: list[Any]) -> bool:
+def _numbers(action: ArrayLike) -> Array:
+    """Return an action as a contiguous array of its own: the kernels are compiled for nothing else."""
     try:
-        return math.isfinite(sum(numbers))
-    except TypeError:  # lists within: an array of more dimensions
+        return np.array(action, np.float64)
+    except (TypeError, ValueError):
+        return np.empty(0)
+
+
+def _no_action(action: ArrayLike, size: int) -> ValueError:
+    return ValueError(f"an action must be {size} finite numbers in [-1, 1], got {action!r}")
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _twist_to_wheels(fractions: Array, limits: Array, wheels: Array) -> bool:
+    """Write the wheel speeds of a twist; tell whether its numbers are finite (see :class:`WheelTargets`)."""
+    if not math.isfinite(fractions[0] + fractions[1] + fractions[2]):
         return False
+    fx = min(max(fractions[0], -1.0), 1.0)
+    fy = min(max(fractions[1], -1.0), 1.0)
+    fw = min(max(fractions[2], -1.0), 1.0)
+    speed, turn_rate, lever, scale, fastest = limits[0], limits[1], limits[2], limits[3], limits[4]
+    vx, vy, turn = fx * speed * scale, fy * speed * scale, fw * turn_rate * lever * scale
+    wheels[0], wheels[1], wheels[2], wheels[3] = vx - vy - turn, vx + vy + turn, vx + vy - turn, vx - vy + turn
+    excess = max(max(abs(wheels[0]), abs(wheels[1])), max(abs(wheels[2]), abs(wheels[3]))) / fastest
+    if excess > 1.0:
+        for i in range(4):
+            wheels[i] /= excess
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scale_wheels(fractions: Array, limits: Array, wheels: Array) -> bool:
+    """Write wheel speeds from fractions of the limit; tell whether these are finite."""
+    if not math.isfinite(fractions[0] + fractions[1] + fractions[2] + fractions[3]):
+        return False
+    for i in range(4):
+        wheels[i] = min(max(fractions[i], -1.0), 1.0) * limits[4]
+    return True
 
 
 @lru_cache(maxsize=32)
@@ -167,7 +221,7 @@ def dynamics_constants(robot: RobotConfig, *, lever_m: float | None = None) -> A
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _motor(wheel: float, reference: float, m: Array) -> float:
     """Return a wheel's speed after motor and bearing have acted on it for a substep (implicit Euler).
 
@@ -179,20 +233,18 @@ def _motor(wheel: float, reference: float, m: Array) -> float:
     return new if abs(torque) <= m[4] else m[5] * wheel + math.copysign(m[6], torque)
 
 
-@njit(cache=True, nogil=True)
-def _motor_constants(constants: Array, h: float) -> Array:
-    """Return the constants of a substep of ``h`` [s]: the lag's share, then those of :func:`_motor`."""
+@njit(cache=True, nogil=True, error_model="numpy")
+def motor_constants(constants: Array, h: float, m: Array) -> None:
+    """Write the constants ``(7,)`` of a substep of ``h`` [s]: the lag's share, then those of :func:`_motor`."""
     inertia, friction, limit = constants[3], constants[4], constants[6]
     stiffness = constants[5] + friction
-    m = np.empty(7)
     m[0] = 1.0 - math.exp(-h / constants[7]) if constants[7] > 0.0 else 1.0
     m[1] = h * stiffness / (inertia + h * stiffness)
     m[2], m[3], m[4] = stiffness, friction, limit
     m[5], m[6] = inertia / (inertia + h * friction), h * limit / (inertia + h * friction)
-    return m
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _solve(
     a: float, b: float, d: float, e: float, f: float, x: float, y: float, z: float
 ) -> tuple[float, float, float]:
@@ -206,7 +258,7 @@ def _solve(
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def wheel_dynamics(
     state: Array,
     targets: Array,
@@ -242,10 +294,19 @@ def wheel_dynamics(
     motion
         ``(3,)``, filled: displacement in the world frame [m, m] and rotation [rad].
     """
+    motor = np.empty(7)
+    motor_constants(constants, dt / substeps, motor)
+    turn_wheels(state, targets, radii, friction, constants, motor, dt / substeps, substeps, motion)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def turn_wheels(
+    state: Array, targets: Array, radii: Array, friction: Array, constants: Array, m: Array, h: float,
+    substeps: int, motion: Array,
+) -> None:  # fmt: skip
+    """Do what :func:`wheel_dynamics` says in substeps of ``h`` [s], of which ``m`` are the motor's constants."""
     mass, lever, s0_squared = constants[0], constants[2], constants[8] * constants[8]
     lever_inertia = constants[1] / (lever * lever)
-    h = dt / substeps
-    m = _motor_constants(constants, h)
     # Per wheel: radius, μ N h, and by how much a wheel's own yielding softens the grip on it.
     r0, r1, r2, r3 = radii[0], radii[1], radii[2], radii[3]
     load, arm = h * constants[9], 0.5 / constants[3]

@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
+from mecanum_env.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.robot import GRAVITY_M_S2, forward_matrix
 from slam.types import Odometry, Scan
@@ -44,14 +45,31 @@ def _measure(
 
 @njit(cache=True, nogil=True)
 def _sweep(
-    segments: Array, circles: Array, x: float, y: float, theta: float, offset: float, directions: Array,
-    angle_min: float, angle_increment: float, range_max: float, range_min: float, sigma: float, dropout: float,
-    normals: Array, uniforms: Array, out: Array,
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, normals: Array,
+    uniforms: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes."""
-    x, y = x + offset * math.cos(theta), y + offset * math.sin(theta)
+    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes.
+
+    ``limits`` are those of :class:`Lidar`.
+    """
+    offset, angle_min, angle_increment = limits[0], limits[1], limits[2]
+    range_max, range_min, sigma, dropout = limits[3], limits[4], limits[5], limits[6]
+    theta = pose[2]
+    x, y = pose[0] + offset * math.cos(theta), pose[1] + offset * math.sin(theta)
     cast_rays(segments, circles, x, y, theta, directions, angle_min, angle_increment, range_max, out)
     _measure(out, normals, uniforms, sigma, dropout, range_min, range_max)
+
+
+@njit(cache=True, nogil=True)
+def _noisy_sweep(
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, words: NDArray[np.uint64],
+    out: Array,
+) -> None:  # fmt: skip
+    """Draw the noise of a sweep from the words of a :class:`NoiseStream`, and do :func:`_sweep`."""
+    noise = np.empty((2, out.shape[0]))
+    fill_normal(words, noise[0])
+    fill_uniform(words, noise[1])
+    _sweep(segments, circles, pose, directions, limits, noise[0], noise[1], out)
 
 
 class Lidar:
@@ -70,7 +88,13 @@ class Lidar:
         self.noise = noise
         self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
         self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
-        self._normals, self._uniforms = np.empty(config.beams), np.empty(config.beams)
+        # One array, since each argument of a call takes time to unpack.
+        self._limits = np.array([
+            config.offset_m, self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m,
+            noise.range_sigma_m, noise.dropout,
+        ])  # fmt: skip
+        self._beams = config.beams
+        self._of_scan = self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m
 
     def true_ranges(self, segments: Array, circles: Array, pose: ArrayLike) -> Array:
         """Return the exact range of each beam ``(beams,)`` [m], ``inf`` beyond ``range_max_m``.
@@ -99,23 +123,18 @@ class Lidar:
         )
         return out
 
-    def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: np.random.Generator) -> Scan:
+    def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: RandomNumbers) -> Scan:
         """Return one sweep from a robot at ``pose``; arguments as in :meth:`true_ranges`.
 
         ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
         """
-        config, noise = self.config, self.noise
-        angle_min, increment = self._angle_min, self._angle_increment
-        x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
-        ranges = np.empty(config.beams)
-        rng.standard_normal(out=self._normals)
-        rng.random(out=self._uniforms)
-        _sweep(
-            segments, circles, x, y, theta, config.offset_m, self._directions, angle_min, increment,
-            config.range_max_m, config.range_min_m, noise.range_sigma_m, noise.dropout, self._normals,
-            self._uniforms, ranges,
-        )  # fmt: skip
-        return Scan(ranges, angle_min, increment, config.range_max_m, config.range_min_m)
+        ranges, pose = np.empty(self._beams), np.asarray(pose, dtype=np.float64)
+        if isinstance(rng, NoiseStream):
+            _noisy_sweep(segments, circles, pose, self._directions, self._limits, rng.words, ranges)
+        else:
+            normals, uniforms = rng.standard_normal(self._beams), rng.random(self._beams)
+            _sweep(segments, circles, pose, self._directions, self._limits, normals, uniforms, ranges)
+        return Scan(ranges, *self._of_scan)
 
 
 def creep(robot: RobotConfig, noise: NoiseConfig) -> Array:
@@ -131,9 +150,9 @@ def creep(robot: RobotConfig, noise: NoiseConfig) -> Array:
 class WheelEncoders:
     """Encoders on the four wheels, and the systematic errors of the robot they are mounted on.
 
-    Odometry is reckoned with the nominal wheel radius and lever, less the mean share that is lost to slip, as one
-    who has calibrated it would. The true ones differ, each wheel's radius and
-    the lever by a relative error drawn uniformly when this is built: once an episode.
+    Odometry is reckoned with the nominal wheel radius and lever, less the mean share that is lost to slip and the
+    creep of wheels that accelerate, as one who has calibrated it would. The true ones differ, each wheel's radius
+    and the lever by a relative error drawn uniformly when this is built: once an episode.
 
     Parameters
     ----------
@@ -156,13 +175,14 @@ class WheelEncoders:
         self.robot = robot
         self.noise = noise
         self._forward = forward_matrix(robot)  # (3, 4)
+        self._sigma, self._rolling = noise.encoder, 1.0 - noise.slip
         self._creep = creep(robot, noise)
-        self._last_twist = np.zeros(3)
+        self._last = np.zeros(3)  # what the wheels said in the step before
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
 
-    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: np.random.Generator) -> Odometry:
+    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
         """Return the body twist that the wheels' measured rotation stands for.
 
         Parameters
@@ -176,21 +196,54 @@ class WheelEncoders:
         """
         increments = np.asarray(wheel_increments, dtype=np.float64)
         twist = np.empty(3)
-        noise = self.noise
-        gain = (1.0 - noise.slip) / dt
-        _read_encoders(self._forward, increments, rng.standard_normal(4), noise.encoder, gain, twist)
-        rolling = twist - self._creep * ((twist - self._last_twist) / dt)
-        self._last_twist = twist
-        return Odometry(rolling, dt)
+        if isinstance(rng, NoiseStream):
+            _read_noisy_encoders(
+                self._forward,
+                increments,
+                rng.words,
+                self._sigma,
+                self._rolling,
+                self._creep,
+                dt,
+                self._last,
+                twist,
+            )
+        else:
+            _read_encoders(
+                self._forward, increments, rng.standard_normal(4), self._sigma, self._rolling, self._creep, dt,
+                self._last, twist,
+            )  # fmt: skip
+        return Odometry(twist, dt)
 
 
 @njit(cache=True, nogil=True)
 def _read_encoders(
-    forward: Array, increments: Array, normals: Array, sigma: float, gain: float, twist: Array
-) -> None:
-    """Write gain · forward · increments (1 + σ normals)."""
+    forward: Array, increments: Array, normals: Array, sigma: float, rolling: float, creep: Array, dt: float,
+    last: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Write the body's twist: forward · increments (1 + σ normals), less what is lost to slip and to creep.
+
+    ``last`` is what the wheels said a step ago, and becomes what they say now.
+    """
     for i in range(3):
         total = 0.0
         for k in range(4):
             total += forward[i, k] * (increments[k] * (1.0 + sigma * normals[k]))
-        twist[i] = gain * total
+        twist[i] = rolling / dt * total
+    vx, vy, omega = twist[0], twist[1], twist[2]
+    # The acceleration of a body whose axes turn with it.
+    twist[0] -= creep[0] * ((vx - last[0]) / dt - omega * vy)
+    twist[1] -= creep[1] * ((vy - last[1]) / dt + omega * vx)
+    twist[2] -= creep[2] * ((omega - last[2]) / dt)
+    last[0], last[1], last[2] = vx, vy, omega
+
+
+@njit(cache=True, nogil=True)
+def _read_noisy_encoders(
+    forward: Array, increments: Array, words: NDArray[np.uint64], sigma: float, rolling: float, creep: Array,
+    dt: float, last: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Draw the normals from the words of a :class:`NoiseStream`, and do :func:`_read_encoders`."""
+    normals = np.empty(4)
+    fill_normal(words, normals)
+    _read_encoders(forward, increments, normals, sigma, rolling, creep, dt, last, twist)

@@ -37,7 +37,12 @@ def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float,
 
     theory.md A, observe; ``offset`` is L.
     """
-    c, s = math.cos(x[2]), math.sin(x[2])
+    return _point_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array) -> tuple[float, float]:
+    """Do :func:`innovation_blocks` with the heading's cosine and sine, for who asks about many landmarks."""
     dx = x[0] + offset * c - x[3 + 2 * i]
     dy = x[1] + offset * s - x[4 + 2 * i]
     rho2 = dx * dx + dy * dy
@@ -80,6 +85,12 @@ def predicted(x: Array, i: int, kind: float, offset: float, h: Array) -> tuple[f
 def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from landmark ``i``."""
     rho, bearing = predicted(x, i, z[5], offset, h)
+    return _distance(p, i, rho, bearing, z, h)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distance(p: Array, i: int, rho: float, bearing: float, z: Array, h: Array) -> float:
+    """Return the squared Mahalanobis distance of an observation row from what is predicted of landmark ``i``."""
     m = 3 + 2 * i
     # S = H P Hᵀ + R over the five states that H touches, read from the upper triangle.
     s00, s01, s11 = z[2], z[3], z[4]
@@ -176,7 +187,11 @@ def nearest_neighbour(
                 if not _beside(x, i, offset, z[k], marks[i], window):
                     continue
                 dx = dy = 0.0  # as near as that, it is no new wall
-            d2 = _gate(x, p, i, offset, z[k], h)
+            if z[k, 5] == LINE:
+                rho, phi = line_blocks(x, i, offset, h)
+            else:
+                rho, phi = _point_blocks(x, i, offset, c, s, h)
+            d2 = _distance(p, i, rho, phi, z[k], h)
             candidates += d2 < gate
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2

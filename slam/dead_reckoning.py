@@ -11,6 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.backend import Backend
 from slam.ekf import EkfSlam
 from slam.types import Belief, Odometry
 
@@ -52,6 +53,10 @@ class OdometrySlam(EkfSlam):
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
         return self._robot_cov.copy()
+
+    def pose_nees(self, true_pose: Array) -> float:
+        """Return the NEES of the pose against the truth ``(3,)``."""
+        return Backend.pose_nees(self, true_pose)  # not of the state's covariance, which is pinned
 
     @property
     def belief(self) -> Belief:

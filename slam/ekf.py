@@ -10,14 +10,16 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from slam.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
 from slam.backend import Backend, BackendConfig
 from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, symmetric_block
-from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy
+from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
 from slam.lanes import aligned_zeros
+from slam.metrics import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
 from slam.stacked_update import stacked_update, work_space
@@ -70,6 +72,9 @@ class EkfSlam(Backend):
 
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
+        c = self.config
+        self._max_turn = math.radians(c.max_turn_deg)
+        self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
@@ -83,6 +88,7 @@ class EkfSlam(Backend):
         self._h, self._w, self._s = work_space(_MAX_OBSERVATIONS, len(self._x))
         self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(_MAX_OBSERVATIONS)
+        self._recall = (0, 0)  # see LandmarkBook.recently_seen
         self._twist = (0.0, 0.0, 0.0)
         self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
         self.nis = 0.0
@@ -92,14 +98,17 @@ class EkfSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
-        noise, dt = self.config.odometry, odometry.dt
+        measured, dt = odometry
+        vx, vy, omega = np.asarray(measured, dtype=np.float64).tolist()
+        twist = vx, vy, omega
+        noise = self.config.odometry
         var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
         predict_robot(self._x, self._p, self._n, vx, vy, omega, dt, var_v, var_w)
         self._twist = twist
-        way = math.hypot(vx, vy, noise.lever_m * omega) * dt
+        lever = noise.lever_m
+        way = math.hypot(vx, vy, lever * omega) * dt
         moved, turned = self._unseen_motion
-        self._unseen_motion = (moved + way, turned + way / noise.lever_m)
+        self._unseen_motion = moved + way, turned + way / lever
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
@@ -152,12 +161,13 @@ class EkfSlam(Backend):
     def _associate(self, z: Array) -> NDArray[np.int64]:
         config = self.config
         if config.association == "joint":
-            return self._associate_jointly(z)
-        match = self._match[: len(z)]
-        nearest_neighbour(
-            self._x, self._p, self._book.count, config.lidar_offset_m, z, self._book.marks,
-            config.gate, config.landmarks.new_distance_m, math.radians(config.max_turn_deg),
-            config.association == "individual", match, self._distance, self._h[0],
+            match = self._associate_jointly(z)
+            self._recall = self._book.recently_seen(match)
+            return match
+        match, book = self._match[: len(z)], self._book
+        self._recall = _match_and_recall(
+            self._x, self._p, config.lidar_offset_m, z, book.marks, book.now, self._gates,
+            config.association == "individual", match, self._distance,
         )  # fmt: skip
         return match
 
@@ -165,13 +175,14 @@ class EkfSlam(Backend):
         config, match = self.config, self._match[: len(z)]
         joint_compatibility(
             self._x, self._p, self._book.count, config.lidar_offset_m, z, self._book.marks, _JOINT_GATES,
-            config.landmarks.new_distance_m, math.radians(config.max_turn_deg), _MOST_NODES, match,
+            config.landmarks.new_distance_m, self._max_turn, _MOST_NODES, match,
         )  # fmt: skip
         return match
 
     def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
         """Tell whether many of the landmarks that the last scans showed are missing all at once."""
-        recent, still = self._book.recently_seen(match)
+        del match  # counted when it was made
+        recent, still = self._recall
         return recent >= 3 and still < 0.6 * recent
 
     def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
@@ -215,12 +226,15 @@ class EkfSlam(Backend):
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks`)."""
-        new = self._book.review(self._x, self.config.lidar_offset_m, z, match)
+        book, offset = self._book, self.config.lidar_offset_m
+        if scan is None:
+            new, gone = book.review(self._x, offset, z, match).tolist(), list[int]()
+        else:
+            new, gone = book.review_scan(self._x, offset, z, match, scan)
         for k in new:
             self._add(z[k], None)
-        if scan is not None:
-            for row in self._book.contradicted(self._x, self.config.lidar_offset_m, scan):
-                self._drop(row)
+        for row in gone:
+            self._drop(row)
 
     def _add(self, z: Array, known_id: int | None) -> None:
         if self._n + 2 > len(self._x):
@@ -238,11 +252,8 @@ class EkfSlam(Backend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
-        n, i = self._n, 3 + 2 * row
-        self._x[i : n - 2] = self._x[i + 2 : n]
-        keep = np.r_[0:i, i + 2 : n]
-        self._p[: n - 2, : n - 2] = self._p[np.ix_(keep, keep)]
-        self._n = n - 2
+        _leave_out(self._x, self._p, self._n, 3 + 2 * row)
+        self._n -= 2
         self._book.drop(row)
 
     def _enlarge(self) -> None:
@@ -278,6 +289,11 @@ class EkfSlam(Backend):
         out = np.empty((3, 3))
         symmetric_block(self._p, out)
         return out
+
+    def pose_nees(self, true_pose: Array) -> float:
+        """Return the NEES of the pose against the truth ``(3,)``."""
+        # The kernel reads nothing but the upper triangle: no copies.
+        return float(nees_pose(self._x, self._p, np.asarray(true_pose, dtype=np.float64)))
 
     @property
     def joint_cov(self) -> Array:
@@ -335,3 +351,26 @@ class EkfSlam(Backend):
         n = np.column_stack([np.cos(alpha), np.sin(alpha)])
         along = np.column_stack([-n[:, 1], n[:, 0]])
         return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _leave_out(x: Array, p: Array, n: int, i: int) -> None:
+    """Move up what stands behind the two states from ``i`` on; ``p`` is an upper triangle."""
+    for a in range(n - 2):
+        above = a if a < i else a + 2
+        for b in range(a, n - 2):
+            p[a, b] = p[above, b if b < i else b + 2]
+    for a in range(i, n - 2):
+        x[a] = x[a + 2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _match_and_recall(
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
+    match: NDArray[np.int64], distance: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """Match by nearest neighbour; return what :meth:`slam.landmarks.LandmarkBook.recently_seen` says of it."""
+    gate, near, max_turn = gates[0], gates[1], gates[2]
+    h = np.empty((2, 5))
+    nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)
+    return count_recent(marks, match, now)

@@ -141,15 +141,14 @@ class FeatureExtractor:
             angles = scan.angle_min + scan.angle_increment * np.arange(n)
             self._angles = np.column_stack([np.cos(angles), np.sin(angles)])
             self._xy = np.zeros((n, 2))
-            self._beam = np.zeros(n, np.int64)
-            self._stack = np.zeros((n + 2, 2), np.int64)
-            self._pieces = np.zeros((n + 2, 3), np.int64)
+            self._reach = np.zeros(n)
+            self._places = np.zeros((7, n + 2), np.int64)
             self.surface = np.zeros(n, np.int16)
             self._gaps = self._gap_table(scan.angle_increment)
             self._scan_of = key
         self._line_count, self._corner_count = _extract(
             scan.ranges, self._angles, scan.angle_increment, scan.range_min, scan.range_max, self._limits,
-            self._gaps, self._xy, self._beam, self._stack, self._pieces, self.surface, self._lines, self._corners,
+            self._gaps, self._xy, self._reach, self._places, self.surface, self._lines, self._corners,
         )  # fmt: skip
         return self._corners[: self._corner_count]
 
@@ -207,13 +206,17 @@ class FeatureExtractor:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _extract(
     ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array, gaps: Array,
-    xy: Array, beam: NDArray[np.int64], stack: NDArray[np.int64], pieces: NDArray[np.int64],
-    surface: NDArray[np.int16], lines: Array, corners: Array,
+    xy: Array, reach: Array, places: NDArray[np.int64], surface: NDArray[np.int16], lines: Array, corners: Array,
 ) -> tuple[int, int]:  # fmt: skip
-    """Fill ``surface``, ``lines`` and ``corners`` from a scan; return how many lines and corners there are."""
+    """Fill ``surface``, ``lines`` and ``corners`` from a scan; return how many lines and corners there are.
+
+    ``xy`` ``(n, 2)``, ``reach`` ``(n,)`` and ``places`` ``(7, n + 2)`` are work space.
+    """
+    beam, apart = places[0], places[1]
+    stack, pieces = places[2:4].reshape(-1, 2), places[4:7].reshape(-1, 3)
     surface[:] = -1
-    n = points_in_order(ranges, rays, increment, range_min, limits, gaps, xy, beam)
-    pieces_count = split(xy, beam, n, ranges, limits, gaps, stack, pieces)
+    n = points_in_order(ranges, rays, increment, range_min, limits, gaps, xy, reach, beam, apart)
+    pieces_count = split(xy, n, limits, apart, stack, pieces)
     line_count = 0
     last_line = -1  # the surface that the scan has run on from without a break, else -1
     last_end = 0  # … and its last point

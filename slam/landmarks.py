@@ -57,7 +57,7 @@ class LandmarkBook:
     """What is known of each landmark beside its position, which the estimator keeps."""
 
     def __init__(self, policy: LandmarkPolicy) -> None:
-        self.policy = policy
+        self.policy = p = policy
         self.count = 0
         self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
         self._next_id = 0
@@ -65,8 +65,12 @@ class LandmarkBook:
         self._ids = np.zeros(32, np.int64)
         self._marks = np.zeros((32, 8))
         self._tentative = np.zeros((_TENTATIVE, 8))
-        self._tentative_count = np.zeros(1, np.int64)
+        self._tentative_count = 0
         self._new = np.zeros(256, np.int64)
+        self._limits = np.array([
+            p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
+            p.clear_margin_m, p.drop_after, p.overlook_after, p.overlook_ratio,
+        ])  # fmt: skip
 
     @property
     def marks(self) -> Array:
@@ -75,6 +79,11 @@ class LandmarkBook:
         A wall goes from one to the other [m], along it from its foot. A view.
         """
         return self._marks[: self.count]
+
+    @property
+    def now(self) -> int:
+        """The number of updates reviewed."""
+        return self._now
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -139,7 +148,7 @@ class LandmarkBook:
 
     def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
         """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
-        recent, still = _recent(self._marks[: self.count], match, self._now)
+        recent, still = count_recent(self.marks, match, self._now)
         return recent, still
 
     def just_seen(self) -> NDArray[np.int64]:
@@ -158,26 +167,40 @@ class LandmarkBook:
 
         ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their landmarks.
         """
-        p = self.policy
         self._now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
-        count = _review(
-            x, offset, z, match, self._now, self._marks[: self.count], self._tentative, self._tentative_count,
-            p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
+        count, self._tentative_count = _review(
+            x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count, self._limits,
             self._new,
         )  # fmt: skip
         return self._new[:count]
 
     def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
         """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
-        p, marks = self.policy, self._marks[: self.count]
         doubtful = _look_through(
-            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, marks, p.clear_margin_m,
-            p.drop_after, p.overlook_after, p.overlook_ratio,
+            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks, self._limits
+        )
+        return self._to_drop() if doubtful else []
+
+    def review_scan(
+        self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan
+    ) -> tuple[list[int], list[int]]:
+        """Do :meth:`review` and :meth:`contradicted` in one call of a kernel; return the results of both.
+
+        Looking for contradictions first and adding what is new after is the same: what is new was just seen.
+        """
+        self._now += 1
+        if len(self._new) < len(z):
+            self._new = np.zeros(len(z), np.int64)
+        count, self._tentative_count, doubtful = _review_scan(
+            x, offset, z, match, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks,
+            self._tentative, self._tentative_count, self._limits, self._new,
         )  # fmt: skip
-        if not doubtful:
-            return []
+        return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
+
+    def _to_drop(self) -> list[int]:
+        p, marks = self.policy, self.marks
         passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
         overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
         return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
@@ -207,7 +230,8 @@ def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
+def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
+    """Count what :meth:`LandmarkBook.recently_seen` returns."""
     recent = still = 0
     for i in range(marks.shape[0]):
         if marks[i, _LAST_SEEN] > now - _RECENT:
@@ -221,12 +245,12 @@ def _recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
-    tentative_count: NDArray[np.int64], gate: float, confirm_after: int, edge_confirm_after: int, baseline: float,
-    forget_after: int,
-    new: NDArray[np.int64],
-) -> int:  # fmt: skip
+    n: int, limits: Array, new: NDArray[np.int64],
+) -> tuple[int, int]:  # fmt: skip
+    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are."""
+    gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
+    forget_after = limits[4]
     c, s = math.cos(x[2]), math.sin(x[2])
-    n = tentative_count[0]
     found = 0
     for i in range(n):
         tentative[i, _AGE] += 1.0
@@ -290,17 +314,16 @@ def _review(
             if kept != i:
                 tentative[kept] = tentative[i]
             kept += 1
-    tentative_count[0] = kept
-    return found
+    return found, kept
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_through(
     x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
-    margin: float,
-    drop_after: float, overlook_after: float, overlook_ratio: float,
+    limits: Array,
 ) -> bool:  # fmt: skip
     """Count, for each landmark near by, whether three beams pass it or one ends at it; tell if any is doubtful."""
+    margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
     c, s = math.cos(x[2]), math.sin(x[2])
     sx, sy = x[0] + offset * c, x[1] + offset * s
     beams = ranges.shape[0]
@@ -337,3 +360,12 @@ def _look_through(
         ):
             doubtful = True
     return doubtful
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _review_scan(
+    x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
+    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, new: NDArray[np.int64],
+) -> tuple[int, int, bool]:  # fmt: skip
+    found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, new)
+    return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)

@@ -44,9 +44,13 @@ def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy")
 def points_in_order(
     ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
-    beam: NDArray[np.int64],
+    reach: Array, beam: NDArray[np.int64], apart: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π."""
+    """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π.
+
+    ``reach`` gets their ranges, ``apart`` whether a point and the next cannot lie on one surface. Returns the
+    number of points.
+    """
     n = ranges.shape[0]
     start = 0
     if n * increment > 2.0 * math.pi - 1.5 * increment:
@@ -59,7 +63,7 @@ def points_in_order(
             elif _breaks(r0, r1, 1, gaps, limits[SIGMA]):
                 start = i
                 break
-    count = 0
+    count = holes = 0
     for k in range(n):
         i = start + k
         if i >= n:
@@ -68,29 +72,55 @@ def points_in_order(
         if r >= range_min and r < np.inf:
             xy[count, 0] = r * rays[i, 0]
             xy[count, 1] = r * rays[i, 1]
+            reach[count] = r
             beam[count] = i
             count += 1
+        else:
+            apart[n - 1 - holes] = count - 1  # the point before the hole: there is room, as there is a point less
+            holes += 1
+    _mark_breaks(reach, count, gaps, limits[SIGMA], apart, n, holes, beam)
     return count
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _mark_breaks(
+    reach: Array, count: int, gaps: Array, sigma: float, apart: NDArray[np.int64], beams: int, holes: int,
+    beam: NDArray[np.int64],
+) -> None:  # fmt: skip
+    """Write :func:`_breaks` of each point and the next; after which points beams were lost, ``apart`` ends with.
+
+    As though no beam had been lost first, in a loop that vectorises, then anew where some were.
+    """
+    share, cosine, slack = gaps[0, 0], gaps[0, 1], 4.0 * sigma
+    for k in range(np.uint64(max(count - 1, 0))):
+        r0, r1 = reach[k], reach[k + np.uint64(1)]
+        limit = (r0 if r0 < r1 else r1) * share + slack
+        distance_squared = (r0 - r1) * (r0 - r1) + r0 * r1 * cosine
+        apart[k] = np.int64((limit < 0.0) | (distance_squared > limit * limit))
+    for hole in range(holes):
+        k = apart[beams - 1 - hole]
+        if 0 <= k < count - 1:
+            step = beam[k + 1] - beam[k]
+            if step < 0:
+                step += beams
+            apart[k] = _breaks(reach[k], reach[k + 1], step, gaps, sigma)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def split(
-    xy: Array, beam: NDArray[np.int64], n: int, ranges: Array, limits: Array, gaps: Array,
-    stack: NDArray[np.int64], pieces: NDArray[np.int64],
+    xy: Array, n: int, limits: Array, apart: NDArray[np.int64], stack: NDArray[np.int64],
+    pieces: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number."""
+    """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number.
+
+    ``xy`` and ``apart`` are those of :func:`points_in_order`.
+    """
     threshold = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
-    beams = ranges.shape[0]
     count = 0
     begin = 0
     while begin < n:
         end = begin
-        while end + 1 < n:
-            step = beam[end + 1] - beam[end]
-            if step < 0:
-                step += beams
-            if _breaks(ranges[beam[end]], ranges[beam[end + 1]], step, gaps, limits[SIGMA]):
-                break
+        while end + 1 < n and apart[end] == 0:
             end += 1
         depth = 0
         stack[0, 0], stack[0, 1] = begin, end
@@ -116,21 +146,21 @@ def split(
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"})
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"nnan", "nsz"}, forceinline=True)
 def _farthest(xy: Array, first: int, last: int, threshold: float) -> int:
     """Return the point farthest from the chord first–last if it is beyond the threshold, else -1."""
+    if last - first < 2:
+        return -1
     x0, y0 = xy[first, 0], xy[first, 1]
     dx, dy = xy[last, 0] - x0, xy[last, 1] - y0
-    # The largest distance first, in a loop that vectorises; which point it was, only where that matters.
-    largest = 0.0
-    for i in range(first + 1, last):
-        largest = max(largest, abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0)))
-    if largest <= threshold * math.sqrt(dx * dx + dy * dy):
-        return -1
-    for i in range(first + 1, last):
-        if abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0)) == largest:
-            return i
-    return -1
+    farthest, largest = -1, threshold * math.sqrt(dx * dx + dy * dy)
+    # A branch, seldom taken and well foreseen: computing a maximum, each point would wait for the one before.
+    # Unsigned, since other indices are tested for being negative.
+    for i in range(np.uint64(first + 1), np.uint64(last)):
+        distance = abs(dx * (xy[i, 1] - y0) - dy * (xy[i, 0] - x0))
+        if distance > largest:
+            farthest, largest = np.int64(i), distance  # type: ignore[assignment]
+    return farthest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +23,15 @@ LINE = 2
 """A straight wall, not a point: its two coordinates are α [rad] and r [m], x cos α + y sin α = r."""
 
 
-@dataclass(frozen=True, slots=True)
-class Odometry:
+# Named tuples where each step makes a new one: a frozen dataclass takes 0.5 µs longer to build.
+class Odometry(NamedTuple):
     """The wheels' account of one step: a body twist held for ``dt``."""
 
     twist: Array | tuple[float, float, float]  # (3,) vx [m/s], vy [m/s], ω [rad/s] in the body frame
     dt: float  # [s]
 
 
-@dataclass(frozen=True, slots=True)
-class Scan:
+class Scan(NamedTuple):
     """One sweep of a planar lidar, in the sensor frame (REP 117 values).
 
     A range is metres, ``inf`` where nothing within ``range_max`` returned, ``nan`` where the beam was lost.

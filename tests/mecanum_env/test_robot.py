@@ -143,6 +143,21 @@ def test_actions_are_clipped_and_checked() -> None:
         action_to_wheels(robot, [0, 0, 0])
 
 
+@pytest.mark.parametrize("bad", [[[0, 0, 0]], "abc", [None, 0, 0], [1j, 0, 0], 0.5, [], [[0], 0, 0], [1e308] * 3])
+def test_what_is_no_action_is_refused_in_words(bad: object) -> None:
+    with pytest.raises(ValueError, match="3 finite numbers"):
+        twist_action_to_wheels(RobotConfig(), bad)  # type: ignore[arg-type]
+
+
+def test_an_action_may_be_of_any_numbers_anywhere_in_memory() -> None:
+    robot = RobotConfig()
+    expected = twist_action_to_wheels(robot, [1.0, 0.0, -1.0])
+    numbers = np.array([1.0, 9.0, 0.0, 9.0, -1.0, 9.0])
+    for action in (numbers[::2], numbers[::2].astype(np.float32), numbers[::2].astype(int), (1, 0, -1)):
+        np.testing.assert_array_equal(twist_action_to_wheels(robot, action), expected)
+    np.testing.assert_array_equal(numbers, [1.0, 9.0, 0.0, 9.0, -1.0, 9.0])
+
+
 # ---- dynamics ----------------------------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, NOISE_PRESETS, ROBOT_PRESETS, LidarConfig, NoiseConfig
+from mecanum_env.noise import noise_stream
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.robot import forward_kinematics, forward_matrix, twist_action_to_wheels
 from mecanum_env.rooms.floor_plan import FloorPlan
@@ -342,3 +343,20 @@ def test_odometry_always_draws_four_numbers() -> None:
         encoders.odometry(np.zeros(4), 0.1, rng)
         expected.standard_normal(4)
         assert rng.random() == expected.random()
+
+
+def test_a_noise_stream_gives_the_readings_of_its_generator() -> None:
+    robot, noise = ROBOT_PRESETS["youbot"], NOISE_PRESETS["slippery"]
+    lidar, encoders = Lidar(LidarConfig(), noise), WheelEncoders(robot, noise, np.random.default_rng(0))
+    seed = np.random.SeedSequence(3)
+    streams = noise_stream(seed), np.random.Generator(np.random.PCG64(seed))
+    for k in range(20):
+        (odometry, scan), (expected_odometry, expected_scan) = (
+            (
+                encoders.odometry(np.full(4, 0.1 * k), 0.1, rng),
+                lidar.scan(SQUARE, NO_CIRCLES, (1.0 + 0.1 * k, 2.0, 0.3 * k), rng),
+            )
+            for rng in streams
+        )
+        np.testing.assert_array_equal(odometry.twist, expected_odometry.twist)
+        np.testing.assert_array_equal(scan.ranges, expected_scan.ranges)

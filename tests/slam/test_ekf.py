@@ -12,9 +12,10 @@ import slam
 from slam import Observations, Odometry
 from slam.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
 from slam.chi_square import chi2_quantile
+from slam.ekf import _leave_out
 from slam.geometry import compose, inverse, wrap
 from slam.joint_gaussian import add_landmark, near_landmarks
-from slam.metrics import nees
+from slam.metrics import nees, nees_pose
 from slam.motion import move
 from slam.stacked_update import stacked_update, work_space
 from tests.slam.numerics import numerical_jacobian, random_covariance
@@ -336,3 +337,24 @@ def test_unknown_names_and_keys_are_listed() -> None:
         slam.make("ekff")
     with pytest.raises(ValueError, match=r"unknown key of EkfConfig 'gates'.*valid: .*gate"):
         slam.make("ekf", config={"gates": 1.0})
+
+
+@given(states, st.integers(1, 6))
+def test_leaving_a_landmark_out_takes_its_rows_and_columns(seed: int, landmarks: int) -> None:
+    x, p, rng = random_state(seed, landmarks)
+    n, i = len(x), 3 + 2 * int(rng.integers(landmarks))
+    keep = np.r_[0:i, i + 2 : n]
+    left_x, left_p = x.copy(), np.triu(p)
+    _leave_out(left_x, left_p, n, i)
+    np.testing.assert_array_equal(left_x[: n - 2], x[keep])
+    np.testing.assert_array_equal(np.triu(left_p[: n - 2, : n - 2]), np.triu(p[np.ix_(keep, keep)]))
+
+
+@pytest.mark.parametrize("name", ["ekf", "odometry", "truth"])
+def test_the_pose_nees_is_that_of_pose_and_covariance(name: str) -> None:
+    backend = slam.make(name)
+    for k in range(5):
+        backend.predict(Odometry((0.3, 0.1, 0.2), 0.1))
+        backend.update(room_scan(np.array([2.0 + 0.03 * k, 2.0, 0.02 * k])))
+    true = backend.pose + np.array([1e-3, -2e-3, 1e-3])
+    assert backend.pose_nees(true) == nees_pose(backend.pose, backend.pose_cov, true)

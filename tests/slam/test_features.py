@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from slam import CONCAVE, CONVEX, Scan
 from slam.features import FeatureConfig, FeatureExtractor
 from slam.geometry import inverse, transform_points, wrap
+from slam.surfaces import SIGMA, _breaks, _farthest, points_in_order
 from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
 
 ROOM = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]])
@@ -149,3 +150,36 @@ def test_few_beams_far_apart_are_never_joined() -> None:
     extractor = FeatureExtractor()
     assert len(extractor.extract(Scan(ranges, angles[0], angles[1] - angles[0], 8.0))) == 0
     assert np.all(extractor.surface == -1)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_breaks_are_found_as_between_single_points(seed: int) -> None:
+    """Whatever beams are lost, and wherever the circle begins."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(8, 400))
+    increment = 2.0 * math.pi / n * (1.0 if rng.random() < 0.5 else 0.6)
+    ranges = np.repeat(rng.uniform(0.5, 6.0, n), rng.integers(1, 9, n))[:n] + 0.02 * rng.standard_normal(n)
+    ranges[rng.random(n) < rng.choice([0.0, 0.02, 0.5])] = rng.choice([np.nan, np.inf])
+    extractor = FeatureExtractor()
+    gaps, limits, angles = extractor._gap_table(increment), extractor._limits, increment * np.arange(n)
+    rays = np.column_stack([np.cos(angles), np.sin(angles)])
+    xy, reach, beam, apart = np.zeros((n, 2)), np.zeros(n), np.zeros(n, np.int64), np.full(n + 2, 7)
+    count = points_in_order(ranges, rays, increment, 0.0, limits, gaps, xy, reach, beam, apart)
+    assert sorted(beam[:count]) == np.flatnonzero(np.isfinite(ranges)).tolist()
+    np.testing.assert_array_equal(reach[:count], ranges[beam[:count]])
+    for k in range(count - 1):
+        step = int(beam[k + 1] - beam[k]) % n
+        assert apart[k] == _breaks(reach[k], reach[k + 1], step, gaps, limits[SIGMA])
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_farthest_point_is_the_first_of_the_largest_distance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    xy = rng.integers(0, 4, (int(rng.integers(2, 40)), 2)).astype(float)  # of a few places, so that there are ties
+    first, last = sorted(rng.integers(0, len(xy), 2).tolist())
+    (dx, dy), relative = xy[last] - xy[first], xy - xy[first]
+    distance = np.abs(dx * relative[:, 1] - dy * relative[:, 0])[first + 1 : last]
+    expected = -1
+    if len(distance) and distance.max() > 0.5 * math.sqrt(dx * dx + dy * dy):
+        expected = first + 1 + int(np.argmax(distance))
+    assert _farthest(xy, first, last, 0.5) == expected

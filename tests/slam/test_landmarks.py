@@ -3,6 +3,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from slam import Scan
 from slam.association import IGNORED, UNMATCHED
@@ -87,3 +89,28 @@ def test_a_landmark_that_beams_pass_through_is_dropped_and_one_on_a_wall_is_not(
     assert book.row(0) == -1
     book.add(0.0, 0.0, None)
     assert book.ids.tolist() == [1, 2]  # ids are never used twice
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_reviewing_a_scan_in_one_go_is_reviewing_and_then_looking_for_contradictions(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    policy = LandmarkPolicy(confirm_after=1, drop_after=1, overlook_after=1, overlook_ratio=0.0)
+    books = LandmarkBook(policy), LandmarkBook(policy)
+    x = np.concatenate([[0.0, 0.0, 0.3], rng.uniform(-4, 4, 40)])
+    for _ in range(12):
+        z = np.array([corner(*rng.uniform(-4, 4, 2), edge=bool(rng.random() < 0.5)) for _ in range(4)])
+        match = rng.permutation(np.arange(-2, max(books[0].count, 2)))[:4]
+        match[(match >= books[0].count) | (rng.random(4) < 0.6)] = UNMATCHED
+        scan = Scan(np.repeat(rng.uniform(1.0, 6.0, 12), 30), ANGLE_MIN, INCREMENT, 8.0)
+        new = books[0].review(x, 0.1, z, match).tolist()
+        for k in new:
+            books[0].add(z[k, 5], z[k, 6], None)
+        gone = books[0].contradicted(x, 0.1, scan)
+        assert books[1].review_scan(x, 0.1, z, match, scan) == (new, gone)
+        for k in new:
+            books[1].add(z[k, 5], z[k, 6], None)
+        for row in gone:
+            books[0].drop(row)
+            books[1].drop(row)
+        np.testing.assert_array_equal(books[0].marks, books[1].marks)
+        np.testing.assert_array_equal(books[0].ids, books[1].ids)
