@@ -12,11 +12,12 @@ from slam.motion import OdometryNoise
 __all__ = ["backend_settings", "odometry_noise"]
 
 # A wheel's radius error stays for the whole episode, while the filter takes the odometry's error for white. Over
-# the second or so that it takes the landmarks to correct a drift, ten steps' errors add up instead of averaging.
-_PERSISTENCE = 10.0
+# the half second or so that it takes the landmarks to correct a drift, seven steps' errors add up instead of
+# averaging.
+_PERSISTENCE = 7.0
 
-# What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), with something to spare:
-# a robot that stands must not become certain of it.
+# What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), and some more: a robot
+# that stands must not become certain of where it is.
 _FLOOR_M_S = 0.0001
 
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 MAX_LINES = 128
-_GRAZING = 0.01  # c² that beams along a surface count as at least: bearings are not as exact as that
+_GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _OUTLIER = 4.0  # σ along the beam by which a point may be off the line that it is fitted to
+_HIDDEN = 0.25  # 1σ of that shift; see :func:`fit`
 _STEPS = 2  # of Gauss-Newton; after one from total least squares a wall seen at an angle is still too far off
 MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
 
@@ -193,30 +194,39 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
         b -= 1
     # The next is out of reach by its own noise, too: for it to count would make a bias of that.
     a, b = a + 1, b - 1
-    n = b - a + 1
-    if n < 3:
-        return False
+    n = 0
     for _ in range(_STEPS):
-        if not _refine(xy, a, b, limits[SIGMA], line):
+        n = _refine(xy, a, b, limits[SIGMA], line)
+        if n < 3:
             return False
     t0 = -line[NY] * (xy[first, 0] - line[MX]) + line[NX] * (xy[first, 1] - line[MY])
     t1 = -line[NY] * (xy[last, 0] - line[MX]) + line[NX] * (xy[last, 1] - line[MY])
     line[T0], line[T1], line[POINTS] = t0, t1, n
-    return bool(abs(t1 - t0) >= limits[MIN_LENGTH])
+    length = t1 - t0
+    if length < limits[MIN_LENGTH]:
+        return False
+    # What departs by less than ``near`` (a thin ledge, a neighbour's last points) was not told apart. If it is as
+    # long as it is high, it shifts the line the more, the shorter that is.
+    hidden = _HIDDEN * near * near / length
+    line[VAR_OFFSET] += hidden * hidden
+    line[VAR_SLOPE] += 12.0 * hidden * hidden / (length * length)
+    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> bool:
-    """Bring a line nearer to the maximum likelihood one of the points ``a`` … ``b``; write its covariance.
+def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
+    """Bring a line nearer to the maximum likelihood one of the points ``a`` … ``b``; return how many those are.
 
     Range noise acts along the beam. It moves a point along a wall seen at an angle as well as across it, and
     always both together: total least squares takes that for a turn of the wall, the more the shorter and the
     noisier. So a point is placed along the wall by its bearing alone, and counts by the cosine c of its incidence:
-    across the wall its error has the variance σ² c². A Gauss-Newton step from the line as it is.
+    across the wall its error has the variance σ² c². A Gauss-Newton step from the line as it is, with the points
+    that may lie on it at all; at least three, else nothing is done.
     """
     nx, ny, r = line[NX], line[NY], line[R]
     mt = -ny * line[MX] + nx * line[MY]  # of the centroid, from the line's foot
     gate = (_OUTLIER * sigma) ** 2
+    n = 0
     sw = st = stt = se = ste = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
@@ -227,13 +237,14 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> bool:
         e = d - r
         if d <= 0.5 * r or e * e * weight > gate:
             continue
+        n += 1
         sw += weight
         st += weight * t
         stt += weight * t * t
         se += weight * e
         ste += weight * t * e
-    if sw <= 0.0 or stt * sw <= st * st:
-        return False
+    if n < 3:
+        return n
     mean = st / sw
     spread = stt - mean * st
     slope = (ste - mean * se) / spread
@@ -246,7 +257,7 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> bool:
     line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, nx * mx + ny * my, mx, my
     line[VAR_OFFSET] = sigma * sigma / sw
     line[VAR_SLOPE] = sigma * sigma / spread
-    return True
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -86,6 +86,7 @@ def test_a_wall_s_covariance_is_the_noise_s() -> None:
     rng = np.random.default_rng(1)
     pose = np.array([2.0, 1.7, 0.4])
     extractor = FeatureExtractor()
+    floors = np.diag([extractor.config.wall_sigma_m**2, extractor.config.wall_sigma_rad**2])
     errors = []
     for _ in range(400):
         extractor.extract(room_scan(pose, rng))
@@ -96,7 +97,7 @@ def test_a_wall_s_covariance_is_the_noise_s() -> None:
             turned = float(wrap(row[1] + pose[2]))
             r, alpha = min(side, key=lambda s: abs(float(wrap(s[1] - turned))))
             e = np.array([row[0] - (r - n_of(alpha) @ pose[:2]), float(wrap(turned - alpha))])
-            cov = np.array([[row[2], row[3]], [row[3], row[4]]]) - np.diag([0.001**2, 0.0005**2])
+            cov = np.array([[row[2], row[3]], [row[3], row[4]]]) - floors
             errors.append(e @ np.linalg.solve(cov, e))
     assert len(errors) > 4 * 390  # now and then noise makes one look curved, or cuts one in two
     assert np.mean(errors) / 2 == pytest.approx(1.0, abs=0.15)
