@@ -31,8 +31,8 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     white = noise.encoder**2 + noise.slip**2 / 3.0
     lasting = _PERSISTENCE * (noise.radius_error**2 / 3.0)
     per_wheel = math.sqrt((white + lasting) / 4.0)
-    # A wrong lever is a bias in the turn rate, which on average has a third of the wheels' squared speed.
-    base = noise.base_error * math.sqrt(_PERSISTENCE / 9.0)
+    # A wrong lever is a bias in the turn rate, which has up to half of the wheels' squared speed where a robot turns.
+    base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
     return OdometryNoise(
         lever_m=robot.lever_m,
         speed_floor_m_s=_FLOOR_M_S,

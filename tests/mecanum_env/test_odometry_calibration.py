@@ -93,23 +93,20 @@ def test_odometry_takes_the_mean_slip_out() -> None:
 
 @pytest.mark.parametrize("preset", ["nominal", "slippery", "cavity"])
 def test_the_declared_v_is_the_measured_one(preset: str) -> None:
-    """Shares within 20 % of what was measured over 60 episodes, and drifts over a second as V allows.
-
-    Where the robot is slow the declared floors, 2 mm/s and 3 mrad/s, count for more than what was measured.
-    """
+    """Shares within 20 % of what was measured over 60 episodes, and drifts over a window as V allows."""
     robot = ROBOT_PRESETS.get(preset, ROBOT)
     drives = drive(robot, NOISE_PRESETS[preset], episodes=60, steps=120)
     declared, found = odometry_noise(robot, NOISE_PRESETS[preset]), fit(drives, robot.lever_m).lasting
     assert declared.speed_share == pytest.approx(found.speed_share, rel=0.2)
     assert declared.turn_share_rad_m == pytest.approx(found.turn_share_rad_m, rel=0.2)
-    assert all(0.5 < ratio < 1.2 for ratio in drift_ratios(drives, declared))
+    assert all(0.7 < ratio < 1.2 for ratio in drift_ratios(drives, declared))
 
 
 def test_the_command_prints_measured_beside_declared(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--noise", "nominal", "--episodes", "3", "--steps", "40", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["nominal"]
     assert {"white", "lasting", "lasting_without_gain", "declared", "gain", "bins", "steps"} <= result.keys()
-    assert result["declared"]["speed_share"] == pytest.approx(0.0104, abs=1e-4)
+    assert result["declared"]["speed_share"] == pytest.approx(0.0091, abs=1e-4)
     assert main(["--noise", "nominall"]) == 2
     assert "did you mean 'nominal'?" in capsys.readouterr().err
     assert main(["--episodes", "0"]) == 2
