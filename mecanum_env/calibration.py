@@ -12,9 +12,9 @@ from slam.motion import OdometryNoise
 __all__ = ["backend_settings", "odometry_noise"]
 
 # A wheel's radius error stays for the whole episode, while the filter takes the odometry's error for white. Over
-# the half second or so that it takes the landmarks to correct a drift, seven steps' errors add up instead of
+# the half second or so that it takes the landmarks to correct a drift, six steps' errors add up instead of
 # averaging.
-_PERSISTENCE = 7.0
+_PERSISTENCE = 6.0
 
 # What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), and some more: a robot
 # that stands must not become certain of where it is.
@@ -31,7 +31,7 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     white = noise.encoder**2 + noise.slip**2 / 3.0
     lasting = _PERSISTENCE * (noise.radius_error**2 / 3.0)
     per_wheel = math.sqrt((white + lasting) / 4.0)
-    # A wrong lever is a bias in the turn rate, which has up to half of the wheels' squared speed where a robot turns.
+    # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
     base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
     return OdometryNoise(
         lever_m=robot.lever_m,

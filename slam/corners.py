@@ -109,7 +109,7 @@ def _to_polar(
 def _meets(line: Array, ray: Array) -> float:
     """Return where a beam meets a line, along it from its centroid."""
     reach = line[R] / (line[NX] * ray[0] + line[NY] * ray[1])
-    return -line[NY] * (reach * ray[0] - line[MX]) + line[NX] * (reach * ray[1] - line[MY])
+    return float(-line[NY] * (reach * ray[0] - line[MX]) + line[NX] * (reach * ray[1] - line[MY]))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

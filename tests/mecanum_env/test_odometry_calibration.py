@@ -54,11 +54,12 @@ def test_the_same_seed_drives_the_same() -> None:
     np.testing.assert_array_equal(a.true, b.true)
 
 
-def test_without_noise_odometry_is_off_by_millimetres_a_second() -> None:
+def test_without_noise_odometry_is_off_by_half_a_millimetre_a_second() -> None:
+    """The wheels' creep under acceleration is taken out: with it, 1.2 mm/s."""
     found = fit(drive(ROBOT, PERFECT, episodes=10, steps=100), LEVER)
-    assert np.all(np.abs(found.gain) < 0.01)
-    assert sigma(found.white, 0.5)[0] < 0.002
-    assert sigma(found.lasting, 0.5)[0] < 0.007
+    assert np.all(np.abs(found.gain) < 0.001)
+    assert sigma(found.white, 0.5)[0] < 0.0005
+    assert sigma(found.lasting, 0.5)[0] < 0.001
 
 
 def test_the_white_part_of_encoder_noise_is_what_theory_says() -> None:

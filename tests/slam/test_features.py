@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,6 +11,7 @@ from slam import CONCAVE, CONVEX, Scan
 from slam.features import FeatureConfig, FeatureExtractor
 from slam.geometry import inverse, transform_points, wrap
 from slam.surfaces import SIGMA, _breaks, _farthest, points_in_order
+from slam.types import LINE
 from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
 
 ROOM = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]])
@@ -98,15 +100,18 @@ def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None
     assert abs(direction - math.atan2(-1, -1)) < 0.1
 
 
-def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from() -> None:
+@pytest.mark.parametrize("sigma", [0.01, 0.03])
+def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from(sigma: float) -> None:
     """The two ends of a free-standing wall, their bias and spread against the declared covariance."""
     wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.3], [2.0, 3.3]])
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor()
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
     errors, nees = [], []
     for _ in range(200):
         pose = np.array([rng.uniform(2.2, 3.8), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
-        extractor.extract(polygon_scan(pose, [ROOM, wall], rng))
+        scan = polygon_scan(pose, [ROOM, wall])
+        scan.ranges[:] += sigma * rng.standard_normal(BEAMS)
+        extractor.extract(scan)
         corners = extractor.corners()
         for z, cov, kind in zip(corners.range_bearing, corners.cov, corners.kind, strict=True):
             if kind != CONVEX:
@@ -119,6 +124,34 @@ def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from() -> None:
     assert len(errors) > 300
     assert np.abs(np.mean(errors, axis=0)).max() < 0.004
     assert 0.7 < np.mean(nees) < 2.2
+
+
+def test_noise_neither_turns_nor_moves_the_walls_of_a_closet() -> None:
+    """Short walls seen at an angle, with a corner at both ends, and noise that hides where one begins."""
+    rng = np.random.default_rng(2)
+    size, sigma = np.array([2.4, 1.6]), 0.03
+    closet = size * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
+    errors, nees = [], []
+    for _ in range(600):
+        pose = np.array([*(size * rng.uniform(0.2, 0.8, 2)), rng.uniform(-3, 3)])
+        scan = polygon_scan(pose, [closet])
+        scan.ranges[:] += sigma * rng.standard_normal(BEAMS)
+        extractor.extract(scan)
+        rows = extractor.with_walls()
+        for row in rows[rows[:, 5] == LINE]:
+            turned = float(wrap(row[1] + pose[2]))
+            alpha = math.pi / 2 * round(turned / (math.pi / 2))
+            true = {0: size[0] - pose[0], 1: size[1] - pose[1], -1: pose[1]}.get(
+                round(alpha / (math.pi / 2)), pose[0]
+            )
+            e = np.array([row[0] - true, turned - alpha])
+            nees.append(e @ np.linalg.solve(np.array([[row[2], row[3]], [row[3], row[4]]]), e))
+            # Turned towards the middle of what is seen or away from it, whichever way the scan runs.
+            errors.append(e * (1.0, np.sign(row[8] + row[9])))
+    assert len(errors) > 4 * 500
+    assert 0.6 < np.mean(nees) / 2 < 1.05
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 3 * np.std(errors, axis=0) / math.sqrt(len(errors)))
 
 
 def test_lost_beams_and_open_space_are_no_surfaces() -> None:
