@@ -92,7 +92,7 @@ def _advance(high: int, low: int, m_high: int, m_low: int, c_high: int, c_low: i
     """Return m · state + c modulo 2¹²⁸."""
     new_low = low * m_low + c_low
     carry = np.uint64(new_low < c_low)
-    above: Any = _high_word(low, m_low)
+    above: Any = _high_word(low, m_low)  # type: ignore[call-arg]
     return above + high * m_low + low * m_high + c_high + carry, new_low
 
 
