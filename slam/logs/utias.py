@@ -28,6 +28,7 @@ NOISE = ObservationNoise(range_m=0.17, bearing_deg=1.1)
 
 SETTINGS = {
     "lidar_offset_m": 0.0,
+    "association": "nearest",
     "known_gate": 18.4,  # 99.99 %: a few bar codes were misread
     "odometry": {
         "lever_m": 0.13, "speed_floor_m_s": 0.01, "speed_share": 1.9, "turn_floor_rad_s": 0.01,

@@ -52,6 +52,7 @@ SETTINGS = {
         "turn_floor_rad_s": round(_SPEED_SIGMA * _USUAL_SLOPE / AXLES_M, 4),
         "turn_share_rad_m": round(_STEERING_SIGMA / AXLES_M, 5), "slip_share": 0.0,
     },
+    "association": "nearest",
     "landmarks": {"tentative_gate_m": 1.5, "new_distance_m": 3.0, "confirm_after": 5, "forget_after": 50},
 }  # fmt: skip
 
