@@ -66,8 +66,8 @@ class FeatureConfig:
     edge_sigma: float = 1.0
     edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
-    # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen so
-    # that over apartments of the training seeds 100-149 the average pose NEES/3 is near 1.
+    # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen
+    # so that over apartments of the training seeds 100-149 the average pose NEES/3 is near 1.
     sigma_floor_m: float = 0.0005
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: float = 0.6
