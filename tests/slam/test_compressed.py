@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 import slam
 from slam import Observations
+from slam.backend import Backend
 from slam.compressed import CompressedEkfSlam
 from tests.slam.simulated import drive, observe_landmarks, room_scan
 
@@ -67,20 +69,27 @@ def test_it_is_the_full_filter(look_every: int) -> None:
     assert most < 0.6 * full.landmark_count  # it did filter a part only
 
 
-def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
-    """A known id that was left behind 20 m ago: a loop closed."""
-    rng = np.random.default_rng(3)
-    landmarks = grove(3)
-    full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
-    for backend in (full, compressed):
+def through_the_grove(
+    landmarks: np.ndarray, backends: tuple[Backend, ...], seed: int, steps: int
+) -> Iterator[np.ndarray]:
+    """Drive straight on, all backends told the same; yield the true pose after each step."""
+    rng, pose = np.random.default_rng(seed), np.zeros(3)
+    for backend in backends:
         backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
-    pose = np.zeros(3)
-    for _ in range(100):
+    for _ in range(steps):
         pose, odometry = drive(pose, np.array([0.8, 0.0, 0.0]), (0.02, 0.02), rng, dt=0.3)
         seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
-        for backend in (full, compressed):
+        for backend in backends:
             backend.predict(odometry)
             backend.observe(seen)
+        yield pose
+
+
+def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
+    """A known id that was left behind 20 m ago: a loop closed."""
+    landmarks = grove(3)
+    full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
+    *_, pose = through_the_grove(landmarks, (full, compressed), 3, 100)
     assert compressed.landmark_count > compressed._book.count
     first = int(compressed._map_ids[compressed._far[0]])
     d = landmarks[first] - pose[:2] - OFFSET * np.array([math.cos(pose[2]), math.sin(pose[2])])
@@ -94,18 +103,8 @@ def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
 
 def test_the_place_of_a_dropped_landmark_is_taken_again() -> None:
     """Landmarks are dropped on the way, in both filters; later ones stand where they stood."""
-    rng = np.random.default_rng(4)
-    landmarks = grove(4)
     full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
-    for backend in (full, compressed):
-        backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
-    pose = np.zeros(3)
-    for k in range(110):
-        pose, odometry = drive(pose, np.array([0.8, 0.0, 0.0]), (0.02, 0.02), rng, dt=0.3)
-        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
-        for backend in (full, compressed):
-            backend.predict(odometry)
-            backend.observe(seen)
+    for k, _ in enumerate(through_the_grove(grove(4), (full, compressed), 4, 110)):
         if k % 9 == 8:
             dropped = int(compressed._book.ids[k % compressed._book.count])
             for backend in (full, compressed):
