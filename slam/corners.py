@@ -38,6 +38,10 @@ from slam.types import CONCAVE, CONVEX
 
 Array = NDArray[np.float64]
 
+_SIMPLER = 6.0  # by how much an end face must lower the misfit to be believed
+_LEAN = 0.1  # how much a beam must lean towards a surface to be taken for one that reaches its end face
+_POOR = 2.0  # range sigmas: largest 1σ of a convex corner that two fits make
+
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
@@ -84,6 +88,11 @@ def meet(one: Array, two: Array, increment: float, limits: Array, corner: Array)
     # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
     # one that stands out into it.
     left = (-ax) * by - (-ay) * bx > 0.0
+    if not left:
+        # A short face gives a corner that is worse than its covariance; as the end of the other surface it is not.
+        half = 0.5 * (cxx - cyy)
+        if 0.5 * (cxx + cyy) + math.sqrt(half * half + cxy * cxy) > (_POOR * limits[SIGMA]) ** 2 + floor:
+            return 0
     sign = 1.0 if left else -1.0
     direction = math.atan2(sign * (ay + by), sign * (ax + bx))
     _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, 0, corner)
@@ -113,6 +122,58 @@ def _meets(line: Array, ray: Array) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _misfit(line: Array, reach: float, ray: Array, sigma: float) -> float:
+    """Return the squared distance, in units of its noise, of a range from where its beam meets a line."""
+    off = (reach - line[R] / (line[NX] * ray[0] + line[NY] * ray[1])) / sigma
+    return 0.0 if math.isnan(off) else off * off
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _end_before_face(
+    line: Array, step: int, last: int, faces: int, ranges: Array, rays: Array, limits: Array
+) -> tuple[float, float]:
+    """Return where a surface ends, along it from its centroid, and the variance that an end face brings to that.
+
+    The first points of a face that recedes at a right angle lie so near the surface's line that they passed for
+    points of the surface, the more of them the noisier the ranges. So its last beams, as far back from ``last`` as
+    that may be, and the ``faces`` beams after it are divided anew, where their ranges fit best: the surface lies
+    on the line, and all points of the face lie as far along it as its end. The variance is negative where neither
+    that fits nor all of them lie on the line.
+    """
+    n, sigma = ranges.shape[0], limits[SIGMA]
+    lean = (-line[NY] * rays[last, 0] + line[NX] * rays[last, 1]) * step
+    across = line[NX] * rays[last, 0] + line[NY] * rays[last, 1]
+    end, back = _meets(line, rays[last]), 0
+    visible = lean < -_LEAN * across
+    if visible:
+        # How far beyond the end these beams meet the line where the face is 4σ behind it.
+        most = limits[SPLIT_SIGMAS] * sigma * -lean / across
+        while back < line[POINTS] - 4 and (end - _meets(line, rays[(last - back * step) % n])) * step < most:
+            back += 1
+    rest = 0.0
+    for k in range(1 - back, faces + 1):
+        i = (last + k * step) % n
+        rest += _misfit(line, ranges[i], rays[i], sigma)
+    best, variance = rest - _SIMPLER, 0.0
+    s = 0.5 * (_meets(line, rays[(last + faces * step) % n]) + _meets(line, rays[(last + (faces + 1) * step) % n]))
+    # The face from its far end inwards: weight, first and second moment of its points along the line.
+    weight = first = second = 0.0
+    for k in range(faces, -back, -1):
+        i = (last + k * step) % n
+        lean = -line[NY] * rays[i, 0] + line[NX] * rays[i, 1]
+        if not visible or math.isnan(ranges[i]) or lean * step > -_LEAN:
+            continue
+        along = ranges[i] * lean + line[NY] * line[MX] - line[NX] * line[MY]
+        w = 1.0 / (sigma * lean) ** 2
+        weight, first, second = weight + w, first + w * along, second + w * along * along
+        rest -= _misfit(line, ranges[i], rays[i], sigma)
+        misfit = rest + second - first * first / weight
+        if misfit < best:
+            best, s, variance = misfit, first / weight, 1.0 / weight
+    return s, variance if best < 2.0 * (faces + back) + _SIMPLER else -1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def edge(
     line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
     corner: Array,
@@ -128,7 +189,7 @@ def edge(
         return 0
     n = ranges.shape[0]
     step = 1 if side == 1 else -1
-    index = int(line[LAST]) if side == 1 else int(line[FIRST])
+    last = index = int(line[LAST]) if side == 1 else int(line[FIRST])
     full = n * increment > 2.0 * math.pi - 1.5 * increment
     # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
     end = _meets(line, rays[index])
@@ -168,13 +229,14 @@ def edge(
     spacing = abs(t - end)
     if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
-    s = 0.5 * (t + end)
-    x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
     # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
-    # An end face that shows may be bevelled: its first points still pass for the surface's.
-    along = (
-        (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + (4.0 * limits[SIGMA] ** 2 if faces > 0 else 0.0)
-    )
+    along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2
+    s, variance = _end_before_face(line, step, last, faces, ranges, rays, limits)
+    if variance >= 0.0:
+        along += variance
+    else:  # bevelled, or something else: its first points may have passed for the surface's
+        along += 16.0 * limits[SIGMA] ** 2
+    x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
     direction = math.atan2(step * ay - ny, step * ax - nx)
