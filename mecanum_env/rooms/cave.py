@@ -20,18 +20,24 @@ from slam.settings import require
 __all__ = ["CaveConfig", "cave"]
 
 Array = NDArray[np.float64]
+Field = NDArray[np.float32]  # single precision: a quarter of a million cells, and half a hundred passes over them
 Mask = NDArray[np.bool_]
 
 _ATTEMPTS = 60
 _START_M = 0.5  # clearance of the start, as of every generated plan
 _MARGIN_M = 0.2  # solid around the cave
-_BOX = 2.1  # area of the box that the chambers are placed in, by that of the cave
+_BOX = 1.6  # area of the box that the chambers' centres are placed in, by that of the cave
+_SHARE = 0.55  # of the cave that is chambers, about; the rest is passages
+_AROUND_M = 3.0  # rock around that box …
+_BORDER_M = 1.0  # … of which this much stays
 _BEND = 0.16  # standard deviation of a passage's sideways bend, by its length
 _CORE_M = 0.65  # half the width of a passage that no noise closes
-_BLEND_PER_M = 3.5  # how sharply chambers and passages meet: 1 / radius of the fillet, about
-_DISC_M = 0.58  # rolls through the whole cave: the walls bend around it where they are hollow
-_TIP_M = 0.3  # rolls through the rock: what is thinner than twice that is gone
-_BLUR_CELLS, _SMOOTH_M = 3.0, 0.18  # of the field and along the walls
+_BLEND_PER_M = 5.0  # how sharply chambers and passages meet: 1 / radius of the fillet, about
+_DISC_M = 0.6  # rolls through the whole cave: the walls bend around it where they are hollow
+_ROLLS = 2
+_TIP_M = 0.4  # rolls through the rock: what is thinner than twice that is gone
+_LEAST_ROCK_M2 = 0.5  # a smaller lump of rock in the way is left out: the pillars are for that
+_BLUR_CELLS, _SMOOTH_M = 4.0, 0.25  # of the field and along the walls
 _PILLAR_M = (0.15, 0.4)  # radius
 _PILLAR_GAP_M = 0.95  # between a pillar and everything else
 
@@ -69,13 +75,15 @@ def cave(config: CaveConfig, *, seed: int) -> FloorPlan:
     rng = generator(seed)
     low, high = config.area_m2
     target = float(rng.uniform(low, high))
-    scale = 1.0  # what was asked for by what came out, to come nearer with each attempt
+    scale = 1.0  # of what is asked for, to come nearer with each attempt
     for _ in range(_ATTEMPTS):
         field = _drivable(_draw_rock(config, target * scale, rng))
         if field is None:
             continue
         area = float(np.count_nonzero(field > 0)) * CELL_M**2
-        scale = min(max(scale * target / area, 0.3), 3.0)
+        if not low <= area <= high:
+            scale *= min(max(math.sqrt(target / area), 0.8), 1.25)
+            continue
         walls, size = _walls(field)
         pillars = _pillars(rasterise(walls, size, CELL_M), config, rng)
         free = rasterise(walls, size, CELL_M) & ~_under(pillars, size)
@@ -98,40 +106,40 @@ def cave(config: CaveConfig, *, seed: int) -> FloorPlan:
     raise ValueError(f"no cave of {config.area_m2} m² found; widen area_m2 or make chamber_m smaller")
 
 
-def _draw_rock(config: CaveConfig, area_m2: float, rng: np.random.Generator) -> Array:
+def _draw_rock(config: CaveConfig, area_m2: float, rng: np.random.Generator) -> Field:
     """Return a field ``(rows, cols)`` [m], positive where there is no rock: about as deep as the next wall is far."""
     aspect = float(rng.uniform(0.7, 1.4))
     width, depth = (math.sqrt(_BOX * area_m2 * a) for a in (aspect, 1.0 / aspect))
     mean = 0.5 * sum(config.chamber_m)
-    count = max(2, round(area_m2 / (2.4 * math.pi / 2 * mean**2)))
+    count = max(2, round(_SHARE * area_m2 / (math.pi * mean**2)))
     radii = rng.uniform(*config.chamber_m, count)
-    centres = _spread(count, (width, depth), mean, rng)
-    cols, rows = (round(v / CELL_M) for v in (width, depth))
-    x, y = np.meshgrid((np.arange(cols) + 0.5) * CELL_M, (np.arange(rows) + 0.5) * CELL_M)
-    total = np.full((rows, cols), 1e-9)
-    for (cx, cy), radius in zip(centres, radii, strict=True):
-        turn, stretch = rng.uniform(0.0, math.pi), rng.uniform(1.0, 1.35)
+    centres = _spread(count, (width, depth), rng) + _AROUND_M
+    cols, rows = (math.ceil((v + 2 * _AROUND_M) / CELL_M) for v in (width, depth))
+    x, y = ((np.arange(n, dtype=np.float32) + np.float32(0.5)) * np.float32(CELL_M) for n in (cols, rows))
+    y = y[:, None]
+    total = np.full((rows, cols), 1e-9, np.float32)
+    for (cx, cy), radius in zip(centres.tolist(), radii.tolist(), strict=True):
+        turn, stretch = float(rng.uniform(0.0, math.pi)), float(rng.uniform(1.0, 1.35))
         c, s = math.cos(turn), math.sin(turn)
         u, v = (c * (x - cx) + s * (y - cy)) / stretch, (c * (y - cy) - s * (x - cx)) * stretch
         total += np.exp(_BLEND_PER_M * (radius - np.sqrt(u * u + v * v)))
-    core = np.full((rows, cols), -np.inf)
+    core = np.full((rows, cols), -np.inf, np.float32)
     for a, b in _passages(centres, config.loops, rng):
         distance = _distance_to_line(_bent(centres[a], centres[b], rng), (rows, cols))
-        total += np.exp(_BLEND_PER_M * (0.5 * rng.uniform(*config.passage_m) - distance))
+        total += np.exp(_BLEND_PER_M * (0.5 * float(rng.uniform(*config.passage_m)) - distance))
         core = np.maximum(core, _CORE_M - distance)
     field = np.log(total) / _BLEND_PER_M
-    for spacing_m, height in ((1.7, 0.7), (0.8, 0.45)):
+    for spacing_m, height in ((1.8, 0.8), (0.9, 0.3)):
         field += config.roughness * height * _noise((rows, cols), spacing_m, rng)
-    border = np.minimum(np.minimum(x, width - x), np.minimum(y, depth - y))
-    return np.asarray(np.minimum(np.maximum(field, core), border - 6 * CELL_M))
+    border = np.minimum(np.minimum(x, x[-1] - x), np.minimum(y, y[-1] - y))
+    return np.asarray(np.minimum(np.maximum(field, core), border - _BORDER_M), np.float32)
 
 
-def _spread(count: int, size: tuple[float, float], inset: float, rng: np.random.Generator) -> Array:
+def _spread(count: int, size: tuple[float, float], rng: np.random.Generator) -> Array:
     """Return points ``(count, 2)`` [m] in a box, each the farthest of some random ones from those before."""
-    low, high = np.full(2, inset), np.maximum(np.array(size) - inset, inset + 0.1)
-    points = rng.uniform(low, high)[None]
+    points = rng.uniform(0.0, size)[None]
     for _ in range(count - 1):
-        offers = rng.uniform(low, high, (10, 2))
+        offers = rng.uniform(0.0, size, (10, 2))
         gaps = np.sqrt(((offers[:, None] - points[None]) ** 2).sum(axis=2)).min(axis=1)
         points = np.vstack([points, offers[int(np.argmax(gaps))]])
     return points
@@ -163,31 +171,31 @@ def _bent(a: Array, b: Array, rng: np.random.Generator) -> Array:
     return np.asarray(a + t * along + (sway[0] * np.sin(math.pi * t) + sway[1] * np.sin(2 * math.pi * t)) * aside)
 
 
-def _distance_to_line(points: Array, shape: tuple[int, int]) -> Array:
+def _distance_to_line(points: Array, shape: tuple[int, int]) -> Field:
     """Return each cell's distance [m] ``shape`` to a line through points."""
     canvas = np.ones(shape, np.uint8)
     pixels = np.floor(points / CELL_M).astype(np.int32)
     cv2.polylines(canvas, [pixels[:, None]], False, 0, 1, cv2.LINE_8)
-    return cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64) * CELL_M
+    return np.asarray(cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, np.float32)
 
 
-def _noise(shape: tuple[int, int], spacing_m: float, rng: np.random.Generator) -> Array:
+def _noise(shape: tuple[int, int], spacing_m: float, rng: np.random.Generator) -> Field:
     """Return smooth noise of unit variance at its nodes, which are ``spacing_m`` apart."""
     rows, cols = (math.ceil(n * CELL_M / spacing_m) + 1 for n in shape)
-    nodes = rng.standard_normal((rows, cols))
-    return np.asarray(cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float64)
+    nodes = rng.standard_normal((rows, cols)).astype(np.float32)
+    return np.asarray(cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC), np.float32)
 
 
-def _drivable(field: Array) -> Array | None:
+def _drivable(field: Field) -> Array | None:
     """Return a smooth field for the part of a cave that a disc can roll through, None where it fits nowhere."""
-    free = _rolled(field > 0)
-    if free is None:
-        return None
-    # The same from the other side takes off the rock's tips and thin walls; it may open gaps too narrow again.
-    rock = _distance(~free) > _TIP_M
-    free = _rolled(_distance(~rock) > _TIP_M)
-    if free is None:
-        return None
+    free: Mask | None = field > 0
+    for _ in range(_ROLLS):
+        free = _rolled(free)
+        if free is None:
+            return None
+        # The same from the other side takes off the rock's tips and thin walls; it may open narrow gaps anew.
+        rock = _distance(~free) > _TIP_M
+        free = np.asarray(_distance(~rock) > _TIP_M)
     signed = _distance(free) - _distance(~free)
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BLUR_CELLS), np.float64)
 
@@ -202,15 +210,16 @@ def _rolled(free: Mask) -> Mask | None:
     return np.asarray(_distance(~reach) <= _DISC_M)
 
 
-def _distance(mask: Mask) -> Array:
+def _distance(mask: Mask) -> Field:
     """Return how far [m] each cell of a mask is from the nearest one that is not of it."""
     cells = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(cells, np.float64) * CELL_M
+    return np.asarray(cells * CELL_M, np.float32)
 
 
 def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
     """Return the walls ``(n, 4)`` [m] along which a field is zero, and columns and rows of the raster around them."""
-    loops = [facets(loop) for loop in level_loops(field, CELL_M, smooth_m=_SMOOTH_M)]
+    lines = level_loops(field, CELL_M, smooth_m=_SMOOTH_M)
+    loops = [facets(line) for line in lines if abs(_area(line)) >= _LEAST_ROCK_M2]
     points = np.vstack(loops)
     # By whole cells: the field's lattice becomes the plan's.
     shift = np.floor((points.min(axis=0) - _MARGIN_M) / CELL_M) * CELL_M
@@ -218,6 +227,12 @@ def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
     loops = [np.round(loop - shift, 6) for loop in loops]
     walls = np.vstack([np.hstack([loop, np.roll(loop, -1, axis=0)]) for loop in loops])
     return walls, (int(size[0]), int(size[1]))
+
+
+def _area(line: Array) -> float:
+    """Return the area [m²] within a closed line of points ``(k, 2)``, negative where it runs clockwise."""
+    x, y = line.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _pillars(free: Mask, config: CaveConfig, rng: np.random.Generator) -> Array:

@@ -29,7 +29,7 @@ class MazeConfig:
     rows: tuple[int, int] = (6, 8)
     corridor_m: tuple[float, float] = (1.2, 1.6)  # width, drawn for each column and each row
     wall_m: tuple[float, float] = (0.1, 0.2)  # thickness, one for the maze
-    loops: float = 0.35  # share of the perfect maze's inner walls that are taken out, dead ends first
+    loops: float = 0.15  # share of the perfect maze's inner walls that are taken out
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):
@@ -130,23 +130,16 @@ def _carve(grid: Grid, size: tuple[int, int], rng: np.random.Generator) -> None:
 
 
 def _braid(grid: Grid, loops: float, rng: np.random.Generator) -> None:
-    """Take out a share of the inner walls, those of dead ends first, and leave no post without a wall."""
+    """Take out a share of the inner walls, and leave no post without one."""
     walls = [(0, int(r), int(c)) for r, c in np.argwhere(~grid.east)]
     walls += [(1, int(r), int(c)) for r, c in np.argwhere(~grid.north)]
     rest = round(loops * len(walls))
     order = [walls[int(i)] for i in rng.permutation(len(walls))]
-    for dead_ends_only in (True, False):
-        for side, row, column in order:
-            if rest == 0:
-                return
-            opening = (grid.east, grid.north)[side]
-            if opening[row, column] or _holds_a_post(grid, side, row, column):
-                continue
-            degrees = grid.degrees()
-            other = (row, column + 1) if side == 0 else (row + 1, column)
-            if dead_ends_only and min(degrees[row, column], degrees[other]) > 1:
-                continue
-            opening[row, column] = True
+    for side, row, column in order:
+        if rest == 0:
+            return
+        if not _holds_a_post(grid, side, row, column):
+            (grid.east, grid.north)[side][row, column] = True
             rest -= 1
 
 
