@@ -13,20 +13,20 @@ from numpy.typing import NDArray
 
 from mecanum_env.rooms.outline import trace
 
-__all__ = ["MOST_TURN_DEG", "facets", "level_loops", "rasterise"]
+__all__ = ["MOST_TURN_DEG", "bends_deg", "facets", "level_loops", "rasterise"]
 
 Array = NDArray[np.float64]
 
 MOST_TURN_DEG = 4.8
 """Largest bend [°] from one piece to the next: a plan's list of corners begins at 5°."""
 
-_PIECE_TURN_DEG = 4.3  # turned within a piece; the bend to the next is about the same, and rarely larger
+_PIECE_TURN_DEG = 4.5  # turned along a piece; the bend to the next is about the same, and rarely larger
 _SAGITTA_M = 0.005  # a piece is about this far from its arc at most, well within the lidar's noise
-_STEP_M = 0.02  # points along the line before it is cut into pieces
+_STEP_M = 0.01  # points along the line before it is cut into pieces
 
 
 def level_loops(field: Array, cell_m: float, *, smooth_m: float) -> list[Array]:
-    """Return the closed lines ``(k, 2)`` [m] on which a field ``(rows, cols)`` is zero, 2 cm from point to point.
+    """Return the closed lines ``(k, 2)`` [m] on which a field ``(rows, cols)`` is zero, 1 cm from point to point.
 
     The field is given at the centres of cells whose lattice begins at the origin; it must be negative along the
     border. Where it is positive is on a line's left. Each line is smoothed by a Gaussian of standard deviation
@@ -72,14 +72,14 @@ def _smooth(points: Array, sigma_m: float) -> Array:
 
 
 def facets(points: Array) -> Array:
-    """Return the vertices ``(m, 2)`` of a closed smooth line ``(k, 2)`` [m]: pieces that bend by less than 5°."""
+    """Return vertices ``(m, 2)`` along a closed smooth line ``(k, 2)`` [m] whose pieces bend by less than 5°.
+
+    Where the line itself turns faster than that within 1 cm, so do they.
+    """
     keep = _cut(points)
     while True:
         vertices = points[keep]
-        ahead = np.roll(vertices, -1, axis=0) - vertices
-        heading = np.arctan2(ahead[:, 1], ahead[:, 0])
-        turn = np.abs((heading - np.roll(heading, 1) + math.pi) % (2.0 * math.pi) - math.pi)
-        sharp = np.flatnonzero(turn > math.radians(MOST_TURN_DEG))
+        sharp = np.flatnonzero(bends_deg(vertices) > MOST_TURN_DEG)
         # Split the longer of the two pieces that meet there.
         gaps = np.append(np.diff(keep), keep[0] + len(points) - keep[-1])
         longer = np.where(gaps[sharp] >= gaps[sharp - 1], sharp, sharp - 1)
@@ -88,6 +88,13 @@ def facets(points: Array) -> Array:
         if len(refined) == len(keep):
             return vertices
         keep = refined
+
+
+def bends_deg(vertices: Array) -> Array:
+    """Return by how much a closed line ``(m, 2)`` bends at each vertex ``(m,)`` [°], either way."""
+    ahead = np.roll(vertices, -1, axis=0) - vertices
+    heading = np.degrees(np.arctan2(ahead[:, 1], ahead[:, 0]))
+    return np.asarray(np.abs((heading - np.roll(heading, 1) + 180.0) % 360.0 - 180.0))
 
 
 def _cut(points: Array) -> NDArray[np.int64]:
@@ -101,8 +108,10 @@ def _cut(points: Array) -> NDArray[np.int64]:
         low, high = min(low, heading), max(high, heading)
         # An arc of this length and turn rises by length · turn / 8 above its chord.
         if high - low > most or (high - low) * (i + 1 - keep[-1]) * step > 8.0 * _SAGITTA_M:
-            keep.append(i)
-            low = high = heading
+            # One back: a piece and the next bend by the turn from its first step to the first of the next.
+            cut = max(i - 1, keep[-1] + 1)
+            keep.append(cut)
+            low, high = min(headings[cut], heading), max(headings[cut], heading)
     return np.unique(np.array(keep, np.int64))
 
 
