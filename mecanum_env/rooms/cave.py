@@ -84,34 +84,41 @@ def cave(config: CaveConfig, *, seed: int) -> FloorPlan:
         if not low <= area <= high:
             scale *= min(max(math.sqrt(target / area), 0.8), 1.25)
             continue
-        walls, size = _walls(field)
-        floor = rasterise(walls, size, CELL_M)
-        pillars = _pillars(floor, config, rng)
-        free = floor & ~_under(pillars, size)
-        clearance = clearance_of(free, CELL_M)
-        reach, pocket = unreached(free, clearance, resolution=CELL_M)
-        area = float(np.count_nonzero(free)) * CELL_M**2
-        if pocket is not None or not low <= area <= high or clearance[reach].max() < _START_M + CELL_M:
-            continue
-        plan = FloorPlan(
-            name=f"cave-{seed}",
-            walls=walls,
-            polygons=(),
-            circles=pillars,
-            free=free,
-            resolution=CELL_M,
-            origin=(0.0, 0.0),
-            start=choose_start(clearance, reach, resolution=CELL_M, origin=(0.0, 0.0), rng=rng),
-            start_clearance_m=_START_M,
-        )
-        # Where rock came out very thin, or pieces much shorter than a cell, there may be one after all.
-        if not len(plan.corners):
+        plan = _plan(field, config, seed, rng)
+        if plan is not None:
             return plan
     raise ValueError(f"no cave of {config.area_m2} m² found; widen area_m2 or make chamber_m smaller")
 
 
+def _plan(field: Array, config: CaveConfig, seed: int, rng: np.random.Generator) -> FloorPlan | None:
+    """Return the plan of a smooth field, None where it does not keep to what it must."""
+    walls, size = _walls(field)
+    floor = rasterise(walls, size, CELL_M)
+    pillars = _pillars(floor, config, rng)
+    free = floor & ~_under(pillars, size)
+    clearance = clearance_of(free, CELL_M)
+    reach, pocket = unreached(free, clearance, resolution=CELL_M)
+    area = float(np.count_nonzero(free)) * CELL_M**2
+    low, high = config.area_m2
+    if pocket is not None or not low <= area <= high or clearance[reach].max() < _START_M + CELL_M:
+        return None
+    plan = FloorPlan(
+        name=f"cave-{seed}",
+        walls=walls,
+        polygons=(),
+        circles=pillars,
+        free=free,
+        resolution=CELL_M,
+        origin=(0.0, 0.0),
+        start=choose_start(clearance, reach, resolution=CELL_M, origin=(0.0, 0.0), rng=rng),
+        start_clearance_m=_START_M,
+    )
+    # Where rock came out very thin, or pieces much shorter than a cell, there may be a corner after all.
+    return None if len(plan.corners) else plan
+
+
 def _draw_rock(config: CaveConfig, area_m2: float, rng: np.random.Generator) -> Field:
-    """Return a field ``(rows, cols)`` [m], positive where there is no rock: about as deep as the next wall is far."""
+    """Return a field ``(rows, cols)`` [m]: about how far the next wall is, negative in the rock."""
     aspect = float(rng.uniform(0.7, 1.4))
     width, depth = (math.sqrt(_BOX * area_m2 * a) for a in (aspect, 1.0 / aspect))
     mean = 0.5 * sum(config.chamber_m)
@@ -150,7 +157,7 @@ def _spread(count: int, size: tuple[float, float], rng: np.random.Generator) -> 
 
 
 def _passages(centres: Array, loops: float, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Return which chambers are joined: all of them, by the shortest passages, and some more pairs of neighbours."""
+    """Return which chambers are joined: all, by the shortest passages, and some more neighbours."""
     squared = ((centres[:, None] - centres[None]) ** 2).sum(axis=2)
     pairs = sorted(itertools.combinations(range(len(centres)), 2), key=lambda p: float(squared[p]))
     group = list(range(len(centres)))
@@ -192,13 +199,13 @@ def _noise(shape: tuple[int, int], spacing_m: float, rng: np.random.Generator) -
 
 def _drivable(field: Field) -> Array | None:
     """Return a smooth field for the part of a cave that a disc can roll through, None where it fits nowhere."""
-    free: Mask | None = field > 0
+    free = np.asarray(field > 0, np.bool_)
     for _ in range(_ROLLS):
-        free = _rolled(free)
-        if free is None:
+        rolled = _rolled(free)
+        if rolled is None:
             return None
         # The same from the other side takes off the rock's tips and thin walls; it may open narrow gaps anew.
-        rock = _distance(~free) > _TIP_M
+        rock = _distance(~rolled) > _TIP_M
         free = np.asarray(_distance(~rock) > _TIP_M)
     signed = _distance(free) - _distance(~free)
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BLUR_CELLS), np.float64)
@@ -221,7 +228,7 @@ def _distance(mask: Mask) -> Field:
 
 
 def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
-    """Return the walls ``(n, 4)`` [m] along which a field is zero, and columns and rows of the raster around them."""
+    """Return walls ``(n, 4)`` [m] where a field is zero, and columns and rows of the raster around them."""
     lines = level_loops(field, CELL_M, smooth_m=_SMOOTH_M)
     loops = [facets(line) for line in lines if abs(_area(line)) >= _LEAST_ROCK_M2]
     points = np.vstack(loops)

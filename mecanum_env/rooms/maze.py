@@ -57,7 +57,7 @@ class Grid:
     def loops(self) -> int:
         """Number of independent ways round, where all cells are connected."""
         rows, columns = self.east.shape[0], self.north.shape[1]
-        return self.openings - rows * columns + 1
+        return int(self.openings - rows * columns + 1)
 
     def degrees(self) -> NDArray[np.int64]:
         """Return how many neighbours each cell ``(rows, columns)`` is open to."""
@@ -149,7 +149,9 @@ def _holds_a_post(grid: Grid, side: int, row: int, column: int) -> bool:
     for r, c in posts:
         if not (0 <= r < grid.north.shape[0] and 0 <= c < grid.east.shape[1]):
             continue  # on the outer wall
-        walls = 4 - int(grid.east[r, c]) - int(grid.east[r + 1, c]) - int(grid.north[r, c]) - int(grid.north[r, c + 1])
+        walls = (
+            4 - int(grid.east[r, c]) - int(grid.east[r + 1, c]) - int(grid.north[r, c]) - int(grid.north[r, c + 1])
+        )
         if walls == 1:
             return True
     return False

@@ -1,11 +1,12 @@
 """From a smooth field to smooth walls: its zero line as straight pieces too short to show a corner.
 
-The lidar and the physics know straight surfaces and circles. A curved wall is therefore a chain of pieces, cut where
-its direction has turned by a few degrees: many in a tight bend, few along a gentle one.
+The lidar and the physics know straight surfaces and circles. A curved wall is therefore a chain of pieces, cut
+where its direction has turned by a few degrees: many in a tight bend, few along a gentle one.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -34,7 +35,7 @@ def level_loops(field: Array, cell_m: float, *, smooth_m: float) -> list[Array]:
     """
     corners, first = trace(field > 0)
     loops = []
-    for begin, end in zip(first[:-1], first[1:], strict=True):
+    for begin, end in itertools.pairwise(first.tolist()):
         points = _crossings(field, corners[begin:end]) * cell_m
         loops.append(_smooth(_resample(points), smooth_m))
     return loops
@@ -98,7 +99,7 @@ def bends_deg(vertices: Array) -> Array:
 
 
 def _cut(points: Array) -> NDArray[np.int64]:
-    """Indices at which a closed line is cut so that no piece turns much, nor lies far from its chord."""
+    """Return where to cut a closed line so that no piece turns much, nor lies far from its chord."""
     ahead = np.roll(points, -1, axis=0) - points
     headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])).tolist()
     step = float(np.hypot(*ahead.T).mean())
