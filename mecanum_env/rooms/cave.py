@@ -28,7 +28,7 @@ _START_M = 0.5  # clearance of the start, as of every generated plan
 _MARGIN_M = 0.2  # solid around the cave
 _BOX = 1.6  # area of the box that the chambers' centres are placed in, by that of the cave
 _SHARE = 0.55  # of the cave that is chambers, about; the rest is passages
-_AROUND_M = 3.0  # rock around that box …
+_AROUND_M = 3.0  # rock around that box, more about large chambers …
 _BORDER_M = 1.0  # … of which this much stays
 _BEND = 0.16  # standard deviation of a passage's sideways bend, by its length
 _CORE_M = 0.65  # half the width of a passage that no noise closes
@@ -124,8 +124,9 @@ def _draw_rock(config: CaveConfig, area_m2: float, rng: np.random.Generator) -> 
     mean = 0.5 * sum(config.chamber_m)
     count = max(2, round(_SHARE * area_m2 / (math.pi * mean**2)))
     radii = rng.uniform(*config.chamber_m, count)
-    centres = _spread(count, (width, depth), rng) + _AROUND_M
-    cols, rows = (math.ceil((v + 2 * _AROUND_M) / CELL_M) for v in (width, depth))
+    around = max(_AROUND_M, 1.3 * config.chamber_m[1])
+    centres = _spread(count, (width, depth), rng) + around
+    cols, rows = (math.ceil((v + 2 * around) / CELL_M) for v in (width, depth))
     x, y = ((np.arange(n, dtype=np.float32) + np.float32(0.5)) * np.float32(CELL_M) for n in (cols, rows))
     y = y[:, None]
     total = np.full((rows, cols), 1e-9, np.float32)
