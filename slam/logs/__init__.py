@@ -133,7 +133,7 @@ def _open_scans(path: Path) -> ScanLog:
 def _kind_of(path: Path) -> str | None:
     """Return "carmen", "dpslam" or, where no line at the beginning is either's, ``None``."""
     for number, line in read_lines(path):
-        word = line.partition(" ")[0].strip()
+        word = "".join(line[:20].split(maxsplit=1)[:1])
         if word in _CARMEN_WORDS:
             return "carmen"
         if word in _DPSLAM_WORDS:
