@@ -171,14 +171,15 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
 
     speed = f"{found['wall_s']:.1f} s, {found['realtime_factor']:.0f} times real time"
     scan_rows: list[tuple[str, str]] = []
+    sensed = f"{found['observations']} observations"
     if "scans" in found:
         error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
         local = shown("relations_local_trans_m", "m", 3)
         scan_rows.append(("relations", f"{error}, {local} along the way"))
-        scan_rows.append(("scans", f"{found['scans']}, {shown('ms_per_scan', 'ms each')} in the median"))
+        sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
     rows = (
         ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
-        ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {found['observations']} observations"),
+        ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {sensed}"),
         ("trajectory", f"{shown('ate_rmse_m', 'm')} off, {shown('ate_aligned_m', 'm')} aligned"),
         ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
         ("landmarks", f"{found['landmarks']}, {shown('landmark_rmse_m', 'm')} off"),

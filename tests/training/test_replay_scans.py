@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import tomllib
 from pathlib import Path
 
@@ -104,7 +106,7 @@ def test_a_backends_final_trajectory_is_what_relations_are_of(
 def test_the_summary_speaks_of_scans(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", *argv(logs, "--limit-s", "5", "--out", str(tmp_path))]) == 0
     shown = capsys.readouterr().out
-    assert "relations" in shown and "11, " in shown and "map.png" in shown
+    assert "relations" in shown and "11 scans, " in shown and "map.png" in shown
 
 
 @pytest.mark.parametrize(
@@ -146,3 +148,18 @@ def test_the_first_minutes_of_the_intel_log(tmp_path: Path, capsys: pytest.Captu
     assert found["relations_trans_m"] < 1e-6 and found["dead_reckoning_relations_local_trans_m"] > 0.3
     classes, _, _ = read_map_server(tmp_path / "map.yaml")
     assert np.count_nonzero(classes == 100) > 1000
+
+
+def test_ctrl_c_at_the_first_scan_keeps_it(
+    logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(task.Progress, "__call__", lambda self, time_s: os.kill(os.getpid(), signal.SIGINT))
+    assert main(["replay", *argv(logs, "--out", str(tmp_path), "--json")]) == 130
+    found = json.loads(capsys.readouterr().out)
+    assert found["interrupted"] and found["scans"] == 1 and (tmp_path / "map.png").exists()
+
+
+def test_a_log_cut_to_one_scan(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = replayed(argv(logs, "--limit-s", "0.1", "--out", str(tmp_path)), capsys)
+    assert found["scans"] == 1 and found["samples"] == 1 and found["relations_count"] == 0
+    assert found["relations_trans_m"] is None
