@@ -57,16 +57,17 @@ class Workspace:
     ----------
     f, eta, x
         Spectra of F ``(K, n, n)``, η ``(K, n, n)`` and x̂ ``(K, n)``, K = order + 2: one discrete more than is used
-        tells of the error. ``eta[0]`` and ``x[0]`` are the values now.
+        tells of the error. ``eta[0]`` and ``x[0]`` are the values now. ``(K, 0)`` without an ``estimate``: then the
+        covariance alone is solved for.
     z
         ``(2,)``: the measurement now, and its change over what is left of the step.
     """
 
-    def __init__(self, n: int, order: int, dtype: type = np.float64) -> None:
+    def __init__(self, n: int, order: int, *, dtype: type = np.float64, estimate: bool = True) -> None:
         count, half, entries = order + 2, order // 2, n * (n + 1) // 2 + n
         self.f = np.zeros((count, n, n), dtype)
         self.eta = np.zeros((count, n, n), dtype)
-        self.x = np.zeros((count, n), dtype)
+        self.x = np.zeros((count, n if estimate else 0), dtype)
         self.z = np.zeros(2, dtype)
         self.column = np.zeros(count, dtype)
         self.system = np.zeros((half, half + 1), dtype)
@@ -94,12 +95,14 @@ def riccati(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> N
                 total = -(seen * inverse_r)
                 if k == 0 and noise[i, j] != 0.0:
                     total += noise[i, j]
+                moved = 0.0
                 for m in range(k + 1):
                     for a in range(n):
                         if f[m, i, a] != 0.0:
-                            total += f[m, i, a] * eta[k - m, a, j]
-                        if f[m, j, a] != 0.0:
-                            total += f[m, j, a] * eta[k - m, i, a]
+                            moved += f[m, i, a] * eta[k - m, a, j]
+                        if i != j and f[m, j, a] != 0.0:
+                            moved += f[m, j, a] * eta[k - m, i, a]
+                total += 2.0 * moved if i == j else moved
                 eta[k + 1, i, j] = share * total
                 eta[k + 1, j, i] = eta[k + 1, i, j]
 
@@ -209,7 +212,7 @@ def step_share(
     is_fraction: NDArray[np.bool_],
 ) -> float:  # fmt: skip
     """Return the share of h that every entry of η and x̂ allows; note which to recover by a fraction."""
-    n = x.shape[1]
+    n = eta.shape[1]
     share, entry = 1.0, 0
     for i in range(n):
         for j in range(i, n):
@@ -218,7 +221,7 @@ def step_share(
             is_fraction[entry] = own < 0.0
             share = min(share, abs(own))
             entry += 1
-    for i in range(n):
+    for i in range(x.shape[1]):
         scale = abs(x[0, i]) + (abs(eta[0, i, i]) + absolute / relative) ** 0.5
         own = _allowed_share(x[:, i], relative * scale, scale, try_pade, system, below[entry])
         is_fraction[entry] = own < 0.0
@@ -236,7 +239,7 @@ def expand(
 
     The values at its end are then ``eta[0]`` and ``x[0]``, and ``z`` is what is left of the measurement's change.
     """
-    n = x.shape[1]
+    n = eta.shape[1]
     riccati(f, noise, inverse_r, h, eta)
     discretes(f, inverse_r, h, eta, z, x)
     share = step_share(eta, x, z, relative, absolute, try_pade, system, below, is_fraction)
@@ -248,7 +251,7 @@ def expand(
             eta[0, i, j] = recover(eta[:, i, j], below[entry], is_fraction[entry], share)
             eta[0, j, i] = eta[0, i, j]
             entry += 1
-    for i in range(n):
+    for i in range(x.shape[1]):
         x[0, i] = recover(x[:, i], below[entry], is_fraction[entry], share)
         entry += 1
     z[0] += z[1] * share
