@@ -2,7 +2,7 @@
 
 The spectrum of x about t₀ with scale h is X(k) = hᵏ/k! x⁽ᵏ⁾(t₀), an array ``(order + 1,)`` in the units of x; the
 original is x(t₀ + θ h) = Σ X(k) θᵏ, or a Padé fraction that agrees with it (theory.md C, differential transform).
-The filter that these serve is in :mod:`slam.transform_filter`. Equations: ``docs/differential_transform.md``.
+The filter that these serve is in :mod:`slam.riccati`. Equations: ``docs/differential_transform.md``.
 """
 
 from __future__ import annotations
@@ -77,12 +77,12 @@ def derivative(x: Array, h: float) -> Array:
 
 
 def integral(x: Array, h: float, start: float = 0.0) -> Array:
-    """Return the spectrum ``(order + 2,)`` of ``start`` plus the integral of x from t₀; undone by :func:`derivative`."""
+    """Return the spectrum ``(order + 2,)`` of ``start`` plus x's integral; :func:`derivative` undoes it."""
     return np.concatenate([[start], h * x / np.arange(1, len(x) + 1)])
 
 
 def product(x: Array, y: Array) -> Array:
-    """Return the spectrum ``(order + 1,)`` of x y: the convolution Σ X(l) Y(k - l), up to the shorter one's order."""
+    """Return the spectrum of x y: the convolution Σ X(l) Y(k - l), up to the shorter one's order."""
     order = min(len(x), len(y))
     return np.asarray(np.convolve(x, y)[:order])
 
@@ -99,12 +99,15 @@ def quotient(x: Array, y: Array) -> Array:
 
 def rescale(x: Array, ratio: float) -> Array:
     """Return the spectrum of the same function for the scale ``ratio`` · h: X(k) ratioᵏ."""
-    return np.asarray(x * ratio ** np.arange(len(x)))
+    return np.asarray(x * np.power(float(ratio), np.arange(len(x))))
 
 
 def evaluate(x: Array, share: ArrayLike) -> Array:
     """Return x(t₀ + θ h) of θ = ``share`` (any shape) by the series."""
-    return np.asarray(np.polynomial.polynomial.polyval(share, x))
+    theta, out = np.asarray(share, np.float64), np.zeros(np.shape(share))
+    for value in x[::-1].tolist():
+        out = out * theta + value
+    return out
 
 
 def pade(x: Array) -> tuple[Array, Array] | None:
@@ -135,7 +138,10 @@ def _fill_power(out: Array, exponent: float, t0: float, h: float) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_model(powers: Array, matrices: Array, t0: float, h: float, column: Array, f: Array) -> None:
-    """Write the spectra ``f`` ``(K, n, n)`` of F(t) = Σ ``matrices[j]`` t^``powers[j]``; ``column`` ``(K,)`` is room."""
+    """Write the spectra ``f`` ``(K, n, n)`` of F(t) = Σ ``matrices[j]`` t^``powers[j]``.
+
+    ``column`` ``(K,)`` is room.
+    """
     f[:] = 0.0
     n = f.shape[1]
     for j in range(powers.shape[0]):
@@ -233,7 +239,10 @@ class PowerModel(Model):
         self.powers: Array = np.array(powers, np.float64)
         self.matrices: Array = np.array(matrices, np.float64)
         n = self.size
-        require(self.matrices.shape == (len(self.powers), n, n), f"{name} takes matrices ({len(self.powers)}, {n}, {n})")
+        require(
+            self.matrices.shape == (len(self.powers), n, n),
+            f"{name} takes matrices ({len(self.powers)}, {n}, {n})",
+        )
         self.needs_positive_time = bool(np.any((self.powers < 0) | (self.powers % 1.0 != 0)))
 
     def spectrum(self, t0: float, h: float, order: int) -> Array:
@@ -254,7 +263,7 @@ class SpectrumModel(Model):
         return np.asarray(self._of(t0, h, order), np.float64)
 
 
-_POSITION_RATE = [[0.0, 1.0], [0.0, 0.0]]
+_POSITION_RATE = np.array([[0.0, 1.0], [0.0, 0.0]])
 
 MODELS: dict[str, PowerModel] = {
     model.name: model
@@ -262,12 +271,12 @@ MODELS: dict[str, PowerModel] = {
         # ẍ = (2/t) ẋ - (2/t²) x, solved by t and t²: uniform acceleration from the origin at t = 0.
         PowerModel(
             "uniform_acceleration", powers=[0, -1, -2], drive=[0.0, 1.0],
-            matrices=[_POSITION_RATE, [[0, 0], [0, 2]], [[0, 0], [-2, 0]]],
+            matrices=np.array([_POSITION_RATE, [[0, 0], [0, 2]], [[0, 0], [-2, 0]]]),
         ),
         # As the paper prints it: ẍ = (2/t²) x - (2/t) ẋ, solved by t and t⁻².
         PowerModel(
             "as_printed", powers=[0, -1, -2], drive=[0.0, 1.0],
-            matrices=[_POSITION_RATE, [[0, 0], [0, -2]], [[0, 0], [2, 0]]],
+            matrices=np.array([_POSITION_RATE, [[0, 0], [0, -2]], [[0, 0], [2, 0]]]),
         ),
         PowerModel("constant_velocity", powers=[0], drive=[0.0, 1.0], matrices=[_POSITION_RATE]),
         PowerModel(
@@ -276,7 +285,7 @@ MODELS: dict[str, PowerModel] = {
         ),
     )
 }  # fmt: skip
-"""The named models. Process noise enters the velocity [m²/s³], in ``wiener_acceleration`` the acceleration [m²/s⁵]."""
+"""The named models. Process noise drives the velocity [m²/s³], of ``wiener_acceleration`` the acceleration."""
 
 
 def make_model(name: str) -> PowerModel:

@@ -1,7 +1,7 @@
 """Paper C on board: the odometry of the simulated robot while it accelerates, with and without the filter.
 
-Q is chosen on drives of the training seeds; what is reported comes from drives of test seeds. A filter hides from the
-backend that its errors are correlated, so the EKF's NEES in rooms is told, too.
+Q is chosen on drives of the training seeds; what is reported comes from drives of test seeds. A filter hides from
+the backend that its errors are correlated, so the EKF's NEES in rooms is told, too.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def filtered(driven: Drives, config: OdometryFilterConfig) -> Array:
 
 
 def accelerating(driven: Drives) -> list[tuple[int, int, int]]:
-    """Return the stretches in which the robot truly accelerates: episode, first step, and the step after the last."""
+    """Return the stretches in which the robot truly accelerates: episode, first step, the step after the last."""
     lever = ROBOT_PRESETS["youbot"].lever_m
     change = np.diff(driven.true * np.array([1.0, 1.0, lever]), axis=1) / driven.dt
     fast = np.linalg.norm(change, axis=2) > FASTER_M_S2
@@ -75,8 +75,8 @@ def accelerating(driven: Drives) -> list[tuple[int, int, int]]:
 def errors(driven: Drives, twists: Array, stretches: Sequence[tuple[int, int, int]]) -> Row:
     """Return what is wrong with twists ``(episodes, steps, 3)``: RMS over the stretches, and over whole drives.
 
-    Velocity and turn rate are the single steps' in the stretches; positions are dead-reckoned from the true pose at
-    the start of a stretch, or of a drive, and compared at its end.
+    Velocity and turn rate are the single steps' in the stretches; positions are dead-reckoned from the true pose
+    at the start of a stretch, or of a drive, and compared at its end.
     """
     wrong = np.concatenate([twists[e, a:b] - driven.true[e, a:b] for e, a, b in stretches])
     ends = [_drift(twists[e, a:b], driven.true[e, a:b], driven.dt) for e, a, b in stretches]
@@ -145,11 +145,11 @@ def step_time_us(driven: Drives, config: OdometryFilterConfig) -> float:
     return 1e6 * float(np.median(times))
 
 
-# ---- in rooms, with a backend that believes what it is given -----------------------------------------------------
+# ---- in rooms, with a backend that believes what it is given ---------------------------------------------------
 
 
 def explore(*, seed: int, episodes: int, steps: int, workers: int, noises: Sequence[str] = NOISES) -> list[Row]:
-    """Let the EKF explore apartments with and without the filter; return its NEES and errors, per noise and filter."""
+    """Let the EKF explore apartments with and without the filter; return NEES and errors per noise and filter."""
     names = ("none", "differential-transform")
     jobs = [(noise, name, s, steps) for s in range(seed, seed + episodes) for noise in noises for name in names]
     results: dict[Job, Row] = {}

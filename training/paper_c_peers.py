@@ -1,9 +1,9 @@
 """What paper C's recurrence is held against: other ways to solve the Riccati equation, and numbers that count.
 
-Dormand and Prince's RK45; Van Loan's matrix exponential with the discrete filter's update; and the exponential of the
-Hamiltonian matrix (Davison and Maki), which solves the Riccati equation itself while F stays as it is. All compiled,
-as the recurrence is, so that times compare; run as plain Python on :class:`Counted` numbers they tell how many
-operations they took.
+Dormand and Prince's RK45; Van Loan's matrix exponential with the discrete filter's update; the exponential of the
+Hamiltonian matrix (Davison and Maki), which solves the Riccati equation itself while F stays as it is. All are
+compiled, as the recurrence is, so that times compare; run as plain Python on :class:`Counted` numbers they tell how
+many operations they took.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def rk45(
 ) -> int:  # fmt: skip
     """Solve from ``t`` to ``t + span`` [s], ``p`` ``(n, n)`` in place; return the number of steps tried.
 
-    ``step`` ``(1,)`` is the step to try [s], kept from call to call; ``work`` ``(9, n, n)`` is room. The error of a
-    step may be as large as that of an expansion (:class:`slam.transform_filter.Tolerances`).
+    ``step`` ``(1,)`` is the step to try [s], kept from call to call; ``work`` ``(9, n, n)`` is room. The error of
+    a step may be as large as that of an expansion (:class:`slam.riccati.Tolerances`).
     """
     n, now, end, tried = p.shape[0], t, t + span, 0
     f, trial = work[7], work[8]
@@ -110,7 +110,9 @@ def rk45(
             work[0] = work[6]
             now = end if is_last else now + h
         factor = 0.9 * worst**-0.2 if worst > 0.0 else 5.0
-        if worst > 1.0 or not is_last or factor < 1.0:  # a last step is as short as it has to be, which tells nothing
+        if (
+            worst > 1.0 or not is_last or factor < 1.0
+        ):  # a last step is as short as it has to be, which tells nothing
             step[0] = h * min(max(factor, 0.2), 5.0)
     return tried
 
@@ -263,8 +265,8 @@ def _divide(above: Array, under: Array, out: Array) -> None:
 class Counted:
     """A number that counts what is done with it: products, sums (differences, too), quotients, powers.
 
-    Comparisons, signs and copies cost nothing here, as multiplications by zeros that are known beforehand do not take
-    place. The counts are of the class: ``Counted.done``.
+    Comparisons, signs and copies cost nothing here, and multiplications by zeros that are known beforehand do not
+    take place. The counts are of the class: ``Counted.done``.
     """
 
     __array_ufunc__ = None  # NumPy's own numbers leave it to us

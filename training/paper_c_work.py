@@ -1,4 +1,4 @@
-"""What paper C's filter costs: operations and time against how exactly the covariance comes out, method by method."""
+"""What paper C's filter costs: operations and time against how exact the covariance is, method by method."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from slam.differential_transform import Model, PowerModel
-from slam.transform_filter import Tolerances, Workspace, advance
+from slam.riccati import Tolerances, Workspace, advance
 from training.paper_c_peers import Counted, as_python, hamiltonian, rk45, van_loan
 
 __all__ = ["METHODS", "Run", "cheapest", "measure", "reference", "relative_deviation", "solve"]
@@ -23,15 +23,15 @@ Go = Callable[[Any, Any], int]
 
 METHODS: dict[str, Sequence[float]] = {
     "Padé [3/3]": tuple(10.0**-k for k in range(3, 12)),
-    "series, order 6": tuple(10.0**-k for k in range(3, 12)),
+    "series, 6": tuple(10.0**-k for k in range(3, 12)),
     "Padé [6/6]": tuple(10.0**-k for k in range(3, 12)),
     "RK45": tuple(10.0**-k for k in range(3, 12)),
-    "Hamiltonian exponential": (20, 40, 100, 200, 400, 1000, 2000, 4000),
+    "Hamiltonian": (20, 40, 100, 200, 400, 1000, 2000, 4000),
     "Van Loan": (20, 40, 100, 200, 400, 1000, 2000, 4000),
 }
 """Each method's settings: the error allowed in a step, or the number of equal steps."""
 
-_TRANSFORMS = {"Padé [3/3]": (6, "pade"), "series, order 6": (6, "series"), "Padé [6/6]": (12, "pade")}
+_TRANSFORMS = {"Padé [3/3]": (6, "pade"), "series, 6": (6, "series"), "Padé [6/6]": (12, "pade")}
 _CHECKPOINTS = 20  # at which a run is held against the stiff solver
 _COUNTED_STEPS = 100  # equal steps all cost the same: so many are counted, and scaled
 _ABSOLUTE = 1e-6  # of the relative tolerance [m², …]
@@ -218,7 +218,7 @@ def measure(run: Run, *, repeats: int) -> list[dict[str, Any]]:
 
 
 def cheapest(rows: Sequence[dict[str, Any]], goal: float) -> dict[str, dict[str, Any] | None]:
-    """Return of each method the run with the fewest operations that deviates by no more than ``goal``; None: none."""
+    """Return of each method the run of fewest operations that deviates by no more than ``goal``, or None."""
     out: dict[str, dict[str, Any] | None] = {}
     for method in METHODS:
         good = [row for row in rows if row["method"] == method and row["deviation"] <= goal]

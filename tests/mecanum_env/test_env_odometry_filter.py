@@ -1,4 +1,4 @@
-"""``odometry_filter=`` of the environments: off by default and then without effect, checked as every other part."""
+"""``odometry_filter=`` of the environments: off by default and then without effect, checked like every part."""
 
 from __future__ import annotations
 
