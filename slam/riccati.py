@@ -154,7 +154,7 @@ def _allowed_share(c: Array, allowed: float, scale: float, try_pade: bool, syste
     if inverse == 0.0:
         return 1.0
     radius = 1.0 / inverse
-    by_series = min(radius * (allowed / scale) ** (1.0 / (count - 1)), _RADIUS_SHARE * radius)
+    by_series: float = min(radius * (allowed / scale) ** (1.0 / (count - 1)), _RADIUS_SHARE * radius)
     if by_series >= 1.0 or not try_pade:
         return min(by_series, 1.0)
     # Fitted for the scale radius · h, in which the discretes are of one size, so that a pivot tells something.
@@ -211,7 +211,7 @@ def recover(c: Array, below: Array, is_fraction: bool, share: float) -> float:
     for j in range(m):
         above += below[j] * c[m - 1 - j]
     for i in range(m - 1, -1, -1):
-        term = c[i]
+        term: float = c[i]
         for j in range(i):
             term += below[j] * c[i - 1 - j]
         above = above * share + term

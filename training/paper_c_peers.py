@@ -2,8 +2,8 @@
 
 Dormand and Prince's RK45; Van Loan's matrix exponential with the discrete filter's update; the exponential of the
 Hamiltonian matrix (Davison and Maki), which solves the Riccati equation itself while F stays as it is. All are
-compiled, as the recurrence is, so that times compare; run as plain Python on :class:`Counted` numbers they tell how
-many operations they took.
+compiled, as the recurrence is, so that times compare; run as plain Python on :class:`Counted` numbers they tell
+how many operations they took.
 """
 
 from __future__ import annotations
