@@ -205,7 +205,7 @@ def recover(c: Array, below: Array, is_fraction: bool, share: float) -> float:
         for k in range(c.shape[0] - 3, -1, -1):
             value = value * share + c[k]
         return value
-    m = below.shape[0]
+    m: int = below.shape[0]
     above: float = c[m]
     under: float = below[m - 1]
     for j in range(m):

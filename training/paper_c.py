@@ -47,6 +47,9 @@ _GOAL = 1e-6
 _WORK_MODELS = ("uniform_acceleration", "constant_velocity")
 _PANEL = (1000, 330)
 
+ODOMETRY_MODELS = tuple(MODELS)
+"""Those tried on board."""
+
 
 # ---- Fig. 2 ----------------------------------------------------------------------------------------------------
 
@@ -201,7 +204,7 @@ def _work(repeats: int) -> tuple[dict[str, Any], Image]:
 
 def _odometry(episodes: int, explorations: int, steps: int, workers: int) -> tuple[dict[str, Any], Image]:
     training = {n: odometry.drives(n, seed=odometry.TRAINING_SEED, episodes=episodes) for n in odometry.NOISES}
-    scanned = odometry.scan_process(training)
+    scanned = odometry.scan_process(training, models=ODOMETRY_MODELS)
     config = OdometryFilterConfig()
     result: dict[str, Any] = {
         "training": {"first_seed": odometry.TRAINING_SEED, "episodes": episodes, "rows": scanned},
@@ -234,7 +237,7 @@ def _odometry_chart(rows: list[dict[str, Any]]) -> Image:
         own = [row for row in rows if row["noise"] == noise]
         raw = next(row for row in own if row["model"] is None)["velocity_rms_mm_s"]
         lines = []
-        for model in MODELS:
+        for model in ODOMETRY_MODELS:
             curve = [(r["process"], r["velocity_rms_mm_s"] / raw) for r in own if r["model"] == model]
             x, y = np.array(curve).T
             lines.append(Line(model, x, y, dots=True))
