@@ -164,6 +164,7 @@ def explore(*, seed: int, episodes: int, steps: int, workers: int, noises: Seque
                 "anees_median": float(np.median([row["anees"] for row in group])),
                 "ate_rmse_m": float(np.mean([row["ate_rmse_m"] for row in group])),
                 "final_position_error_m": float(np.mean([row["final_position_error_m"] for row in group])),
+                "anees_of_seeds": [row["anees"] for row in group],
             })  # fmt: skip
     return rows
 
