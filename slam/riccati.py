@@ -221,7 +221,7 @@ def recover(c: Array, below: Array, is_fraction: bool, share: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def step_share(
-    eta: Array, x: Array, z: Array, relative: float, absolute: float, try_pade: bool, system: Array, below: Array,
+    eta: Array, x: Array, relative: float, absolute: float, try_pade: bool, system: Array, below: Array,
     is_fraction: NDArray[np.bool_],
 ) -> float:  # fmt: skip
     """Return the share of h that every entry of η and x̂ allows; note which to recover by a fraction."""
@@ -255,7 +255,7 @@ def expand(
     n = eta.shape[1]
     riccati(f, noise, inverse_r, h, eta)
     discretes(f, inverse_r, h, eta, z, x)
-    share = step_share(eta, x, z, relative, absolute, try_pade, system, below, is_fraction)
+    share = step_share(eta, x, relative, absolute, try_pade, system, below, is_fraction)
     if share < 1.0:
         share = min(share * _SAFETY, 1.0)
     entry = 0

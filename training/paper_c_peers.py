@@ -69,6 +69,35 @@ def _slope(f: Array, noise: Array, inverse_r: float, p: Array, out: Array) -> No
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _try_step(
+    powers: Array, matrices: Array, noise: Array, inverse_r: float, now: float, h: float, p: Array,
+    relative: float, absolute: float, work: Array,
+) -> float:  # fmt: skip
+    """Write the covariance a step of ``h`` [s] later to ``work[8]``; return its error over what is allowed."""
+    n, f, trial = p.shape[0], work[7], work[8]
+    for s in range(1, 7):
+        for i in range(n):
+            for j in range(i, n):
+                total = _STAGES[s][0] * work[0, i, j]
+                for r in range(1, s):
+                    if _STAGES[s][r] != 0.0:
+                        total += _STAGES[s][r] * work[r, i, j]
+                trial[i, j] = p[i, j] + h * total
+                trial[j, i] = trial[i, j]
+        _fill_matrix(powers, matrices, now + _NODES[s] * h, f)
+        _slope(f, noise, inverse_r, trial, work[s])
+    worst = 0.0
+    for i in range(n):
+        for j in range(i, n):
+            total = _ERROR[0] * work[0, i, j]
+            for r in range(2, 7):
+                total += _ERROR[r] * work[r, i, j]
+            allowed = relative * abs(trial[i, i] * trial[j, j]) ** 0.5 + absolute
+            worst = max(worst, abs(h * total) / allowed)
+    return worst
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def rk45(
     powers: Array, matrices: Array, noise: Array, inverse_r: float, t: float, span: float, p: Array,
     relative: float, absolute: float, step: Array, work: Array,
@@ -78,41 +107,21 @@ def rk45(
     ``step`` ``(1,)`` is the step to try [s], kept from call to call; ``work`` ``(9, n, n)`` is room. The error of
     a step may be as large as that of an expansion (:class:`slam.riccati.Tolerances`).
     """
-    n, now, end, tried = p.shape[0], t, t + span, 0
-    f, trial = work[7], work[8]
-    _fill_matrix(powers, matrices, now, f)
-    _slope(f, noise, inverse_r, p, work[0])
+    now, end, tried = t, t + span, 0
+    _fill_matrix(powers, matrices, now, work[7])
+    _slope(work[7], noise, inverse_r, p, work[0])
     while now < end:
         tried += 1
         h = min(step[0], end - now)
         is_last = step[0] >= end - now
-        for s in range(1, 7):
-            for i in range(n):
-                for j in range(i, n):
-                    total = _STAGES[s][0] * work[0, i, j]
-                    for r in range(1, s):
-                        if _STAGES[s][r] != 0.0:
-                            total += _STAGES[s][r] * work[r, i, j]
-                    trial[i, j] = p[i, j] + h * total
-                    trial[j, i] = trial[i, j]
-            _fill_matrix(powers, matrices, now + _NODES[s] * h, f)
-            _slope(f, noise, inverse_r, trial, work[s])
-        worst = 0.0
-        for i in range(n):
-            for j in range(i, n):
-                total = _ERROR[0] * work[0, i, j]
-                for r in range(2, 7):
-                    total += _ERROR[r] * work[r, i, j]
-                allowed = relative * abs(trial[i, i] * trial[j, j]) ** 0.5 + absolute
-                worst = max(worst, abs(h * total) / allowed)
+        worst = _try_step(powers, matrices, noise, inverse_r, now, h, p, relative, absolute, work)
         if worst <= 1.0:
-            p[:] = trial
+            p[:] = work[8]
             work[0] = work[6]
             now = end if is_last else now + h
         factor = 0.9 * worst**-0.2 if worst > 0.0 else 5.0
-        if (
-            worst > 1.0 or not is_last or factor < 1.0
-        ):  # a last step is as short as it has to be, which tells nothing
+        # A last step is as short as it has to be, which tells nothing of the next one.
+        if worst > 1.0 or not is_last or factor < 1.0:
             step[0] = h * min(max(factor, 0.2), 5.0)
     return tried
 
