@@ -178,6 +178,8 @@ class EnvConfig:
     rooms_config: Mapping[str, Any] = field(default_factory=dict)
     slam: str = "invariant-ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
+    odometry_filter: str = "none"  # between the wheels and the backend (slam.odometry_filter)
+    odometry_filter_config: Mapping[str, Any] = field(default_factory=dict)
     robot: RobotConfig = field(default_factory=RobotConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -198,8 +200,8 @@ class EnvConfig:
         require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
         require(self.time_limit_s > 0, "EnvConfig.time_limit_s must be > 0")
         require(self.max_landmarks_observed >= 1, "EnvConfig.max_landmarks_observed must be at least 1")
-        tables = isinstance(self.rooms_config, Mapping) and isinstance(self.slam_config, Mapping)
-        require(tables, "EnvConfig.rooms_config and slam_config must be tables of settings")
+        for name in ("rooms_config", "slam_config", "odometry_filter_config"):
+            require(isinstance(getattr(self, name), Mapping), f"EnvConfig.{name} must be a table of settings")
 
 
 # Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and

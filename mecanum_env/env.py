@@ -39,11 +39,12 @@ from mecanum_env.reward import StepOutcome, reward_terms
 from mecanum_env.robot import WheelTargets
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
-from mecanum_env.sensors import Lidar, WheelEncoders
+from mecanum_env.sensors import FilteredEncoders, Lidar, WheelEncoders
 from mecanum_env.world import World
 from slam.backend import Backend
 from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
+from slam.odometry_filter import make_odometry_filter
 from slam.settings import from_mapping, unknown_name
 from slam.types import Belief, Odometry, Scan
 
@@ -85,10 +86,11 @@ def make_config(
     noise: Settings | NoiseConfig | None = None,
     reward: Mapping[str, Any] | RewardConfig | None = None,
     floor_plan: str | Path | None = None,
+    odometry_filter: Settings | None = None,
 ) -> EnvConfig:
     """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
 
-    A string names a preset, generator or backend; a mapping configures it (``{"preset": "youbot", …}``,
+    A string names a preset, generator, backend or filter; a mapping configures it (``{"preset": "youbot", …}``,
     ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
     Unknown names and keys raise ``ValueError`` that lists the valid ones.
     """
@@ -98,7 +100,7 @@ def make_config(
         given_parts = config if isinstance(config, Mapping) else {}
         lidar = robot if lidar is None and "lidar" not in given_parts else lidar
         noise = robot if noise is None and "noise" not in given_parts else noise
-    for name, given in (("rooms", rooms), ("slam", slam)):
+    for name, given in (("rooms", rooms), ("slam", slam), ("odometry_filter", odometry_filter)):
         if isinstance(given, Mapping):
             options = dict(given)
             changes[name] = str(options.pop("name", getattr(base, name)))
@@ -120,6 +122,7 @@ def make_config(
     made = dataclasses.replace(base, **changes)
     check_rooms(made.rooms, made.rooms_config)
     _check_backend(made)
+    make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
     return made
 
 
@@ -134,7 +137,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ----------
     action : str
         ``"twist"``: body twist as fractions of the limits; ``"wheels"``: wheel speeds FL, FR, RL, RR.
-    config, rooms, slam, robot, lidar, noise, reward, floor_plan
+    config, rooms, slam, robot, lidar, noise, reward, floor_plan, odometry_filter
         See :func:`make_config`.
     render_mode : str, optional
         ``"rgb_array"``: truth beside belief.
@@ -164,6 +167,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         noise: Settings | NoiseConfig | None = None,
         reward: Mapping[str, Any] | RewardConfig | None = None,
         floor_plan: str | Path | FloorPlan | None = None,
+        odometry_filter: Settings | None = None,
     ) -> None:
         if action not in ACTIONS:
             raise unknown_name("action", action, ACTIONS)
@@ -172,7 +176,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(
             config=config, rooms=rooms, slam=slam, robot=robot, lidar=lidar, noise=noise, reward=reward,
-            floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan,
+            floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, odometry_filter=odometry_filter,
         )  # fmt: skip
         self.render_mode = render_mode
         targets = WheelTargets(self.config.robot)
@@ -182,6 +186,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.backend = make_backend(self.config)
         self._knows_truth = isinstance(self.backend, TruthSlam)
         self.lidar = Lidar(self.config.lidar, self.config.noise)
+        self._filter = make_odometry_filter(self.config.odometry_filter, self.config.odometry_filter_config)
         self._ready = False
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
@@ -204,6 +209,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
         config = self.config
         self._encoders = WheelEncoders(config.robot, config.noise, world_rng)
+        self._odometer = FilteredEncoders(self._encoders, self._filter) if self._filter else self._encoders
         world = World(
             plan, config.robot, config.noise, world_rng,
             true_radii=self._encoders.true_radii, true_lever=self._encoders.true_lever,
@@ -237,7 +243,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         world, ground, plan = truth.world, truth.ground, truth.ground.plan
         collisions = world.collisions
         world.step(self._wheel_targets(action), config.step_s, config.physics_step_s)
-        odometry = self._encoders.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
+        odometry = self._odometer.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
         world_pose = world.pose
         scan = self.lidar.scan(plan.segments, plan.circles, world_pose, self._sensor_rng)
         self._odometry, self.scan, truth.scan = odometry, scan, scan
@@ -278,7 +284,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def odometry(self) -> Odometry:
-        """The wheels' account of the last step."""
+        """The wheels' account of the last step, as the backend was given it."""
         return self._odometry
 
     def episode_metrics(self) -> dict[str, float | int | None]:

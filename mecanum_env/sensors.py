@@ -16,9 +16,10 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.robot import GRAVITY_M_S2, forward_matrix
+from slam.odometry_filter import OdometryFilter
 from slam.types import Odometry, Scan
 
-__all__ = ["Lidar", "WheelEncoders"]
+__all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
 
 Array = NDArray[np.float64]
 
@@ -214,6 +215,18 @@ class WheelEncoders:
                 self._last, twist,
             )  # fmt: skip
         return Odometry(twist, dt)
+
+
+class FilteredEncoders:
+    """Wheel encoders with a filter behind them, reset when this is built: once an episode."""
+
+    def __init__(self, encoders: WheelEncoders, behind: OdometryFilter) -> None:
+        self._encoders, self._filter = encoders, behind
+        behind.reset()
+
+    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
+        """Return the filtered twist; see :meth:`WheelEncoders.odometry`."""
+        return self._filter.filter(self._encoders.odometry(wheel_increments, dt, rng))
 
 
 @njit(cache=True, nogil=True)

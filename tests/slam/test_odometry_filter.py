@@ -1,0 +1,80 @@
+"""The filter between wheels and backend: what it must not change, and what it does."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from slam.differential_transform import MODELS
+from slam.motion import move
+from slam.odometry_filter import OdometryFilter, OdometryFilterConfig, make_odometry_filter
+from slam.types import Odometry
+
+DT = 0.1
+
+
+def run(behind: OdometryFilter, twists: np.ndarray) -> np.ndarray:
+    return np.array([behind.filter(Odometry(twist, DT)).twist for twist in twists])
+
+
+def reckon(twists: np.ndarray) -> np.ndarray:
+    pose = np.zeros(3)
+    for twist in twists:
+        pose = move(pose, twist, DT)
+    return pose
+
+
+def swing(steps: int = 80) -> np.ndarray:
+    k = np.arange(steps)
+    return np.column_stack([0.5 * np.sin(k / 20), 0.2 * np.sin(k / 15), 0.8 * np.sin(k / 25)])
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_held_back_is_given_once_the_robot_rests(model: str) -> None:
+    twists = np.vstack([swing(), np.zeros((1, 3))])
+    out = run(OdometryFilter(OdometryFilterConfig(model=model)), twists)
+    assert np.max(np.abs(out[:-1] - twists[:-1])) > 1e-4
+    np.testing.assert_allclose(reckon(out), reckon(twists), atol=1e-9)
+    rest = run(OdometryFilter(OdometryFilterConfig(model=model)), np.zeros((5, 3)))
+    np.testing.assert_array_equal(rest, np.zeros((5, 3)))
+
+
+def test_a_steady_drive_passes_unchanged_in_the_end() -> None:
+    twists = np.tile([0.4, 0.0, 0.0], (100, 1))
+    out = run(OdometryFilter(), twists)
+    np.testing.assert_allclose(out[-20:], twists[-20:], atol=1e-6)
+
+
+def test_noise_is_smoothed() -> None:
+    rng = np.random.Generator(np.random.PCG64(1))
+    noise = 0.05 * rng.standard_normal((600, 3))
+    for process, share in ((0.03, 1.0), (1e-3, 0.9), (1e-5, 0.6)):
+        behind = OdometryFilter(OdometryFilterConfig(process_linear=process))
+        out = run(behind, np.array([0.5, 0.1, 0.05]) + noise)
+        assert np.std(out[50:, 0]) < share * np.std(noise[50:, 0])
+
+
+def test_turns_beyond_pi_are_no_jumps() -> None:
+    out = run(OdometryFilter(), np.tile([0.3, 0.0, 1.2], (200, 1)))
+    np.testing.assert_allclose(out[50:, 2], 1.2, atol=1e-4)
+    np.testing.assert_allclose(np.hypot(out[50:, 0], out[50:, 1]), 0.3, atol=0.01)
+
+
+def test_reset_forgets() -> None:
+    behind = OdometryFilter()
+    first = run(behind, swing(20))
+    behind.reset()
+    np.testing.assert_array_equal(run(behind, swing(20)), first)
+    assert make_odometry_filter("none") is None
+    with pytest.raises(ValueError, match="odometry must be finite"):
+        behind.filter(Odometry((math.nan, 0.0, 0.0), DT))
+
+
+def test_outputs_are_fresh_arrays() -> None:
+    behind = OdometryFilter()
+    first = behind.filter(Odometry((0.3, 0.0, 0.1), DT)).twist
+    kept = np.array(first)
+    behind.filter(Odometry((-0.3, 0.2, 0.4), DT))
+    np.testing.assert_array_equal(first, kept)

@@ -1,0 +1,99 @@
+"""``python -m training.paper_c``: figures and their JSON with tiny settings; peers that solve and count right."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from training import paper_c
+from training.paper_c import run_of
+from training.paper_c_odometry import accelerating, best, drives, errors
+from training.paper_c_peers import Counted
+from training.paper_c_work import METHODS, count, reference, relative_deviation, solve
+
+TINY = ["--runs", "2", "--repeats", "1", "--episodes", "1", "--explorations", "1", "--steps", "3"]
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("training.paper_c_work.METHODS", {name: tuple(METHODS[name])[:2] for name in METHODS})
+    grid = {"constant_velocity": np.array([0.03]), "uniform_acceleration": np.array([1.0])}
+    monkeypatch.setattr("training.paper_c_odometry._PROCESS", grid)
+    monkeypatch.setattr(paper_c, "ODOMETRY_MODELS", tuple(grid))
+
+
+def test_everything_is_written(small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    del small
+    assert paper_c.main(["--out", str(tmp_path / "out"), *TINY]) == 0
+    told = json.loads(capsys.readouterr().out)
+    result = json.loads((tmp_path / "out" / "paper_c.json").read_text("utf-8"))
+    for name, row in told["covariance"].items():
+        for recovery, figures in row.items():
+            assert figures["max_relative"] < 1e-6, (name, recovery)
+            assert figures["max_absolute"] < 1e-6, (name, recovery)
+    assert {row["odometry_filter"] for row in result["odometry"]["explorations_test"]} == {
+        "none", "differential-transform",
+    }  # fmt: skip
+    assert result["estimate"]["exact"]["position_rms_m"][0] == 0.0
+    for name in ("figure_2", "figure_3", "work", "odometry"):
+        image = cv2.imread(str(tmp_path / "out" / f"{name}.png"))
+        assert image is not None
+        assert image.shape[1] == 1000
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(paper_c._FILES)
+
+
+@pytest.mark.parametrize("more", [["--runs", "0"], ["--seed", "-1"], ["--workers", "0"]])
+def test_bad_input_is_one_line(more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert paper_c.main(["--out", str(tmp_path / "out"), *more]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_peers_solve_the_same_equation(method: str) -> None:
+    run = run_of("uniform_acceleration")
+    true = reference(run, np.array([run.t0, run.t1]), relative=1e-9)[1:]
+    settings = {"Van Loan": 4000, "Hamiltonian": 400}
+    cov = solve(method, settings.get(method, 1e-7), run)
+    allowed = {"Van Loan": 2e-2, "Hamiltonian": 1e-4}.get(method, 1e-5)
+    assert relative_deviation(cov, true).max() < allowed
+    if method != "Van Loan":  # whose first-order error alone is left
+        finer = solve(method, 800 if method == "Hamiltonian" else 1e-9, run)
+        assert relative_deviation(finer, true).max() < max(0.3 * relative_deviation(cov, true).max(), 1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_what_counts_computes_the_same(method: str) -> None:
+    run = run_of("constant_velocity")
+    setting = 1e-4 if METHODS[method][0] < 1 else 20
+    Counted.start()
+    counted = solve(method, setting, run, counted=True)
+    np.testing.assert_allclose(counted, solve(method, setting, run), rtol=1e-9)
+    assert count(method, setting, run) == Counted.done
+    assert Counted.done["multiplications"] > 100
+
+
+def test_counted_numbers_count() -> None:
+    Counted.start()
+    x = 2.0 * Counted(3.0) + 1 - Counted(1.0) / 2
+    assert float(abs(-x) ** 2) == pytest.approx(6.5**2)
+    assert Counted.done == {"multiplications": 1, "additions": 2, "divisions": 1, "powers": 1}
+    assert np.float64(2.0) * Counted(2.0) == 4.0
+
+
+def test_stretches_are_where_the_robot_accelerates() -> None:
+    driven = drives("nominal", seed=0, episodes=2)
+    stretches = accelerating(driven)
+    assert len(stretches) > 5
+    speeds = np.linalg.norm(driven.true[..., :2], axis=2)
+    changes = [np.ptp(speeds[e, a - 1 : b]) for e, a, b in stretches]
+    assert np.median(changes) > 0.05
+    exact = errors(driven, driven.true, stretches)
+    assert max(exact.values()) < 1e-6
+    rows = [{"noise": "nominal", "model": None, "process": None, **errors(driven, driven.measured, stretches)}]
+    rows.append({**rows[0], "model": "constant_velocity", "process": 1.0, "velocity_rms_mm_s": 0.0})
+    assert best(rows) == [{"model": "constant_velocity", "process": 1.0, "share_of_unfiltered": 0.5}]
