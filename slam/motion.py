@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.settings import require
 
-__all__ = ["OdometryNoise", "jacobians", "move", "predict_robot"]
+__all__ = ["OdometryNoise", "jacobians", "move", "predict_robot", "twist_between"]
 
 Array = NDArray[np.float64]
 
@@ -71,6 +71,23 @@ def move(pose: Array, twist: Array, dt: float) -> Array:
     out = np.array(pose, dtype=np.float64)
     _move(out, float(twist[0]), float(twist[1]), float(twist[2]), dt)
     return out
+
+
+def twist_between(pose: Array, after: Array, dt: float) -> Array:
+    """Return the body twist ``(3,)`` that, held for ``dt`` > 0 [s], brings :func:`move` from one pose to another.
+
+    The inverse of the motion model itself, exact to rounding: the logarithm of SE(2) would differ from it by
+    (ω dt)² / 24 of the way. The turn is the short one.
+    """
+    turn = wrap_scalar(float(after[2]) - float(pose[2]))
+    middle = float(pose[2]) + 0.5 * turn
+    dx, dy, c, s = (
+        float(after[0]) - float(pose[0]),
+        float(after[1]) - float(pose[1]),
+        math.cos(middle),
+        math.sin(middle),
+    )
+    return np.array([c * dx + s * dy, c * dy - s * dx, turn]) / dt
 
 
 def jacobians(pose: Array, twist: Array, dt: float) -> tuple[Array, Array]:

@@ -1,25 +1,42 @@
-"""Recorded logs of real robots: one reader a format, all into one :class:`RecordedLog` (``docs/replay.md``)."""
+"""Recorded logs of real robots: one reader a format (``docs/replay.md``).
+
+Logs of landmark observations become a :class:`RecordedLog`, logs of laser scans a :class:`ScanLog`.
+"""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from slam.logs import utias, victoria_park
-from slam.logs.recorded import ObservationNoise, RecordedLog
+import numpy as np
 
-__all__ = ["ObservationNoise", "RecordedLog", "open_log"]
+from slam.logs import carmen, dpslam, utias, victoria_park
+from slam.logs.log import Event
+from slam.logs.recorded import ObservationNoise, RecordedLog
+from slam.logs.scans import ScanLog
+from slam.logs.tables import read_lines
+
+__all__ = ["AnyLog", "Event", "ObservationNoise", "RecordedLog", "ScanLog", "open_log", "with_reference"]
+
+AnyLog = RecordedLog | ScanLog
 
 _UTIAS_FILE = re.compile(r"Robot(\d+)_Odometry\.dat(?:\.gz)?")
 
 
-def open_log(path: str | Path, *, robot: int | None = None) -> RecordedLog:
-    """Read a log; its format is known by the names of its files.
+# By the first word of a line; CARMEN has more, which are not read.
+_CARMEN_WORDS = frozenset({"ODOM", "FLASER", "RLASER", "PARAM", "SYNC", "TRUEPOS", "ROBOTLASER1", "NEFF"})
+_DPSLAM_WORDS = frozenset({"Odometry", "Laser"})
+_LINES_TO_KNOW_BY = 10_000
+
+
+def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
+    """Read a log; its format is known by the names of its files, that of one with scans by its lines.
 
     Parameters
     ----------
     path : path
-        A UTIAS MRCLAM odometry file ``Robot1_Odometry.dat[.gz]`` or its folder; or Victoria Park's folder.
+        A UTIAS MRCLAM odometry file ``Robot1_Odometry.dat[.gz]`` or its folder; Victoria Park's folder; or a
+        CARMEN or DP-SLAM log, plain or gzip, whatever its name.
     robot : int, optional
         Which robot of a UTIAS folder; not needed where it has only one.
 
@@ -47,15 +64,83 @@ def open_log(path: str | Path, *, robot: int | None = None) -> RecordedLog:
         return utias.read(path, robot)
     match = _UTIAS_FILE.fullmatch(path.name)
     if match is None:
-        raise ValueError(f"file {path} is no log that is known: {_KNOWN}")
+        _refuse_robot(robot, path)
+        return _open_scans(path)
     if robot is not None and robot != int(match[1]):
         raise ValueError(f"log {path} is robot {match[1]}'s, not robot {robot}'s; leave --robot out")
     return utias.read(path.parent, int(match[1]))
 
 
+def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
+    """Return a log of scans with the reference that another log of the same scans holds.
+
+    Parameters
+    ----------
+    log : ScanLog
+        What is replayed.
+    path : path
+        A CARMEN log, whose FLASER poses are taken; scans are matched by their time stamps, equal ones in order.
+        Or a DP-SLAM log, whose scans are matched by their number.
+
+    Raises
+    ------
+    ValueError
+        One line: where the log has a reference of its own, the file is damaged or holds none of the scans.
+    """
+    path = Path(path)
+    if not isinstance(log, ScanLog):
+        raise ValueError(f"log {log.name} has its own reference; leave --reference out")
+    if not path.is_file():
+        raise ValueError(f"reference {path} is no file; give a log of the same scans with corrected poses")
+    kind = _kind_of(path)
+    if kind is None:
+        raise ValueError(f"reference {path} is no log that is known: give a CARMEN or DP-SLAM log")
+    note = f"reference: poses of {path.name} at the same scans; the start pose is the reference's"
+    if kind == "dpslam":
+        poses = dpslam.read(path).odometry_poses[: len(log.times)]
+        return log.with_reference(np.arange(len(poses)), poses, note)
+    stamps, poses = carmen.read_poses(path)
+    of_stamp: dict[int, list[int]] = {}
+    for row, stamp in enumerate(stamps.tolist()):
+        of_stamp.setdefault(round(stamp * 1e4), []).append(row)
+    for rows in of_stamp.values():
+        rows.reverse()  # taken from the end: the first of equal stamps first
+    pairs: list[tuple[int, int]] = []
+    for i, stamp in enumerate(log.stamps.tolist()):
+        if left := of_stamp.get(round(stamp * 1e4)):
+            pairs.append((i, left.pop()))
+    if not pairs:
+        raise ValueError(
+            f"reference {path} has no scan at a time stamp of {log.name}'s; give a log of the same scans"
+        )
+    scans, matched = np.array(pairs, np.int64).T
+    return log.with_reference(scans, poses[matched], note)
+
+
 _KNOWN = (
-    "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), or the folder with steering.txt[.gz] (Victoria Park)"
+    "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), the folder with steering.txt[.gz] (Victoria Park), or a "
+    "file with FLASER lines (CARMEN) or Odometry and Laser lines (DP-SLAM)"
 )
+
+
+def _open_scans(path: Path) -> ScanLog:
+    kind = _kind_of(path)
+    if kind is None:
+        raise ValueError(f"file {path} is no log that is known: {_KNOWN}")
+    return carmen.read(path) if kind == "carmen" else dpslam.read(path)
+
+
+def _kind_of(path: Path) -> str | None:
+    """Return "carmen", "dpslam" or, where no line at the beginning is either's, ``None``."""
+    for number, line in read_lines(path):
+        word = line.partition(" ")[0].strip()
+        if word in _CARMEN_WORDS:
+            return "carmen"
+        if word in _DPSLAM_WORDS:
+            return "dpslam"
+        if number >= _LINES_TO_KNOW_BY:
+            break
+    return None
 
 
 def _refuse_robot(robot: int | None, path: Path) -> None:

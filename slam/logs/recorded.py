@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import wrap
+from slam.logs.log import Event, Log
 from slam.settings import require
 from slam.types import Observations, Odometry
 
@@ -41,49 +41,28 @@ class ObservationNoise:
         return out
 
 
-class Event(NamedTuple):
-    """One step of a replay: move on by ``odometry``, then correct by ``observations`` where there are any."""
-
-    time_s: float  # at its end, since the start of the log
-    odometry: Odometry
-    observations: Observations | None
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RecordedLog:
+class RecordedLog(Log):
     """Odometry and landmark observations of a real robot, with a reference where one was recorded.
 
     Times are seconds since the first odometry; what was seen before it or after the last one is left out. The body
     frame is that of the sensor: observations are made at its origin.
     """
 
-    name: str
-    clock_start_s: float  # the recorder's own time of the start
     odometry_times: Array  # (k ≥ 2,) [s] never falling, the first 0; a twist is held from its time to the next
     twists: Array  # (k, 3) vx, vy [m/s], ω [rad/s] in the body frame
     observation_times: Array  # (m,) [s] rising; one entry a set
     observation_ends: NDArray[np.int64]  # (m,) set i is the rows from the end of set i - 1 to here
     range_bearing: Array  # (o, 2) [m, rad] in the body frame
     ids: NDArray[np.int64] | None  # (o,) where landmarks were told apart as they were seen
-    reference_times: Array  # (r,) [s] rising; only where the reference is valid
-    reference_poses: Array  # (r, 3) [m, m, rad] of the body frame; headings nan where not recorded
-    reference_gap_s: float  # the reference is interpolated between times no farther apart than this
     landmark_ids: NDArray[np.int64] | None  # (l,) of the surveyed landmarks
     landmarks: Array | None  # (l, 2) [m] in the reference's frame
-    start_pose: Array  # (3,) in the reference's frame, given to every backend
     observation_noise: ObservationNoise
-    settings: Mapping[str, Any] = field(default_factory=dict)  # backend configuration for this log
-    note: str = ""  # what the reference is, and what of the comparison is given rather than estimated
 
     @property
     def duration_s(self) -> float:
         """Time from the first odometry to the last [s]."""
         return float(self.odometry_times[-1])
-
-    @property
-    def has_heading(self) -> bool:
-        """Whether the reference knows the heading."""
-        return len(self.reference_poses) > 0 and bool(np.isfinite(self.reference_poses[:, 2]).all())
 
     def until(self, limit_s: float) -> RecordedLog:
         """Return the log's beginning, as far as ``limit_s``."""
@@ -145,23 +124,6 @@ class RecordedLog:
         x = self.start_pose[0] + np.append(0.0, np.cumsum((c * vx - s * vy) * dt))
         y = self.start_pose[1] + np.append(0.0, np.cumsum((s * vx + c * vy) * dt))
         return np.column_stack([x, y, wrap(turned)])
-
-    def reference_at(self, time_s: float) -> Array | None:
-        """Return the reference pose ``(3,)`` at a time, or ``None`` where it has a gap there."""
-        times = self.reference_times
-        i = int(np.searchsorted(times, time_s, side="right")) - 1
-        if i < 0 or i >= len(times) or (i + 1 == len(times) and time_s > times[i]):
-            return None
-        if i + 1 == len(times) or times[i] == time_s:
-            return np.array(self.reference_poses[i])
-        span = times[i + 1] - times[i]
-        if span > self.reference_gap_s:
-            return None
-        step = self.reference_poses[i + 1] - self.reference_poses[i]
-        step[2] = wrap(step[2])
-        pose: Array = self.reference_poses[i] + (time_s - times[i]) / span * step
-        pose[2] = wrap(pose[2])
-        return pose
 
 
 def group_by_time(times: Array, begin: float, end: float) -> tuple[Array, NDArray[np.int64], slice]:

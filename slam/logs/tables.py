@@ -5,16 +5,20 @@ from __future__ import annotations
 import gzip
 import math
 import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["check_times", "find", "read_table"]
+__all__ = ["check_times", "find", "numbers_of", "read_lines", "read_table"]
 
 Array = NDArray[np.float64]
 
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
+_LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
 _GZIP = b"\x1f\x8b"
 
 
@@ -88,17 +92,60 @@ def _number(word: str) -> float:
         return math.nan
 
 
+def read_lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines of a text file, plain or gzip, with their numbers from 1; only one is held at a time.
+
+    Raises
+    ------
+    ValueError
+        One line: that the file cannot be read, is damaged, or is too large for any log.
+    """
+    with _opened(path) as file:
+        size = number = 0
+        while line := file.readline(_LONGEST_LINE + 1):
+            number, size = number + 1, size + len(line)
+            if size > _LARGEST or len(line) > _LONGEST_LINE:
+                limit = "" if size > _LARGEST else f", line {number}"
+                raise ValueError(f"{path}{limit} is larger than any log's: it is no such log")
+            yield number, line.decode("utf-8", "replace")
+
+
+def numbers_of(words: Sequence[str], *, path: Path, line: int, what: str) -> Array:
+    """Return the numbers ``(len(words),)`` that words of a line stand for, all finite.
+
+    Raises
+    ------
+    ValueError
+        One line: file, line, the word that is no finite number, and ``what`` it belongs to.
+    """
+    try:
+        values = np.array(words, dtype=np.float64)
+    except ValueError:
+        values = np.array([_number(word) for word in words])
+    if not np.isfinite(values).all():
+        word = words[int(np.flatnonzero(~np.isfinite(values))[0])]
+        raise ValueError(f"{path}, line {line}: {word[:40]!r} is not a finite number ({what}); correct the line")
+    return values
+
+
 def _text(path: Path) -> str:
+    with _opened(path) as file:
+        data = file.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise ValueError(f"{path} is larger than {_LARGEST >> 20} MiB: it is no such log")
+    return data.decode("utf-8", "replace")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a file, plain or gzip, and turn what goes wrong while it is read into one line."""
     try:
         with open(path, "rb") as raw:
             packed = raw.read(2) == _GZIP
         # By its first bytes: a browser may have unpacked a file and left its name.
         with gzip.open(path, "rb") if packed else open(path, "rb") as file:
-            data = file.read(_LARGEST + 1)
+            yield cast(BinaryIO, file)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise ValueError(f"{path} is a damaged gzip file ({error}); fetch it again") from error
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror or error}") from error
-    if len(data) > _LARGEST:
-        raise ValueError(f"{path} is larger than {_LARGEST >> 20} MiB: it is no such log")
-    return data.decode("utf-8", "replace")

@@ -1,0 +1,141 @@
+"""CARMEN logs: laser scans and odometry as text, a message a line.
+
+Montemerlo, Roy and Thrun, "Perspectives on standardization in mobile robot programming: the Carnegie Mellon
+Navigation (CARMEN) toolkit", IROS 2003::
+
+    ODOM x y theta tv rv accel time host logger_time
+    FLASER n r_1 … r_n x y theta odom_x odom_y odom_theta time host logger_time
+
+The beams of n = 180 or 181 stand 1° apart, the first at -90°.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.logs.scans import SETTINGS, ScanLog, chain, relative, rising, without_returns
+from slam.logs.tables import numbers_of, read_lines
+
+__all__ = ["beam_angles", "read", "read_poses"]
+
+Array = NDArray[np.float64]
+
+_ODOM = "ODOM x y theta tv rv accel time host logger_time"
+_FLASER = "FLASER n r_1 … r_n x y theta odom_x odom_y odom_theta time host logger_time"
+_AFTER_RANGES = 9  # words
+_FEWEST_BEAMS, _MOST_BEAMS = 2, 10_000
+# A laser mounted off the robot's centre stays where it is; a corrected pose wanders off the odometry.
+_MOUNT_VARIES, _MOUNT_REACHES_M = 1e-3, 1.0
+
+
+def read(path: Path) -> ScanLog:
+    """Read a CARMEN log, plain or gzip: one event a FLASER line; lines of other kinds are passed over.
+
+    Odometry at a scan is the ODOM line right before it where that has the scan's own time stamp, else the pose of
+    the FLASER line. In a log of raw odometry it is the same; in one that GMapping's gfs2log has corrected, FLASER
+    has the corrected pose, from which the ODOM lines go on by the raw odometry, so that the motion from scan to
+    scan is still there, exactly. Stamps out of order are put between their neighbours
+    (:func:`slam.logs.scans.rising`).
+
+    Raises
+    ------
+    ValueError
+        One line: the file and the line that is cut short or damaged, or that there is no scan.
+    """
+    ranges, poses, odometry, stamps = _scans(path, with_odometry=True)
+    robot = poses[:, 3:6]  # FLASER's odometry
+    travelled = chain(odometry[0], relative(robot[:-1], odometry[1:]))
+    mount = relative(robot, poses[:, :3])
+    offset = np.median(mount, axis=0)
+    if np.abs(mount - offset).max() < _MOUNT_VARIES and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M:
+        travelled = _moved_by(travelled, offset)
+    times = rising(stamps)
+    measured, reach = without_returns(ranges)
+    angle_min, increment = beam_angles(ranges.shape[1])
+    return ScanLog(
+        name=path.name.split(".")[0], clock_start_s=float(times[0]), times=times - times[0], stamps=stamps,
+        ranges=measured,
+        angle_min=angle_min, angle_increment=increment, range_max=reach, odometry_poses=travelled,
+        start_pose=travelled[0].copy(), reference_times=np.zeros(0), reference_poses=np.zeros((0, 3)),
+        reference_gap_s=30.0, settings=SETTINGS, note="no reference; give one with --reference",
+    )  # fmt: skip
+
+
+def read_poses(path: Path) -> tuple[Array, Array]:
+    """Return the time stamps ``(n,)`` [s] and laser poses ``(n, 3)`` of a log's FLASER lines, as they stand there.
+
+    Raises ``ValueError`` as :func:`read` does.
+    """
+    _, poses, _, stamps = _scans(path, with_odometry=False)
+    return stamps, poses[:, :3].copy()
+
+
+def beam_angles(beams: int) -> tuple[float, float]:
+    """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
+
+    180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
+    so, better than with beams centred or spread to 90°, see docs/replay.md). Other numbers span -90° to 90°.
+    """
+    step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
+    return math.radians(-90.0), math.radians(step)
+
+
+def _scans(path: Path, *, with_odometry: bool) -> tuple[Array, Array, Array, Array]:
+    """Return ranges (n, beams), FLASER's two poses (n, 6), odometry there (n, 3) and time stamps (n,)."""
+    ranges: list[Array] = []
+    poses: list[Array] = []
+    odometry: list[Array] = []
+    stamps: list[float] = []
+    before: Array | None = None  # x y θ tv rv accel time of the ODOM line right before
+    for number, line in read_lines(path):
+        kind, _, rest = line.partition(" ")
+        if kind == "ODOM" and with_odometry:
+            before = _odom(rest.split(), path, number)
+        elif kind == "FLASER":
+            words = rest.split()
+            n = _beams(words, path, number)
+            if ranges and n != len(ranges[0]):
+                raise ValueError(f"{path}, line {number}: a scan of {n} beams after scans of {len(ranges[0])}; "
+                                 "give a log of one laser")  # fmt: skip
+            scan = numbers_of(words[1 : 1 + n], path=path, line=number, what="a range of FLASER")
+            if scan.min() < 0:
+                raise ValueError(f"{path}, line {number}: range {scan.min():g} is below 0; correct the line")
+            at = numbers_of(words[1 + n : 8 + n], path=path, line=number, what="pose or time of FLASER")
+            same = before is not None and before[6] == at[6]
+            ranges.append(scan)
+            poses.append(at[:6])
+            odometry.append(before[:3] if same and before is not None else at[3:6])
+            stamps.append(float(at[6]))
+    if not ranges:
+        raise ValueError(f"{path} holds no FLASER line, the only scans of a CARMEN log that are read")
+    return np.stack(ranges), np.stack(poses), np.stack(odometry), np.array(stamps)
+
+
+def _odom(words: Sequence[str], path: Path, number: int) -> Array:
+    if len(words) != 9:
+        raise ValueError(f"{path}, line {number}: expected 9 values after ODOM ({_ODOM}), got {len(words)}; "
+                         "the line is cut short or damaged")  # fmt: skip
+    return numbers_of(words[:7], path=path, line=number, what=_ODOM)
+
+
+def _beams(words: Sequence[str], path: Path, number: int) -> int:
+    """Return how many beams a FLASER line has, its length checked."""
+    count = words[0] if words else ""
+    if not (count.isascii() and count.isdigit() and _FEWEST_BEAMS <= int(count[:6]) <= _MOST_BEAMS):
+        raise ValueError(f"{path}, line {number}: {count[:40]!r} is no number of beams, {_FEWEST_BEAMS} to "
+                         f"{_MOST_BEAMS} ({_FLASER}); correct the line")  # fmt: skip
+    expected = 1 + int(count) + _AFTER_RANGES
+    if len(words) != expected:
+        raise ValueError(f"{path}, line {number}: a FLASER of {count} beams has {expected} values, here are "
+                         f"{len(words)}; the line is cut short or damaged")  # fmt: skip
+    return int(count)
+
+
+def _moved_by(poses: Array, offset: Array) -> Array:
+    """Return poses ``(n, 3)`` each followed by the same transform ``(3,)``."""
+    return relative(relative(poses, np.zeros_like(poses)), np.broadcast_to(offset, poses.shape))

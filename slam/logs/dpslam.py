@@ -1,0 +1,92 @@
+"""The logs of DP-SLAM (Eliazar and Parr): a pose by odometry, then a scan, a line each and no time stamps.
+
+::
+
+    Odometry x y theta
+    Laser n r_1 … r_n
+
+The beams of n = 181 stand 1° apart, the first at -90°.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.logs.carmen import beam_angles
+from slam.logs.scans import SETTINGS, ScanLog, without_returns
+from slam.logs.tables import numbers_of, read_lines
+
+__all__ = ["NOMINAL_DT_S", "read"]
+
+Array = NDArray[np.float64]
+
+NOMINAL_DT_S = 0.5
+"""Time between two scans that a log without time stamps is given. Only floors of the noise depend on it."""
+
+
+def read(path: Path) -> ScanLog:
+    """Read a DP-SLAM log, plain or gzip; lines of other kinds are passed over.
+
+    Raises
+    ------
+    ValueError
+        One line: the file and the line that is cut short or damaged, or that there is no scan.
+    """
+    odometry, ranges = _pairs(path)
+    measured, reach = without_returns(ranges)
+    angle_min, increment = beam_angles(ranges.shape[1])
+    times = np.arange(len(ranges), dtype=np.float64) * NOMINAL_DT_S
+    return ScanLog(
+        name=path.name.split(".")[0], clock_start_s=0.0, times=times, stamps=times,
+        ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach, odometry_poses=odometry,
+        start_pose=odometry[0].copy(), reference_times=np.zeros(0), reference_poses=np.zeros((0, 3)),
+        reference_gap_s=30.0, settings=SETTINGS,
+        note=f"no reference; without time stamps, taken to be {NOMINAL_DT_S} s from scan to scan",
+    )  # fmt: skip
+
+
+def _pairs(path: Path) -> tuple[Array, Array]:
+    """Return the odometry poses ``(n, 3)`` and ranges ``(n, beams)`` of a log."""
+    poses: list[Array] = []
+    ranges: list[Array] = []
+    pose: Array | None = None
+    for number, line in read_lines(path):
+        kind, _, rest = line.partition(" ")
+        words = rest.split()
+        if kind == "Odometry":
+            if len(words) != 3:
+                raise ValueError(f"{path}, line {number}: expected 3 values after Odometry (x y theta), got "
+                                 f"{len(words)}; the line is cut short or damaged")  # fmt: skip
+            pose = numbers_of(words, path=path, line=number, what="Odometry x y theta")
+        elif kind == "Laser":
+            if pose is None:
+                raise ValueError(
+                    f"{path}, line {number}: a Laser line without an Odometry line of its own before it"
+                )
+            ranges.append(_laser(words, path, number))
+            if len(ranges[-1]) != len(ranges[0]):
+                raise ValueError(f"{path}, line {number}: a scan of {len(ranges[-1])} beams after scans of "
+                                 f"{len(ranges[0])}; give a log of one laser")  # fmt: skip
+            poses.append(pose)
+            pose = None
+    if not ranges:
+        raise ValueError(f"{path} holds no Laser line; is it cut short?")
+    return np.stack(poses), np.stack(ranges)
+
+
+def _laser(words: list[str], path: Path, number: int) -> Array:
+    count = words[0] if words else ""
+    if not (count.isascii() and count.isdigit() and 2 <= int(count[:6]) <= 10_000):
+        raise ValueError(
+            f"{path}, line {number}: {count[:40]!r} is no number of beams, 2 to 10000; correct the line"
+        )
+    if len(words) != 1 + int(count):
+        raise ValueError(f"{path}, line {number}: a Laser of {count} beams has as many ranges, here are "
+                         f"{len(words) - 1}; the line is cut short or damaged")  # fmt: skip
+    scan = numbers_of(words[1:], path=path, line=number, what="a range of Laser")
+    if scan.min() < 0:
+        raise ValueError(f"{path}, line {number}: range {scan.min():g} is below 0; correct the line")
+    return scan

@@ -1,0 +1,180 @@
+"""A recorded log of odometry and laser scans in memory (``docs/replay.md``)."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import compose, inverse, wrap
+from slam.logs.log import Event, Log
+from slam.logs.recorded import ObservationNoise
+from slam.motion import twist_between
+from slam.types import Odometry, Scan
+
+__all__ = ["SETTINGS", "ScanLog", "chain", "relative", "rising", "without_returns"]
+
+Array = NDArray[np.float64]
+
+# For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
+# way as measured on the Intel log against its corrected poses, see docs/replay.md.
+SETTINGS = {
+    "lidar_offset_m": 0.0,
+    "odometry": {
+        "lever_m": 0.25, "speed_floor_m_s": 0.002, "speed_share": 0.1, "turn_floor_rad_s": 0.002,
+        "turn_share_rad_m": 0.1, "slip_share": 0.0,
+    },
+    "features": {"range_sigma_m": 0.02, "split_floor_m": 0.05, "sigma_floor_m": 0.02, "wall_sigma_m": 0.01,
+                 "wall_sigma_rad": 0.005},
+    "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.4},
+}  # fmt: skip
+
+# A laser of the SICK LMS family answers one of the highest codes of its range, 8183 or above, where there is no
+# measurement: in millimetres, or in centimetres for the long range.
+_NO_RETURN_MM_M = 8.18
+_NO_RETURN_CM_M = 81.8
+_HIGHEST_MM_M = 8.192
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScanLog(Log):
+    """Odometry and laser scans of a real robot, one odometry pose a scan.
+
+    Times are seconds since the first scan. The body frame is that of the sensor: the odometry is of the laser, and
+    scans are made at its origin. The reference is at scans only.
+    """
+
+    times: Array  # (n ≥ 1,) [s] rising, the first 0
+    stamps: Array  # (n,) [s] as recorded, by which a reference is matched: not always rising
+    ranges: Array  # (n, beams) [m]; inf where nothing within reach returned, nan where the beam was lost
+    angle_min: float  # bearing of the first beam [rad]
+    angle_increment: float  # [rad]
+    range_max: float  # [m]
+    odometry_poses: Array  # (n, 3) [m, m, rad] by the wheels alone, in a frame of their own
+
+    # What a log of landmark observations has, and this one has not.
+    ids = None
+    landmark_ids = None
+    landmarks = None
+    observation_noise = None
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first scan to the last [s]."""
+        return float(self.times[-1])
+
+    @property
+    def odometry_times(self) -> Array:
+        """Times ``(n,)`` of the odometry, which are those of the scans [s]."""
+        return self.times
+
+    def scan(self, index: int) -> Scan:
+        """Return one scan; its ranges are a view."""
+        return Scan(self.ranges[index], self.angle_min, self.angle_increment, self.range_max)
+
+    def until(self, limit_s: float) -> ScanLog:
+        """Return the log's beginning: the scans no later than ``limit_s`` ≥ 0."""
+        n = int(np.searchsorted(self.times, limit_s, side="right"))
+        r = int(np.searchsorted(self.reference_times, limit_s, side="right"))
+        return replace(
+            self, times=self.times[:n], stamps=self.stamps[:n], ranges=self.ranges[:n],
+            odometry_poses=self.odometry_poses[:n],
+            reference_times=self.reference_times[:r], reference_poses=self.reference_poses[:r],
+        )  # fmt: skip
+
+    def events(self, noise: ObservationNoise | None = None, *, known: bool = True) -> Iterator[Event]:
+        """Yield one event a scan: the odometry since the scan before, dt = 0 at the first, and the scan.
+
+        ``predict`` of every backend, which is :func:`slam.motion.move`, composes these odometries to the recorded
+        ones exactly. ``noise`` and ``known`` are for logs of observations and mean nothing here.
+        """
+        del noise, known
+        yield Event(0.0, Odometry((0.0, 0.0, 0.0), 0.0), scan=self.scan(0))
+        for i in range(1, len(self.times)):
+            dt = float(self.times[i] - self.times[i - 1])
+            twist = twist_between(self.odometry_poses[i - 1], self.odometry_poses[i], dt)
+            yield Event(float(self.times[i]), Odometry(twist, dt), scan=self.scan(i))
+
+    def dead_reckoning(self) -> Array:
+        """Return the poses ``(n, 3)`` at the scans by the odometry alone, from the start pose."""
+        offset = compose(self.start_pose, inverse(self.odometry_poses[0]))
+        c, s = math.cos(offset[2]), math.sin(offset[2])
+        x, y, theta = self.odometry_poses.T
+        return np.column_stack([offset[0] + c * x - s * y, offset[1] + s * x + c * y, wrap(offset[2] + theta)])
+
+    def with_reference(self, rows: NDArray[np.int64], poses: Array, note: str) -> ScanLog:
+        """Return the log with reference poses ``(r ≥ 1, 3)`` at the scans ``rows`` ``(r,)``, rising.
+
+        The start pose becomes the reference's, by the odometry where the first scan has none.
+        """
+        first = int(rows[0])
+        back = compose(inverse(self.odometry_poses[first]), self.odometry_poses[0])
+        return replace(
+            self, reference_times=self.times[rows], reference_poses=poses, start_pose=compose(poses[0], back),
+            note=note,
+        )  # fmt: skip
+
+
+def relative(poses: Array, seen: Array) -> Array:
+    """Return poses ``(n, 3)`` as seen from other poses ``(n, 3)``, row by row: inverse(poses) ∘ seen."""
+    dx, dy = (seen[:, :2] - poses[:, :2]).T
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap(seen[:, 2] - poses[:, 2])])
+
+
+def chain(start: Array, steps: Array) -> Array:
+    """Return poses ``(n + 1, 3)``: a start pose ``(3,)`` and steps ``(n, 3)`` on, each in the frame before."""
+    theta = start[2] + np.append(0.0, np.cumsum(steps[:, 2]))
+    c, s = np.cos(theta[:-1]), np.sin(theta[:-1])
+    x = start[0] + np.append(0.0, np.cumsum(c * steps[:, 0] - s * steps[:, 1]))
+    y = start[1] + np.append(0.0, np.cumsum(s * steps[:, 0] + c * steps[:, 1]))
+    return np.column_stack([x, y, wrap(theta)])
+
+
+def rising(stamps: Array) -> Array:
+    """Return time stamps ``(n ≥ 1,)`` that rise: those out of order are put evenly between their neighbours.
+
+    Recorders stamp late now and then. The order of the lines is kept, and as many stamps as possible: a longest
+    rising subsequence of them.
+    """
+    tails: list[float] = []  # the least last value of a rising subsequence of each length …
+    where: list[int] = []  # … where it stands …
+    before = np.full(len(stamps), -1)  # … and what comes before each value
+    for i, stamp in enumerate(stamps.tolist()):
+        k = bisect_left(tails, stamp)
+        before[i] = where[k - 1] if k else -1
+        tails[k : k + 1], where[k : k + 1] = [stamp], [i]
+    kept, i = [], where[-1]
+    while i >= 0:
+        kept.append(i)
+        i = int(before[i])
+    kept.reverse()
+    usual = float(np.median(np.diff(stamps[kept]))) if len(kept) > 1 else 1.0
+    # Beyond the first and the last that are kept, by the usual interval.
+    ends = [-1, *kept, len(stamps)]
+    values = [stamps[kept[0]] - usual * (kept[0] + 1), *stamps[kept]]
+    values.append(stamps[kept[-1]] + usual * (len(stamps) - kept[-1]))
+    times: Array = np.interp(np.arange(len(stamps)), ends, values)
+    return times
+
+
+def without_returns(ranges: Array) -> tuple[Array, float]:
+    """Return ranges ``(n, beams)`` with the codes for "no measurement" taken out, and the laser's reach [m].
+
+    A log that goes up to the codes of the millimetre mode is a short-range laser's: nothing returned within
+    8.18 m, which is ``inf``. In the centimetre mode, 81.8 m and more, a beam is taken for lost, ``nan``: in a
+    building it met glass or a black surface, not 80 m of free space. There the reach is that of the log's
+    farthest measurement. A range of 0 is a beam lost, too.
+    """
+    out = np.where(ranges > 0.0, ranges, math.nan)
+    highest = float(np.nanmax(out, initial=0.0))
+    if _NO_RETURN_MM_M <= highest <= _HIGHEST_MM_M:
+        out[out >= _NO_RETURN_MM_M] = math.inf
+        return out, _NO_RETURN_MM_M
+    out[out >= _NO_RETURN_CM_M] = math.nan
+    # Above the farthest, since a range at the reach itself counts as no return.
+    return out, (math.floor(float(np.nanmax(out, initial=0.0)) * 10.0 + 1e-6) + 1) / 10.0
