@@ -38,7 +38,7 @@ class Lattice:
 
     def enclose(self, low: Array, high: Array) -> tuple[int, int, int, int] | None:
         """Make room for a box [m] with a margin; return by how much it grew (below, left) and its old shape."""
-        margin = 8
+        margin = 16  # what is read around a beam's end, and how far a match may move it
         col0, row0 = (math.floor(v / self.cell_m) - margin for v in low.tolist())
         col1, row1 = (math.floor(v / self.cell_m) + margin for v in high.tolist())
         rows, cols = self.shape

@@ -21,7 +21,7 @@ from slam.geometry import wrap_scalar
 from slam.settings import require
 from slam.types import Scan
 
-__all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search"]
+__all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search", "stamps_of"]
 
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
@@ -84,7 +84,7 @@ class LikelihoodField:
     def __init__(self, config: MatchConfig, low: tuple[float, float], high: tuple[float, float]) -> None:
         """Make an empty field over the box from ``low`` to ``high`` [m]."""
         cell = config.cell_m
-        self.cell_m, self.stamps = cell, _stamps(config)
+        self.cell_m, self.stamps = cell, stamps_of(config)
         col, row = math.floor(low[0] / cell), math.floor(low[1] / cell)
         shape = (math.floor(high[1] / cell) - row + 1, math.floor(high[0] / cell) - col + 1)
         self.x0, self.y0 = (col + 0.5) * cell, (row + 0.5) * cell
@@ -121,7 +121,7 @@ class LikelihoodField:
 _STAMPS: dict[tuple[float, float], Values] = {}
 
 
-def _stamps(config: MatchConfig) -> Values:
+def stamps_of(config: MatchConfig) -> Values:
     """Return what a surface point looks like in the cells around it, ``(phases, phases, size, size)``."""
     key = (config.cell_m, config.smooth_m)
     if key not in _STAMPS:
