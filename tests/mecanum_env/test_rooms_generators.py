@@ -20,7 +20,8 @@ from mecanum_env.rooms.assembly import generator
 from mecanum_env.rooms.rectangular import RectangularConfig
 
 seeds = st.integers(0, 2**32 - 1)
-every_kind = pytest.mark.parametrize("kind", ["rectangular", "apartment"])
+every_kind = pytest.mark.parametrize("kind", rooms.names())
+furnished = pytest.mark.parametrize("kind", ["rectangular", "apartment"])
 few = settings(max_examples=25, deadline=None)
 
 
@@ -115,7 +116,9 @@ def test_obstacles_overlap_neither_each_other_nor_walls(kind, seed):
         0.5 * abs(np.sum(p[:, 0] * np.roll(p[:, 1], -1) - p[:, 1] * np.roll(p[:, 0], -1))) for p in plan.polygons
     ]
     areas += list(math.pi * plan.circles[:, 2] ** 2)
-    assert plan.area_m2 + sum(areas) == pytest.approx(floor, abs=0.02 * (1 + len(areas)))
+    # A curved wall cuts its cells anywhere: what that makes of a cave's 100 m of them is some 0.05 m².
+    slack = 0.25 if kind == "cave" else 0.0
+    assert plan.area_m2 + sum(areas) == pytest.approx(floor, abs=slack + 0.02 * (1 + len(areas)))
 
 
 @every_kind
@@ -147,7 +150,9 @@ def test_the_start_is_clear_and_square(kind, seed):
     plan = rooms.make(kind, seed=seed)
     assert plan.distance_to_surfaces(np.array([plan.start[:2]]))[0] >= 0.5
     assert min(abs(plan.start[2] - h) for h in (-math.pi, -math.pi / 2, 0.0, math.pi / 2)) < 1e-12
-    # Every surface lies on the 5 cm lattice.
+    if kind == "cave":
+        return
+    # Every surface of the others lies on the 5 cm lattice.
     assert plan.walls * 20 == pytest.approx(np.round(plan.walls * 20), abs=1e-6)
 
 
@@ -232,7 +237,7 @@ def test_rooms_are_furnished_in_all_shapes():
         assert not empty.polygons and not len(empty.circles)
 
 
-@every_kind
+@furnished
 @few
 @given(seed=seeds)
 def test_even_the_fullest_rooms_can_be_driven(kind, seed):
@@ -250,12 +255,12 @@ def test_a_plan_is_built_quickly(kind):
         begin = time.perf_counter()
         rooms.make(kind, seed=seed)
         times.append(time.perf_counter() - begin)
-    # The aim is 15 ms on average; a shared machine is given some slack.
-    assert np.median(times) < 0.045
+    # The aim is 15 ms on average, for a cave 100 ms; a shared machine is given some slack.
+    assert np.median(times) < (0.3 if kind == "cave" else 0.045)
 
 
 def test_the_registry_names_what_there_is():
-    assert {"apartment", "rectangular"} <= set(rooms.names())
+    assert {"apartment", "cave", "corridors", "maze", "rectangular"} <= set(rooms.names())
     with pytest.raises(ValueError, match=r"unknown rooms 'apartement' .did you mean 'apartment'.*rectangular"):
         rooms.make("apartement", seed=0)
     with pytest.raises(ValueError, match="unknown key of ApartmentConfig 'dors_m'"):
@@ -286,6 +291,17 @@ def test_a_seed_is_a_whole_number(seed):
         ("apartment", {"rooms": (5.5, 8.0)}),
         ("apartment", {"links": -0.1}),
         ("apartment", {"corridor_m": (math.inf, math.inf)}),
+        ("cave", {"area_m2": (100.0, 60.0)}),
+        ("cave", {"chamber_m": (0.5, 1.0)}),
+        ("cave", {"passage_m": (0.9, 1.2)}),
+        ("cave", {"pillars": (0.5, 2)}),
+        ("cave", {"roughness": 1.5}),
+        ("cave", {"loops": math.nan}),
+        ("maze", {"columns": (1, 4)}),
+        ("maze", {"rows": (6.0, 8.0)}),
+        ("maze", {"corridor_m": (0.8, 1.0)}),
+        ("maze", {"wall_m": (0.0, 0.1)}),
+        ("maze", {"loops": -0.1}),
     ],
 )
 def test_a_bad_config_is_refused(kind, config):
