@@ -3,7 +3,9 @@
 The map is a likelihood field: every cell holds exp(-d²/2s²), d the distance to the nearest surface point. A match
 first searches a bounded window over x, y and θ exhaustively (Olson 2009, "Real-time correlative scan matching": a
 coarse table of maxima bounds blocks of poses, so that few are looked at closely), then climbs to the top between the
-cells (Gauss-Newton on the bilinear field, as Kohlbrecher et al. 2011). Each beam counts by Welsch's robust loss, so
+cells (Gauss-Newton on the interpolated field, as Kohlbrecher et al. 2011, "A flexible and scalable SLAM system with
+full 3D motion estimation"; by a quadratic spline, since between two cells the same distance from a wall a bilinear
+field is flat, and says nothing of where between them the wall is). Each beam counts by Welsch's robust loss, so
 what the map does not know yet, people and lost beams pull little or not at all.
 """
 
@@ -238,7 +240,11 @@ def correlate(
                     elif -_BLOCK < r < rows and -_BLOCK < q < cols:  # the block reaches into the field
                         total += bounds[max(r, 0), max(q, 0)]
                 upper[(a * blocks + i) * blocks + j] = gain * total
-    best, found = -math.inf, guess.copy()
+    best, found = 0.0, guess.copy()  # the guess itself, which no tie shall beat
+    for k in range(n):
+        r, q = row[turns, k] + shifts, col[turns, k] + shifts
+        if 0 <= r < rows and 0 <= q < cols:
+            best += gain * values[r, q]
     for index in np.argsort(-upper, kind="mergesort"):
         if upper[index] <= best:
             break  # every other block's bound is lower still; a prior only lowers
@@ -266,20 +272,28 @@ def _loss(info: Array, dx: float, dy: float, dt: float) -> float:
     )  # fmt: skip
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _weights(t: float) -> tuple[float, float, float]:
+    """Return the quadratic B-spline's weights of the cell before, this one and the next, ``t`` in [-½, ½] off it."""
+    return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def field_sum(values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array) -> float:
-    """Return the sum of the bilinear field under the points ``(n, 2)`` seen from a pose; 0 outside."""
+    """Return the sum of the interpolated field under the points ``(n, 2)`` seen from a pose; 0 outside."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     rows, cols = values.shape
     total = 0.0
     for k in range(points.shape[0]):
         u = (pose[0] + c * points[k, 0] - s * points[k, 1] - x0) / cell
         v = (pose[1] + s * points[k, 0] + c * points[k, 1] - y0) / cell
-        j, i = math.floor(u), math.floor(v)
-        if 0 <= i < rows - 1 and 0 <= j < cols - 1:
-            p, q = u - j, v - i
-            total += (1.0 - q) * ((1.0 - p) * values[i, j] + p * values[i, j + 1])
-            total += q * ((1.0 - p) * values[i + 1, j] + p * values[i + 1, j + 1])
+        j, i = math.floor(u + 0.5), math.floor(v + 0.5)
+        if 1 <= i < rows - 1 and 1 <= j < cols - 1:
+            p0, p1, p2 = _weights(u - j)
+            q0, q1, q2 = _weights(v - i)
+            total += q0 * (p0 * values[i - 1, j - 1] + p1 * values[i - 1, j] + p2 * values[i - 1, j + 1])
+            total += q1 * (p0 * values[i, j - 1] + p1 * values[i, j] + p2 * values[i, j + 1])
+            total += q2 * (p0 * values[i + 1, j - 1] + p1 * values[i + 1, j] + p2 * values[i + 1, j + 1])
     return total
 
 
@@ -290,7 +304,7 @@ def slope(
     """Return :func:`field_sum`; write its exact gradient ``(3,)`` and the curvature ``(3, 3)`` for Gauss-Newton.
 
     Of a ridge L = exp(-d²/2s²) the curvature is L n nᵀ/s², n its normal: L times minus the second derivative of
-    log L, which stays positive where that of L itself does not. It is taken from the 3 × 3 cells around.
+    log L, which stays positive where that of L itself does not.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     rows, cols = values.shape
@@ -300,31 +314,31 @@ def slope(
     for k in range(points.shape[0]):
         rx, ry = c * points[k, 0] - s * points[k, 1], s * points[k, 0] + c * points[k, 1]
         u, v = (pose[0] + rx - x0) / cell, (pose[1] + ry - y0) / cell
-        j, i = math.floor(u), math.floor(v)
-        if not (1 <= i < rows - 2 and 1 <= j < cols - 2):
-            if 0 <= i < rows - 1 and 0 <= j < cols - 1:  # on the rim: no stencil, the value only
-                p, q = u - j, v - i
-                total += (1.0 - q) * ((1.0 - p) * values[i, j] + p * values[i, j + 1])
-                total += q * ((1.0 - p) * values[i + 1, j] + p * values[i + 1, j + 1])
+        j, i = math.floor(u + 0.5), math.floor(v + 0.5)
+        if not (1 <= i < rows - 1 and 1 <= j < cols - 1):
             continue
-        p, q = u - j, v - i
-        v00, v01, v10, v11 = values[i, j], values[i, j + 1], values[i + 1, j], values[i + 1, j + 1]
-        total += (1.0 - q) * ((1.0 - p) * v00 + p * v01) + q * ((1.0 - p) * v10 + p * v11)
-        gx = ((1.0 - q) * (v01 - v00) + q * (v11 - v10)) / cell
-        gy = ((1.0 - p) * (v10 - v00) + p * (v11 - v01)) / cell
-        gradient[0] += gx
-        gradient[1] += gy
-        gradient[2] += gy * rx - gx * ry
-        ci, cj = i + int(q >= 0.5), j + int(p >= 0.5)
-        m = values[ci, cj]
+        t, w = u - j, v - i
+        p0, p1, p2 = _weights(t)
+        a0, a1, a2 = values[i - 1, j - 1], values[i - 1, j], values[i - 1, j + 1]
+        b0, b1, b2 = values[i, j - 1], values[i, j], values[i, j + 1]
+        c0, c1, c2 = values[i + 1, j - 1], values[i + 1, j], values[i + 1, j + 1]
+        a, b, d = p0 * a0 + p1 * a1 + p2 * a2, p0 * b0 + p1 * b1 + p2 * b2, p0 * c0 + p1 * c1 + p2 * c2
+        ax = (t - 0.5) * a0 - 2.0 * t * a1 + (t + 0.5) * a2
+        bx = (t - 0.5) * b0 - 2.0 * t * b1 + (t + 0.5) * b2
+        dx = (t - 0.5) * c0 - 2.0 * t * c1 + (t + 0.5) * c2
+        q0, q1, q2 = _weights(w)
+        m = q0 * a + q1 * b + q2 * d
+        gx = q0 * ax + q1 * bx + q2 * dx
+        gy = (w - 0.5) * a - 2.0 * w * b + (w + 0.5) * d
+        total += m
+        gradient[0] += gx / cell
+        gradient[1] += gy / cell
+        gradient[2] += (gy * rx - gx * ry) / cell
         if m < 0.02:
             continue
-        mx, my = 0.5 * (values[ci, cj + 1] - values[ci, cj - 1]), 0.5 * (values[ci + 1, cj] - values[ci - 1, cj])
-        xx = mx * mx / m - (values[ci, cj + 1] - 2.0 * m + values[ci, cj - 1])
-        yy = my * my / m - (values[ci + 1, cj] - 2.0 * m + values[ci - 1, cj])
-        xy = mx * my / m - 0.25 * (
-            values[ci + 1, cj + 1] - values[ci + 1, cj - 1] - values[ci - 1, cj + 1] + values[ci - 1, cj - 1]
-        )
+        xx = gx * gx / m - (q0 * (a0 - 2.0 * a1 + a2) + q1 * (b0 - 2.0 * b1 + b2) + q2 * (c0 - 2.0 * c1 + c2))
+        yy = gy * gy / m - (a - 2.0 * b + d)
+        xy = gx * gy / m - ((w - 0.5) * ax - 2.0 * w * bx + (w + 0.5) * dx)
         # Between two surfaces the field has a valley, where a direction may curve the other way: left out.
         mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
         root = math.sqrt(half * half + xy * xy)

@@ -93,10 +93,11 @@ class SharedGrid(ParticleGrids):
 
     def write(self, particle: int, scan: ScanCells) -> None:
         """Add a scan's evidence to a particle's map."""
-        tiles = np.unique((scan.cells[: scan.count] >> _SHIFT) @ np.array([1 << 15, 1], np.int32)).size
+        self.ancestry.ranks(particle, self._ranks)
+        self._look += 1
+        tiles = count_tiles(self._found, self._look, scan.cells, scan.count)
         if self._free[1] < tiles:
             self._more(max(tiles, len(self._entries) // 2))
-        self.ancestry.ranks(particle, self._ranks)
         self._look += 1
         write_entries(
             self._head, self._found, self._look, self._entries, self._evidence, self._first, self._held,
@@ -191,6 +192,18 @@ def read_entries(
         e = found[i, j, 1]
         for a in range(4):
             out[k, a] = evidence[e, cells[k, 0] & _MASK, cells[k, 1] & _MASK, a] if e != _NONE else 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_tiles(found: Ints, look: int, cells: Ints, count: int) -> int:
+    """Return how many tiles a scan touches."""
+    tiles = 0
+    for k in range(count):
+        i, j = cells[k, 0] >> _SHIFT, cells[k, 1] >> _SHIFT
+        if found[i, j, 0] != look:
+            found[i, j, 0] = look
+            tiles += 1
+    return tiles
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
