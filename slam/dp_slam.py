@@ -67,6 +67,7 @@ class DpSlam(Backend):
     landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses.
     """
 
+    observes_landmarks = False
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import transform_points
 from slam.motion import OdometryNoise, predict_robot
-from slam.scan_matching import LikelihoodField, MatchConfig, match, refine
+from slam.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.settings import require
 from slam.types import Odometry
 
@@ -36,11 +36,15 @@ class ScanOdometryConfig:
     # Odometry known to less than this is searched over the window of ``MatchConfig``, else only refined.
     search_sigma_m: float = 0.03
     search_sigma_rad: float = 0.015
+    # Wheels that spin in vain are in no odometry noise. Where a motion of anything from none to twice what they
+    # claim fits better by this (twice the log-likelihood; 99 % of chi-square with 3 degrees of freedom), they did.
+    spin_gate: float = 11.34
 
     def __post_init__(self) -> None:
         require(self.scans >= 1, "ScanOdometryConfig.scans must be at least 1")
         require(self.fewest_points >= 1, "ScanOdometryConfig.fewest_points must be at least 1")
         require(0 <= self.least_score <= 1, "ScanOdometryConfig.least_score must be in [0, 1]")
+        require(self.spin_gate > 0, "ScanOdometryConfig.spin_gate must be > 0")
 
 
 class ScanOdometry:
@@ -60,6 +64,7 @@ class ScanOdometry:
         self._scans: deque[tuple[Array, Array]] = deque(maxlen=config.scans)
         self._field: LikelihoodField | None = None
         self._twist = (0.0, 0.0, 0.0)
+        self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since a scan was last believed
         self.settled = np.zeros(3)  # the pose at the last :meth:`settle`
 
     @property
@@ -75,29 +80,40 @@ class ScanOdometry:
         var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         predict_robot(self.pose, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         self._twist = twist
+        way, turn = self._claimed
+        self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
 
     def correct(self, points: Array) -> bool:
         """Match a scan's ends ``(n, 2)`` [m, body frame] to the local map; tell whether that was believed."""
         config = self.config
         believed = False
         if self._field is not None and len(points) >= config.fewest_points:
-            cov = self.cov + np.diag([1e-8, 1e-8, 1e-8])
-            wide = max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2
-            info = np.linalg.inv(cov)
-            if wide:
-                found = match(self._field, points, self.pose, self.matching, prior_info=info)
-            else:
-                found = refine(
-                    self._field, points, self.pose, self.matching, prior=self.pose, prior_info=info
-                )
+            found = self._match(self._field, points)
             believed = found.score >= config.least_score
             if believed:
                 self.pose, self._upper = found.pose.copy(), found.cov
+                self._claimed = (0.0, 0.0)
         if len(points) >= config.fewest_points and (believed or not self._scans) and self._moved_on():
             self._keep(points)
         elif not believed and self._moved_on():
             self._start_over(points)
         return believed
+
+    def _match(self, field: LikelihoodField, points: Array) -> Match:
+        """Match to the local map by what the wheels say, or by what they could have said where they spun."""
+        config, (way, turn) = self.config, self._claimed
+        cov = self.cov + np.eye(3) * 1e-8
+        info = np.linalg.inv(cov)
+        if max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2:
+            found = match(field, points, self.pose, self.matching, prior_info=info)
+        else:
+            found = refine(field, points, self.pose, self.matching, prior=self.pose, prior_info=info)
+        if way == turn == 0.0:
+            return found
+        spun = np.linalg.inv(cov + np.diag(np.square([way, way, max(turn, way / self.noise.lever_m)])))
+        other = refine(field, points, found.pose, self.matching, prior=self.pose, prior_info=spun)
+        better = 2.0 * (other.log_likelihood - found.log_likelihood) > config.spin_gate
+        return other if better else found
 
     def settle(self) -> None:
         """Begin to count motion and its covariance from here."""
