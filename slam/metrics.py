@@ -16,27 +16,39 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.chi_square import chi2_quantile
 from slam.geometry import transform_points, wrap, wrap_scalar
+from slam.relations import (
+    RelationScore,
+    closing_relations,
+    local_relations,
+    relation_errors,
+    relation_score,
+)
 
 __all__ = [
     "CornerDeviation",
     "MapScore",
+    "RelationScore",
     "RelativeError",
     "align_se2",
     "anees",
     "ate",
     "ate_aligned",
     "chi2_quantile",
+    "closing_relations",
     "compare_walls",
     "corner_deviation",
     "coverage",
     "fraction_in_band",
     "free_space_iou",
     "heading_errors",
+    "local_relations",
     "nees",
     "nees_band",
     "nees_pose",
     "nees_pose_invariant",
     "nis",
+    "relation_errors",
+    "relation_score",
     "rpe",
     "time_to",
 ]

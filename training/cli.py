@@ -259,13 +259,20 @@ def complexity(
 def replay(
     log: Annotated[
         Path,
-        typer.Argument(metavar="LOG", help="UTIAS: Robot1_Odometry.dat[.gz] or folder. Victoria Park: folder."),
+        typer.Argument(
+            metavar="LOG",
+            help="CARMEN or DP-SLAM log; UTIAS: Robot1_Odometry.dat or folder; Victoria Park: folder.",
+        ),
     ],
     slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
     association: Annotated[
         str | None, typer.Option(help="known or unknown landmark ids.  [default: known where the log has them]")
     ] = None,
     robot: Annotated[int | None, typer.Option(min=1, help="Which robot of a UTIAS folder.")] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Log of the same scans with corrected poses.  [default: none]"),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
     ] = None,
@@ -279,20 +286,22 @@ def replay(
     """Run a SLAM backend on the recorded log of a real robot, and compare it with the log's reference.
 
     Writes into --out: trajectory_estimate.tum, trajectory_true.tum, trajectory.png, landmarks.db (SQLite),
-    landmarks.csv, config.toml and metrics.json. Ctrl-C ends the replay and keeps it as far as it came.
+    landmarks.csv, config.toml and metrics.json; of a log with scans also map.png and map.pgm with map.yaml (ROS
+    map_server). Ctrl-C ends the replay and keeps it as far as it came.
 
     \b
     Examples:
       mecanum replay utias6/Robot1_Odometry.dat.gz --slam ekf --out out/utias1
       mecanum replay utias6 --robot 3 --association unknown --json
       mecanum replay victoria_park --slam ekf --limit-s 300 --out out/park
+      mecanum replay intel.gfs.log.gz --reference intel-corrected.log.gz --slam invariant-ekf
     """  # noqa: D301
     from training import replay as task
     from training import replay_report
 
     options = task.ReplayOptions(
-        log=log, out=out, robot=robot, slam=slam, association=association, seed=seed, limit_s=limit_s,
-        config=config,
+        log=log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
+        limit_s=limit_s, config=config,
     )  # fmt: skip
     prepared = task.prepare(options)
     progress = task.Progress(prepared.log.duration_s)
@@ -301,7 +310,9 @@ def replay(
     finally:
         progress.close()
     metrics = replay_report.write(prepared)
-    print(json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out))
+    print(
+        json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out, prepared.files)
+    )
     if prepared.interrupted:
         raise Interrupted(f"interrupted after {metrics['duration_s']:.1f} s of the log; what was done is in {out}")
 

@@ -16,14 +16,24 @@ from numpy.typing import NDArray
 
 import slam
 from slam.backend import Backend
-from slam.logs import ObservationNoise, RecordedLog, open_log
+from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_reference
 from slam.metrics import nees_pose
 from slam.motion import move
 from slam.settings import from_mapping, require, to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
 from training.running import interrupt_flag
 
-__all__ = ["FILES", "Progress", "Replay", "ReplayConfig", "ReplayOptions", "prepare", "run", "sample_times"]
+__all__ = [
+    "FILES",
+    "MAP_FILES",
+    "Progress",
+    "Replay",
+    "ReplayConfig",
+    "ReplayOptions",
+    "prepare",
+    "run",
+    "sample_times",
+]
 
 Array = NDArray[np.float64]
 
@@ -33,11 +43,16 @@ FILES = (
 )  # fmt: skip
 """What a replay writes, ``metrics.json`` last: where it is, the others are."""
 
+MAP_FILES = ("map.png", "map.pgm", "map.yaml")
+"""What a replay of a log with scans writes beside them."""
+
 ASSOCIATIONS = ("known", "unknown")
 SAMPLE_S = 0.1
 """Poses are taken, and compared, at the reference's times no nearer to each other, and as often in its gaps."""
 
-_RUN_KINDS: dict[str, tuple[type, ...]] = {"association": (str,), "seed": (int,), "limit_s": (int, float)}
+_RUN_KINDS: dict[str, tuple[type, ...]] = {
+    "association": (str,), "seed": (int,), "limit_s": (int, float), "reference": (str,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +62,7 @@ class ReplayOptions:
     log: Path
     out: Path
     robot: int | None = None
+    reference: Path | None = None  # of a log of scans
     slam: str | None = None
     association: str | None = None
     seed: int | None = None
@@ -58,7 +74,7 @@ class ReplayOptions:
 class ReplayConfig:
     """A replay's configuration file; the log's own values stand where it says nothing."""
 
-    observation: ObservationNoise
+    observation: ObservationNoise | None = None  # of a log of scans there is none
     slam: str = "ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
 
@@ -70,7 +86,7 @@ class ReplayConfig:
 class Replay:
     """A replay: prepared, then run, then written. One entry a sample in what it records."""
 
-    log: RecordedLog
+    log: AnyLog
     config: ReplayConfig
     backend: Backend
     run: dict[str, Any]  # association, seed, … as config.toml's [run] has them
@@ -82,12 +98,14 @@ class Replay:
     time_s: float = 0.0  # how far it came
     steps: int = 0
     observations: int = 0
+    scan_times_s: list[float] = field(default_factory=list)  # wall clock of prediction and update, one a scan
     end: str = "end of the log"
     interrupted: bool = False
     wall_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         self.headings = self.log.has_heading
+        self.files = (*MAP_FILES, *FILES) if isinstance(self.log, ScanLog) else FILES
 
     def trajectories(self) -> tuple[Array, Array, Array]:
         """Return times ``(n,)``, reference ``(n, 3)`` and estimate ``(n, 3)`` where there is a reference."""
@@ -112,11 +130,14 @@ def prepare(options: ReplayOptions) -> Replay:
     with bad_input():
         if options.slam is not None:
             slam.config_type(options.slam)  # before a log is read in vain
-        check_writable(options.out, FILES)
+        check_writable(options.out, (*MAP_FILES, *FILES))
         values = _read_config(options.config) if options.config is not None else {}
         run = {"seed": 0} | _run_table(values.pop("run", {}), options.config)
         run |= {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
         log = open_log(options.log, robot=options.robot)
+        if "reference" in run:
+            log = with_reference(log, run["reference"])
+            run["reference"] = str(Path(run["reference"]).absolute())
         association = run.setdefault("association", "unknown" if log.ids is None else "known")
         if association not in ASSOCIATIONS:
             raise unknown_name("association", association, ASSOCIATIONS)
@@ -129,7 +150,8 @@ def prepare(options: ReplayOptions) -> Replay:
         config = _make_config(log, values, options.slam)
         backend = slam.make(config.slam, config=config.slam_config)
         if hasattr(backend, "give_pose") and not log.has_heading:
-            raise ValueError(f"--slam {config.slam} needs true poses; log {log.name} has only positions")
+            lacks = "none: give --reference" if isinstance(log, ScanLog) else "only positions"
+            raise ValueError(f"--slam {config.slam} needs true poses; log {log.name} has {lacks}")
         backend.reset(log.start_pose, seed=run["seed"])
     run |= {"log": str(options.log.absolute()), "clock_start_s": log.clock_start_s}
     if options.robot is not None:
@@ -138,8 +160,15 @@ def prepare(options: ReplayOptions) -> Replay:
     return Replay(log, config, backend, run, options.out, times, rows)
 
 
-def sample_times(log: RecordedLog) -> tuple[Array, NDArray[np.int64]]:
-    """Return when poses are taken ``(s,)`` [s], and the row of the reference there ``(s,)``, -1 in its gaps."""
+def sample_times(log: AnyLog) -> tuple[Array, NDArray[np.int64]]:
+    """Return when poses are taken ``(s,)`` [s], and the row of the reference there ``(s,)``, -1 in its gaps.
+
+    Of a log of scans they are taken after each scan, where alone its reference is.
+    """
+    if isinstance(log, ScanLog):
+        scan_rows = np.full(len(log.times), -1, np.int64)
+        scan_rows[np.searchsorted(log.times, log.reference_times)] = np.arange(len(log.reference_times))
+        return log.times, scan_rows
     times: list[float] = []
     rows: list[int] = []
     reference = [*log.reference_times.tolist(), log.duration_s]
@@ -156,8 +185,10 @@ def sample_times(log: RecordedLog) -> tuple[Array, NDArray[np.int64]]:
     return np.array(times), np.array(rows, np.int64)
 
 
-def _make_config(log: RecordedLog, values: Mapping[str, Any], backend: str | None) -> ReplayConfig:
+def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) -> ReplayConfig:
     """Lay a config file over the log's own values; return the effective configuration, complete."""
+    if "observation" in values and log.observation_noise is None:
+        raise ValueError(f"log {log.name} holds scans, no observations; take [observation] out of the config")
     config = from_mapping(ReplayConfig, values, base=ReplayConfig(observation=log.observation_noise))
     name = backend or config.slam
     kind = slam.config_type(name)
@@ -176,7 +207,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _run_table(run: object, path: Path | None) -> dict[str, Any]:
-    """Return association, seed and limit from a config's [run] table, where it has them."""
+    """Return association, seed, limit and reference from a config's [run] table, where it has them."""
     if not isinstance(run, dict):
         raise BadInput(f"config {path}: [run] must be a table; see a config.toml")
     for key, kinds in _RUN_KINDS.items():
@@ -203,6 +234,7 @@ def run(replay: Replay, progress: Callable[[float], None]) -> None:
     with interrupt_flag() as interrupted:
         for event in log.events(replay.config.observation, known=known):
             _sample(replay, event.time_s, event.odometry.twist)
+            at = time.perf_counter()
             if event.odometry.dt > 0:
                 backend.predict(event.odometry)
                 replay.steps += 1
@@ -211,14 +243,19 @@ def run(replay: Replay, progress: Callable[[float], None]) -> None:
             if event.observations is not None:
                 backend.observe(event.observations)
                 replay.observations += len(event.observations.range_bearing)
+            if event.scan is not None:
+                backend.update(event.scan)
+                replay.scan_times_s.append(time.perf_counter() - at)
             replay.time_s = event.time_s
             progress(event.time_s)
             if interrupted.is_set():
                 replay.end, replay.interrupted = "interrupted", True
                 break
             if not math.isfinite(math.fsum(backend.pose)):
-                name, at = replay.config.slam, event.time_s
-                raise ArithmeticError(f"{name} diverged {at:.1f} s into the log: its pose is not finite any more")
+                name, when = replay.config.slam, event.time_s
+                raise ArithmeticError(
+                    f"{name} diverged {when:.1f} s into the log: its pose is not finite any more"
+                )
         else:
             _sample(replay, math.inf, (0.0, 0.0, 0.0))
     replay.wall_time_s = time.perf_counter() - began
@@ -254,7 +291,7 @@ class Progress:
     def __call__(self, time_s: float) -> None:
         """Show it, where it is time to."""
         now = time.monotonic()
-        if now < self._next:
+        if now < self._next or time_s <= 0.0:
             return
         self._next = now + (0.2 if self._terminal else 30.0)
         left = (now - self._began) * (self._duration - time_s) / max(time_s, 1e-9)

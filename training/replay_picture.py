@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["draw_replay"]
+from mecanum_env.canvas import View
+from mecanum_env.paint import extent, with_margin
+from mecanum_env.pictures import draw_map
+from slam.occupancy import UNKNOWN
+from slam.types import Belief
+
+__all__ = ["draw_belief", "draw_replay"]
 
 Array = NDArray[np.float64]
 
@@ -65,6 +71,15 @@ def draw_replay(
             cv2.circle(picture, centre, size, _COLOURS["landmarks"], thickness, cv2.LINE_AA, _FRACTION_BITS)
     _write_foot(picture, height, scale, span, title)
     return picture
+
+
+def draw_belief(belief: Belief, estimate: Array, title: str, *, longest_px: int = 1600) -> NDArray[np.uint8]:
+    """Draw the map at the end of a replay, as far as it is known, with the path ``(n ≥ 1, ≥ 2)`` on it."""
+    grid = belief.grid
+    known = extent(grid.classes() != UNKNOWN, grid.resolution, grid.origin)
+    x, y = belief.pose[:2].tolist()
+    view = View.around(with_margin(known or (x - 1.0, y - 1.0, x + 1.0, y + 1.0)), longest_px=longest_px)
+    return draw_map(belief, estimate, view=view, title=title)
 
 
 def _write_foot(picture: NDArray[np.uint8], top: int, scale: float, span: float, title: str) -> None:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -17,13 +17,15 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from slam.formats import atomic_write, write_tum
+from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
+from slam.logs import ScanLog
 from slam.metrics import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
 from slam.types import Belief
 from training.replay import FILES, Replay
-from training.replay_picture import draw_replay
+from training.replay_picture import draw_belief, draw_replay
+from training.replay_scans import scan_metrics
 from training.running import interrupt_flag, plain, versions
 
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
@@ -64,6 +66,8 @@ def metrics(replay: Replay) -> dict[str, Any]:
         "slam": replay.config.slam, "association": replay.run["association"], "log": replay.log.name,
         "seed": replay.run["seed"], "end": replay.end, "interrupted": replay.interrupted, "note": replay.log.note,
     }  # fmt: skip
+    if isinstance(replay.log, ScanLog):
+        found |= scan_metrics(replay, replay.log)
     return {key: plain(value) for key, value in found.items()}
 
 
@@ -91,7 +95,7 @@ def write(replay: Replay) -> dict[str, Any]:
     try:
         with interrupt_flag():  # one Ctrl-C does not leave half the files of this replay, half of another
             found = _write_into(folder, replay)
-            for name in FILES:
+            for name in replay.files:
                 (folder / name).replace(out / name)
         return found
     finally:
@@ -120,6 +124,10 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
         surveyed=surveyed if log.landmarks is None else log.landmarks,
         title=f"{log.name}   {replay.config.slam}, {replay.run['association']} association",
     )  # fmt: skip
+    if isinstance(log, ScanLog):
+        write_map_server(folder / "map", belief.grid)
+        title = f"{log.name}   {replay.config.slam}"
+        atomic_write(folder / "map.png", cv2.imencode(".png", draw_belief(belief, estimates, title))[1].tobytes())
     atomic_write(folder / "trajectory.png", cv2.imencode(".png", picture)[1].tobytes())
     atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": _run_values(replay)}))
     found = metrics(replay)
@@ -155,21 +163,29 @@ def _at(times: Array, stamps: Array, poses: Array) -> Array:
     return np.column_stack([np.interp(times, stamps, column) for column in columns])
 
 
-def summary(found: Mapping[str, Any], out: Path) -> str:
+def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -> str:
     """Return what is printed at the end, where no JSON is wanted."""
 
     def shown(key: str, unit: str, digits: int = 2) -> str:
         return "-" if found[key] is None else f"{found[key]:.{digits}f} {unit}".rstrip()
 
     speed = f"{found['wall_s']:.1f} s, {found['realtime_factor']:.0f} times real time"
+    scan_rows: list[tuple[str, str]] = []
+    sensed = f"{found['observations']} observations"
+    if "scans" in found:
+        error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
+        local = shown("relations_local_trans_m", "m", 3)
+        scan_rows.append(("relations", f"{error}, {local} along the way"))
+        sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
     rows = (
         ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
-        ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {found['observations']} observations"),
+        ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {sensed}"),
         ("trajectory", f"{shown('ate_rmse_m', 'm')} off, {shown('ate_aligned_m', 'm')} aligned"),
         ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
         ("landmarks", f"{found['landmarks']}, {shown('landmark_rmse_m', 'm')} off"),
         ("NEES / 3", shown("anees", "")),
+        *scan_rows,
         ("took", speed),
-        ("files", f"{out}/: {', '.join(FILES)}"),
+        ("files", f"{out}/: {', '.join(files)}"),
     )
     return "\n".join(f"{name:<12} {text}" for name, text in rows)

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slam.logs import carmen, dpslam, utias, victoria_park
 from slam.logs.log import Event
@@ -19,6 +20,8 @@ from slam.logs.tables import read_lines
 __all__ = ["AnyLog", "Event", "ObservationNoise", "RecordedLog", "ScanLog", "open_log", "with_reference"]
 
 AnyLog = RecordedLog | ScanLog
+
+Rows = NDArray[np.int64]
 
 _UTIAS_FILE = re.compile(r"Robot(\d+)_Odometry\.dat(?:\.gz)?")
 
@@ -100,20 +103,11 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
         poses = dpslam.read(path).odometry_poses[: len(log.times)]
         return log.with_reference(np.arange(len(poses)), poses, note)
     stamps, poses = carmen.read_poses(path)
-    of_stamp: dict[int, list[int]] = {}
-    for row, stamp in enumerate(stamps.tolist()):
-        of_stamp.setdefault(round(stamp * 1e4), []).append(row)
-    for rows in of_stamp.values():
-        rows.reverse()  # taken from the end: the first of equal stamps first
-    pairs: list[tuple[int, int]] = []
-    for i, stamp in enumerate(log.stamps.tolist()):
-        if left := of_stamp.get(round(stamp * 1e4)):
-            pairs.append((i, left.pop()))
-    if not pairs:
+    scans, matched = _with_equal_stamps(log.stamps.tolist(), stamps.tolist())
+    if not len(scans):
         raise ValueError(
             f"reference {path} has no scan at a time stamp of {log.name}'s; give a log of the same scans"
         )
-    scans, matched = np.array(pairs, np.int64).T
     return log.with_reference(scans, poses[matched], note)
 
 
@@ -121,6 +115,19 @@ _KNOWN = (
     "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), the folder with steering.txt[.gz] (Victoria Park), or a "
     "file with FLASER lines (CARMEN) or Odometry and Laser lines (DP-SLAM)"
 )
+
+
+def _with_equal_stamps(stamps: list[float], of_reference: list[float]) -> tuple[Rows, Rows]:
+    """Return the rows of one list and those of the other with the same stamp to 0.1 ms, equal ones in order."""
+    rows_of: dict[int, list[int]] = {}
+    for row in reversed(range(len(of_reference))):  # taken from the end: the first of equal stamps first
+        rows_of.setdefault(round(of_reference[row] * 1e4), []).append(row)
+    pairs: list[tuple[int, int]] = []
+    for i, stamp in enumerate(stamps):
+        if rows := rows_of.get(round(stamp * 1e4)):
+            pairs.append((i, rows.pop()))
+    mine, others = np.array(pairs, np.int64).reshape(-1, 2).T
+    return mine, others
 
 
 def _open_scans(path: Path) -> ScanLog:
@@ -133,7 +140,7 @@ def _open_scans(path: Path) -> ScanLog:
 def _kind_of(path: Path) -> str | None:
     """Return "carmen", "dpslam" or, where no line at the beginning is either's, ``None``."""
     for number, line in read_lines(path):
-        word = line.partition(" ")[0].strip()
+        word = "".join(line[:20].split(maxsplit=1)[:1])
         if word in _CARMEN_WORDS:
             return "carmen"
         if word in _DPSLAM_WORDS:

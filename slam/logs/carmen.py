@@ -47,7 +47,7 @@ def read(path: Path) -> ScanLog:
     ValueError
         One line: the file and the line that is cut short or damaged, or that there is no scan.
     """
-    ranges, poses, odometry, stamps = _scans(path, with_odometry=True)
+    ranges, poses, odometry, stamps = _scans(path)
     robot = poses[:, 3:6]  # FLASER's odometry
     travelled = chain(odometry[0], relative(robot[:-1], odometry[1:]))
     mount = relative(robot, poses[:, :3])
@@ -71,7 +71,7 @@ def read_poses(path: Path) -> tuple[Array, Array]:
 
     Raises ``ValueError`` as :func:`read` does.
     """
-    _, poses, _, stamps = _scans(path, with_odometry=False)
+    _, poses, _, stamps = _scans(path)
     return stamps, poses[:, :3].copy()
 
 
@@ -85,7 +85,7 @@ def beam_angles(beams: int) -> tuple[float, float]:
     return math.radians(-90.0), math.radians(step)
 
 
-def _scans(path: Path, *, with_odometry: bool) -> tuple[Array, Array, Array, Array]:
+def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
     """Return ranges (n, beams), FLASER's two poses (n, 6), odometry there (n, 3) and time stamps (n,)."""
     ranges: list[Array] = []
     poses: list[Array] = []
@@ -93,18 +93,18 @@ def _scans(path: Path, *, with_odometry: bool) -> tuple[Array, Array, Array, Arr
     stamps: list[float] = []
     before: Array | None = None  # x y θ tv rv accel time of the ODOM line right before
     for number, line in read_lines(path):
-        kind, _, rest = line.partition(" ")
-        if kind == "ODOM" and with_odometry:
-            before = _odom(rest.split(), path, number)
-        elif kind == "FLASER":
-            words = rest.split()
+        kind = line[:7].split(maxsplit=1)[:1]  # most lines are of a kind that is passed over
+        if kind == ["ODOM"]:
+            before = _odom(line.split()[1:], path, number)
+        elif kind == ["FLASER"]:
+            words = line.split()[1:]
             n = _beams(words, path, number)
-            if ranges and n != len(ranges[0]):
-                raise ValueError(f"{path}, line {number}: a scan of {n} beams after scans of {len(ranges[0])}; "
-                                 "give a log of one laser")  # fmt: skip
             scan = numbers_of(words[1 : 1 + n], path=path, line=number, what="a range of FLASER")
             if scan.min() < 0:
                 raise ValueError(f"{path}, line {number}: range {scan.min():g} is below 0; correct the line")
+            if ranges and n != len(ranges[0]):
+                raise ValueError(f"{path}, line {number}: a scan of {n} beams after scans of {len(ranges[0])}; "
+                                 "give a log of one laser")  # fmt: skip
             at = numbers_of(words[1 + n : 8 + n], path=path, line=number, what="pose or time of FLASER")
             same = before is not None and before[6] == at[6]
             ranges.append(scan)

@@ -54,8 +54,7 @@ def _pairs(path: Path) -> tuple[Array, Array]:
     ranges: list[Array] = []
     pose: Array | None = None
     for number, line in read_lines(path):
-        kind, _, rest = line.partition(" ")
-        words = rest.split()
+        kind, words = (line.split() or [""])[0], line.split()[1:]
         if kind == "Odometry":
             if len(words) != 3:
                 raise ValueError(f"{path}, line {number}: expected 3 values after Odometry (x y theta), got "

@@ -144,7 +144,7 @@ def rising(stamps: Array) -> Array:
     tails: list[float] = []  # the least last value of a rising subsequence of each length …
     where: list[int] = []  # … where it stands …
     before = np.full(len(stamps), -1)  # … and what comes before each value
-    for i, stamp in enumerate(stamps.tolist()):
+    for i, stamp in enumerate(np.round(stamps, 6).tolist()):  # less than a microsecond is no later
         k = bisect_left(tails, stamp)
         before[i] = where[k - 1] if k else -1
         tails[k : k + 1], where[k : k + 1] = [stamp], [i]

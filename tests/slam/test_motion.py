@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam.geometry import compose, exp, wrap
-from slam.motion import OdometryNoise, jacobians, move, predict_robot
+from slam.motion import OdometryNoise, jacobians, move, predict_robot, twist_between
 from tests.slam.numerics import numerical_jacobian, random_covariance
 
 poses = st.tuples(st.floats(-9, 9), st.floats(-9, 9), st.floats(-3, 3)).map(np.array)
@@ -25,6 +25,16 @@ def test_move_agrees_with_the_exponential_to_third_order(pose: np.ndarray, twist
     exact = compose(pose, exp(twist * 0.1))
     bound = np.hypot(*twist[:2]) * 0.1 * (0.1 * abs(twist[2])) ** 2 / 20 + 1e-12
     assert np.hypot(*(move(pose, twist, 0.1) - exact)[:2]) <= bound
+
+
+@given(poses, poses, st.floats(0.01, 100.0))
+def test_the_twist_between_poses_moves_from_one_to_the_other(
+    pose: np.ndarray, after: np.ndarray, dt: float
+) -> None:
+    twist = twist_between(pose, after, dt)
+    moved = move(pose, twist, dt)
+    np.testing.assert_allclose(moved[:2], after[:2], atol=1e-9)
+    assert abs(wrap(moved[2] - after[2])) < 1e-9 and abs(twist[2] * dt) <= np.pi
 
 
 @settings(max_examples=50)
