@@ -40,12 +40,10 @@ class DpSlamConfig(BackendConfig):
     particles: int = 30
     update_m: float = 0.2  # the particles are updated when the robot has moved …
     update_rad: float = 0.2  # … or turned so far since the last time
-    # What scan-matched odometry may have drifted from one update to the next, besides its own covariance: a floor
-    # each, and shares of the way, which a turn lengthens by the odometry's lever.
-    drift_m: float = 0.003
-    drift_rad: float = 0.0015
-    drift_share: float = 0.03
-    drift_rad_m: float = 0.015
+    # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More than
+    # it does: particles that all go one way cannot close a loop (docs/slam.md).
+    drift_m: float = 0.02
+    drift_rad: float = 0.01
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
     # of no surface: what is new says less against a particle than what contradicts its map.
     unknown: float = 0.3
@@ -59,8 +57,7 @@ class DpSlamConfig(BackendConfig):
         super().__post_init__()
         require(self.particles >= 1, "DpSlamConfig.particles must be at least 1")
         require(self.update_m >= 0 and self.update_rad >= 0, "DpSlamConfig.update_* must be ≥ 0")
-        require(self.drift_m > 0 and self.drift_rad > 0, "DpSlamConfig.drift_m and drift_rad must be > 0")
-        require(self.drift_share >= 0 and self.drift_rad_m >= 0, "DpSlamConfig.drift_* must be ≥ 0")
+        require(self.drift_m > 0 and self.drift_rad > 0, "DpSlamConfig.drift_* must be > 0")
         require(0 < self.free <= 1 and 0 < self.unknown <= 1, "DpSlamConfig.free and unknown must be in (0, 1]")
 
 
@@ -149,8 +146,7 @@ class DpSlam(Backend):
         reach = float(np.sqrt((points * points).sum(axis=1).max(initial=0.0))) + abs(config.lidar_offset_m)
         self.grids.enclose(guesses[:, :2].min(axis=0) - reach, guesses[:, :2].max(axis=0) + reach)
         if self._key:
-            way = math.hypot(motion[0], motion[1]) + config.odometry.lever_m * abs(float(motion[2]))
-            self._draw_poses(guesses, points, way)
+            self._draw_poses(guesses, points)
         else:
             self._poses = guesses
         self._odometry.settle()
@@ -162,11 +158,10 @@ class DpSlam(Backend):
         if self.resampled:
             self._resample(ancestors)
 
-    def _draw_poses(self, guesses: Array, points: Array, way_m: float) -> None:
+    def _draw_poses(self, guesses: Array, points: Array) -> None:
         """Sample from the Gaussian around each particle's best fit; its weight is the evidence, at the peak."""
         config, odometry = self.config, self._odometry
-        sigma_m = config.drift_m + config.drift_share * way_m
-        drift = np.diag(np.square([sigma_m, sigma_m, config.drift_rad + config.drift_rad_m * way_m]))
+        drift = np.diag(np.square([config.drift_m, config.drift_m, config.drift_rad]))
         normals = self._rng.standard_normal(self._poses.shape)
         for i, guess in enumerate(guesses):
             # From the local frame, in which the covariance is kept, to the particle's.

@@ -60,9 +60,7 @@ class ParticleMatcher:
         cell = lattice.cell_m
         x0, y0 = (lattice.col + col + 0.5) * cell, (lattice.row + row + 0.5) * cell
         best, curvature = pose.copy(), np.zeros((3, 3))
-        climb(
-            self._values, x0, y0, cell, points, best, pose, info, config.gain, config.iterations, curvature
-        )
+        climb(self._values, x0, y0, cell, points, best, pose, info, config.gain, config.iterations, curvature)
         log_likelihood = weigh(
             self._values, self._plane, x0, y0, cell, points, best, pose, info, config.beam_weight, unknown, free
         )

@@ -299,7 +299,14 @@ def field_sum(values: Values, x0: float, y0: float, cell: float, points: Array, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slope(
-    values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array, gradient: Array, curvature: Array
+    values: Values,
+    x0: float,
+    y0: float,
+    cell: float,
+    points: Array,
+    pose: Array,
+    gradient: Array,
+    curvature: Array,
 ) -> float:
     """Return :func:`field_sum`; write its exact gradient ``(3,)`` and the curvature ``(3, 3)`` for Gauss-Newton.
 

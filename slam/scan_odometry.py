@@ -124,10 +124,9 @@ class ScanOdometry:
         if not self._scans:
             return True
         last, config = self._scans[-1][0], self.config
-        return (
-            math.hypot(self.pose[0] - last[0], self.pose[1] - last[1]) >= config.spacing_m
-            or math.cos(self.pose[2] - last[2]) <= math.cos(min(config.spacing_rad, math.pi))
-        )
+        return math.hypot(self.pose[0] - last[0], self.pose[1] - last[1]) >= config.spacing_m or math.cos(
+            self.pose[2] - last[2]
+        ) <= math.cos(min(config.spacing_rad, math.pi))
 
     def _keep(self, points: Array) -> None:
         self._scans.append((self.pose.copy(), points))

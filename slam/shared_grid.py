@@ -43,7 +43,9 @@ class SharedGrid(ParticleGrids):
         super().__init__(particles, cell_m)
         self.ancestry = Ancestry(particles)
         self._head = self._blank()  # first entry of each tile
-        self._found = np.zeros((*self._head.shape, 2), np.int32)  # of each tile: who looked last, and what was found
+        self._found = np.zeros(
+            (*self._head.shape, 2), np.int32
+        )  # of each tile: who looked last, and what was found
         self._entries = np.zeros((0, 6), np.int32)
         self._evidence = np.zeros((0, TILE, TILE, 4), np.float32)
         self._first = np.full(2 * particles, _NONE, np.int32)  # entry of each node …
@@ -112,9 +114,7 @@ class SharedGrid(ParticleGrids):
         """Write the evidence ``(n, 4)`` that a particle has of array cells ``(n, 2)``."""
         self.ancestry.ranks(particle, self._ranks)
         self._look += 1
-        read_entries(
-            self._head, self._found, self._look, self._entries, self._evidence, self._ranks, cells, out
-        )
+        read_entries(self._head, self._found, self._look, self._entries, self._evidence, self._ranks, cells, out)
 
     def _forget(self, node: int) -> None:
         forget_node(node, self._head, self._entries, self._first, self._held, self._free)

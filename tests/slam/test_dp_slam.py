@@ -301,7 +301,9 @@ def test_landmark_observations_are_refused() -> None:
 
 
 def test_configuration_is_checked() -> None:
-    config = from_mapping(DpSlamConfig, {"particles": 5, "matching": {"cell_m": 0.1}, "scan_odometry": {"scans": 4}})
+    config = from_mapping(
+        DpSlamConfig, {"particles": 5, "matching": {"cell_m": 0.1}, "scan_odometry": {"scans": 4}}
+    )
     assert config.matching.cell_m == 0.1 and config.scan_odometry.scans == 4
     assert config.resampling == ResamplingPolicy() and config.odometry == OdometryNoise()
     for bad, message in (
