@@ -1,9 +1,9 @@
 """The ancestry tree of DP-SLAM's particles (Eliazar and Parr 2003): who descends from whom, kept minimal.
 
-Every particle is a leaf. A node holds what its particle observed while it was a leaf: its descendants share it. When
-particles are resampled, leaves without descendants are removed with all that only they had observed, up to the
-nearest node that still has a descendant, and a node with a single child left is merged with it. So inner nodes have
-at least two children, and n particles have at most 2n - 1 nodes, however long the history.
+Every particle is a leaf. A node holds what its particle observed while it was a leaf: its descendants share it.
+When particles are resampled, leaves without descendants are removed with all that only they had observed, up to
+the nearest node that still has a descendant, and a node with a single child left is merged with it. So inner
+nodes have at least two children, and n particles have at most 2n - 1 nodes, however long the history.
 """
 
 from __future__ import annotations

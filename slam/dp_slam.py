@@ -1,9 +1,10 @@
 """DP-SLAM: particles over occupancy grids without landmarks, backend ``dp-slam`` (theory.md B and D).
 
-Eliazar and Parr's shared grid and ancestry tree (2003, 2004) hold the maps, so that memory and time do not multiply by
-the particles. Each particle's pose is drawn around where the scan fits its own map (Grisetti, Stachniss and Burgard
-2007), starting from scan-matched odometry (Hähnel et al. 2003), so that few particles suffice. They are updated when
-the robot has moved on; between two updates the scan-matched odometry carries all of them along.
+Eliazar and Parr's shared grid and ancestry tree (2003, 2004) hold the maps, so that memory and time do not
+multiply by the particles. Each particle's pose is drawn around where the scan fits its own map (Grisetti,
+Stachniss and Burgard 2007), starting from scan-matched odometry (Hähnel et al. 2003), so that few particles
+suffice. They are updated when the robot has moved on; between two updates the scan-matched odometry carries all
+of them along.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class DpSlamConfig(BackendConfig):
     particles: int = 30
     update_m: float = 0.2  # the particles are updated when the robot has moved …
     update_rad: float = 0.2  # … or turned so far since the last time
-    # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More than
-    # it does: particles that all go one way cannot close a loop (docs/slam.md).
+    # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More
+    # than it does: particles that all go one way cannot close a loop (docs/slam.md).
     drift_m: float = 0.02
     drift_rad: float = 0.01
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows

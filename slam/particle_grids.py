@@ -1,9 +1,9 @@
-"""What the maps of DP-SLAM's particles are made of, however they are stored: evidence per cell, and scans as cells.
+"""What the maps of DP-SLAM's particles are made of, however they are stored: evidence in cells, scans as cells.
 
-A cell counts the scans in which a beam ended in it and those in which beams only passed, and where in it they ended
-on the average: DP-SLAM's density (stops over traversals) with a scan as the unit instead of the way within the cell.
-Against log-odds it has no limits to saturate at, it tells "never seen" from "seen both ways", and the mean place of
-the ends gives walls to a fraction of a cell, which is what a scan is matched against.
+A cell counts the scans in which a beam ended in it and those in which beams only passed, and where in it they
+ended on the average: DP-SLAM's density (stops over traversals) with a scan as the unit instead of the way within
+the cell. Against log-odds it has no limits to saturate at, it tells "never seen" from "seen both ways", and the
+mean place of the ends gives walls to a fraction of a cell, which is what a scan is matched against.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Lattice:
 
 
 class ScanCells:
-    """The cells that a scan touched: array ``row`` and ``col`` ``(n,)``, and ``evidence`` ``(n, 4)`` to be added."""
+    """The array cells that a scan touched ``(count, 2)``, and the ``evidence`` ``(count, 4)`` to be added."""
 
     def __init__(self) -> None:
         self.cells = np.zeros((0, 2), np.int32)
@@ -65,7 +65,7 @@ class ScanCells:
         self._serial = 0
 
     def trace(self, lattice: Lattice, pose: Array, offset_m: float, points: Array) -> None:
-        """Fill in the cells of beams from the sensor to ``points`` ``(n, 2)`` [m, body frame], seen from a pose."""
+        """List the cells of beams from the sensor to ``points`` ``(n, 2)`` [m, body frame], seen from a pose."""
         if self._stamp.shape != lattice.shape:
             self._stamp, self._slot = np.zeros(lattice.shape, np.int32), np.zeros(lattice.shape, np.int32)
             self._serial = 0

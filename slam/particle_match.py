@@ -8,8 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.geometry import wrap_scalar
 from slam.particle_grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
-from slam.scan_matching import MatchConfig, Values, climb, stamps_of
+from slam.scan_matching import MatchConfig, Values, climb, prior_loss, stamps_of
 
 __all__ = ["ParticleMatcher"]
 
@@ -46,7 +47,8 @@ class ParticleMatcher:
         points : Array
             ``(n, 2)`` ends of beams [m, body frame].
         unknown, free : float
-            Likelihood, against 1 on a surface, of an end where the map knows nothing, and where it knows no surface.
+            Likelihood, against 1 on a surface, of an end where the map knows nothing, and where it knows no
+            surface.
 
         Returns
         -------
@@ -91,7 +93,7 @@ def wanted_cells(
     points: Array, pose: Array, cell: float, row0: int, col0: int, rows: int, cols: int, row: int, col: int,
     side: int, plane: Bytes, cells: Ints,
 ) -> int:  # fmt: skip
-    """List the array cells of the blocks around the beams' ends, and mark them as unknown in the window's plane."""
+    """List the array cells of the blocks around the beams' ends, and mark them unknown in the window's plane."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     n = 0
     for k in range(points.shape[0]):
@@ -155,11 +157,8 @@ def weigh(
             value, state = values[i, j], plane[i, j]
         floor = free if state == _KNOWN else unknown
         total += math.log(floor + (1.0 - floor) * value)
-    dx, dy, dt = pose[0] - prior[0], pose[1] - prior[1], pose[2] - prior[2]
-    dt -= 2.0 * math.pi * math.floor(dt / (2.0 * math.pi) + 0.5)
-    loss = info[0, 0] * dx * dx + info[1, 1] * dy * dy + info[2, 2] * dt * dt
-    loss += 2.0 * (info[0, 1] * dx * dy + info[0, 2] * dx * dt + info[1, 2] * dy * dt)
-    return beam_weight * total - 0.5 * loss
+    dx, dy, dt = pose[0] - prior[0], pose[1] - prior[1], wrap_scalar(pose[2] - prior[2])
+    return beam_weight * total - prior_loss(info, dx, dy, dt)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -2,11 +2,11 @@
 
 The map is a likelihood field: every cell holds exp(-d²/2s²), d the distance to the nearest surface point. A match
 first searches a bounded window over x, y and θ exhaustively (Olson 2009, "Real-time correlative scan matching": a
-coarse table of maxima bounds blocks of poses, so that few are looked at closely), then climbs to the top between the
-cells (Gauss-Newton on the interpolated field, as Kohlbrecher et al. 2011, "A flexible and scalable SLAM system with
-full 3D motion estimation"; by a quadratic spline, since between two cells the same distance from a wall a bilinear
-field is flat, and says nothing of where between them the wall is). Each beam counts by Welsch's robust loss, so
-what the map does not know yet, people and lost beams pull little or not at all.
+coarse table of maxima bounds blocks of poses, so that few are looked at closely), then climbs to the top between
+the cells (Gauss-Newton on the interpolated field, as Kohlbrecher et al. 2011, "A flexible and scalable SLAM
+system with full 3D motion estimation"; by a quadratic spline, since between two cells the same distance from a
+wall a bilinear field is flat, and says nothing of where between them the wall is). Each beam counts by Welsch's
+robust loss, so what the map does not know yet, people and lost beams pull little or not at all.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def match(
 def search(
     field: LikelihoodField, points: Array, guess: Array, config: MatchConfig, *, prior_info: Array | None = None,
 ) -> Array:  # fmt: skip
-    """Return the best pose ``(3,)`` of the window, to a cell and ``step_rad``: exhaustive, by bounds (Olson 2009)."""
+    """Return the best pose ``(3,)`` of the window, to a cell and ``step_rad``: exhaustive, by bounds (Olson)."""
     info = np.zeros((3, 3)) if prior_info is None else np.asarray(prior_info, dtype=np.float64)
     shifts = math.ceil(config.window_m / config.cell_m)
     turns = math.ceil(config.window_rad / config.step_rad)
@@ -257,7 +257,7 @@ def correlate(
                     if 0 <= r < rows and 0 <= q < cols:
                         total += values[r, q]
                 dx, dy, dt = (dj - shifts) * cell, (di - shifts) * cell, (a - turns) * step
-                value = gain * total - _loss(info, dx, dy, dt)
+                value = gain * total - prior_loss(info, dx, dy, dt)
                 if value > best:
                     best = value
                     found[0], found[1], found[2] = guess[0] + dx, guess[1] + dy, wrap_scalar(guess[2] + dt)
@@ -265,16 +265,18 @@ def correlate(
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _loss(info: Array, dx: float, dy: float, dt: float) -> float:
-    return 0.5 * (
+def prior_loss(info: Array, dx: float, dy: float, dt: float) -> float:
+    """Return what a prior of information ``(3, 3)`` loses [nat] at a distance from its mean."""
+    loss: float = 0.5 * (
         info[0, 0] * dx * dx + info[1, 1] * dy * dy + info[2, 2] * dt * dt
         + 2.0 * (info[0, 1] * dx * dy + info[0, 2] * dx * dt + info[1, 2] * dy * dt)
     )  # fmt: skip
+    return loss
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _weights(t: float) -> tuple[float, float, float]:
-    """Return the quadratic B-spline's weights of the cell before, this one and the next, ``t`` in [-½, ½] off it."""
+    """Return the quadratic B-spline's weights of three cells, ``t`` in [-½, ½] off the middle one."""
     return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
 
 
@@ -380,7 +382,7 @@ def climb(
     for iteration in range(iterations + 1):
         total = slope(values, x0, y0, cell, points, pose, gradient, hessian)
         dx, dy, dt = pose[0] - prior[0], pose[1] - prior[1], wrap_scalar(pose[2] - prior[2])
-        height = gain * total - _loss(info, dx, dy, dt)
+        height = gain * total - prior_loss(info, dx, dy, dt)
         for a in range(3):
             gradient[a] = gain * gradient[a] - (info[a, 0] * dx + info[a, 1] * dy + info[a, 2] * dt)
             for b in range(3):
@@ -394,7 +396,7 @@ def climb(
             for a in range(3):
                 trial[a] = pose[a] + scale * step[a]
             tx, ty, tt = trial[0] - prior[0], trial[1] - prior[1], wrap_scalar(trial[2] - prior[2])
-            reached = gain * field_sum(values, x0, y0, cell, points, trial) - _loss(info, tx, ty, tt)
+            reached = gain * field_sum(values, x0, y0, cell, points, trial) - prior_loss(info, tx, ty, tt)
             if reached > height:
                 better = True
                 break

@@ -103,7 +103,7 @@ class ScanOdometry:
         """Match to the local map by what the wheels say, or by what they could have said where they spun."""
         config, (way, turn) = self.config, self._claimed
         cov = self.cov + np.eye(3) * 1e-8
-        info = np.linalg.inv(cov)
+        info = np.asarray(np.linalg.inv(cov), np.float64)
         if max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2:
             found = match(field, points, self.pose, self.matching, prior_info=info)
         else:

@@ -1,14 +1,14 @@
 """DP-SLAM's one grid that all particles share (Eliazar and Parr 2003, 2004), and the naive copies it stands for.
 
-A tile of 8 × 8 cells holds a list of (node of the ancestry, evidence of its cells). A particle's evidence is that of
-its nearest ancestor in the list; what a particle adds goes under its own leaf, on top of a copy of what it had
+A tile of 8 × 8 cells holds a list of (node of the ancestry, evidence of its cells). A particle's evidence is that
+of its nearest ancestor in the list; what a particle adds goes under its own leaf, on top of a copy of what it had
 inherited. So maps are copied nowhere: resampling touches the tree, and what only the dead had seen.
 
-The paper keeps a list a cell. A scan touches thousands of neighbouring cells, most of them with entries of the same
-particles: one list for 64 of them is walked once instead of 64 times, for a little more memory at the seams.
+The paper keeps a list a cell. A scan touches thousands of neighbouring cells, most of them with entries of the
+same particles: one list for 64 of them is walked once instead of 64 times, for a little more memory at the seams.
 
-Merging a node with its only child relabels the entries of whichever has fewer, and drops those of the parent that the
-child had overwritten. (The paper relabels the parent's, which most often are the whole map.)
+Merging a node with its only child relabels the entries of whichever has fewer, and drops those of the parent that
+the child had overwritten. (The paper relabels the parent's, which most often are the whole map.)
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ _NONE = -1
 class SharedGrid(ParticleGrids):
     """All particles' maps in one grid.
 
-    ``live`` is the number of entries, ``ancestry`` the tree. An entry is row and column of its tile, node, the next
-    entry of its tile, and the next and previous of its node; its evidence lies beside it.
+    ``live`` is the number of entries, ``ancestry`` the tree. An entry is row and column of its tile, node, the
+    next entry of its tile, and the next and previous of its node; its evidence lies beside it.
     """
 
     def __init__(self, particles: int, cell_m: float) -> None:

@@ -1,8 +1,8 @@
 """What the maps of DP-SLAM's particles cost: the shared grid beside a grid copied for every particle.
 
-``python -m training.dp_slam_cost --out DIR`` records one drive in a generated room, replays it to ``dp-slam`` with more
-and more particles, with either kind of map, and writes ``dp_slam_cost.json``, ``memory.png`` and ``time.png``. Both
-kinds are the same filter, bit for bit; the last poses are compared to show it.
+``python -m training.dp_slam_cost --out DIR`` records one drive in a generated room, replays it to ``dp-slam``
+with more and more particles, with either kind of map, and writes ``dp_slam_cost.json``, ``memory.png`` and
+``time.png``. Both kinds are the same filter, bit for bit; the last poses are compared to show it.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def record(rooms: str, *, seed: int, steps: int) -> tuple[Drive, dict[str, Any]]
     observation, _ = env.reset(seed=seed)
     agent = agents.make("nearest-frontier")
     agent.reset(env.belief)
-    drive: Drive = [(env.odometry, cast("Scan", env.scan))]
+    drive: Drive = [(env.odometry, env.scan)]
     for _ in range(steps):
         observation, _, terminated, _, _ = env.step(agent.act(observation, env.belief))
-        drive.append((env.odometry, cast("Scan", env.scan)))
+        drive.append((env.odometry, env.scan))
         if terminated:
             break
     return drive, backend_settings(env.config)
