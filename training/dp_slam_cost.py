@@ -116,8 +116,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--particles", default="50,100,200,500,1000")
     parser.add_argument("--rooms", default="apartment")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--limit-mb", type=float, default=2000.0, help="copies that need more are left out")
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--limit-mb", type=float, default=1000.0, help="copies that need more are left out")
     options = parser.parse_args(argv)
     try:
         particles = _numbers(options.particles)
