@@ -9,8 +9,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.match_kernels import climb, prior_loss
 from slam.particle_grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
-from slam.scan_matching import MatchConfig, Values, climb, prior_loss, stamps_of
+from slam.scan_matching import MatchConfig, Values, stamps_of
 
 __all__ = ["ParticleMatcher"]
 

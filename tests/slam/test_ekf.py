@@ -332,7 +332,8 @@ def test_near_landmarks_are_sorted_and_in_the_robot_frame() -> None:
 
 def test_unknown_names_and_keys_are_listed() -> None:
     with pytest.raises(
-        ValueError, match=r"unknown SLAM backend 'ekff' \(did you mean 'ekf'\?\); valid: compressed-ekf, dp-slam, ekf"
+        ValueError,
+        match=r"unknown SLAM backend 'ekff' \(did you mean 'ekf'\?\); valid: compressed-ekf, dp-slam, ekf",
     ):
         slam.make("ekff")
     with pytest.raises(ValueError, match=r"unknown key of EkfConfig 'gates'.*valid: .*gate"):

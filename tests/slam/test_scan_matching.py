@@ -10,15 +10,14 @@ from hypothesis import strategies as st
 
 from slam import Scan
 from slam.geometry import compose, transform_points, wrap
+from slam.match_kernels import field_sum, slope
 from slam.scan_matching import (
     LikelihoodField,
     MatchConfig,
     body_points,
-    field_sum,
     match,
     refine,
     search,
-    slope,
 )
 from slam.settings import from_mapping
 from tests.slam.numerics import numerical_jacobian
