@@ -52,12 +52,6 @@ class Ancestry:
             node = int(self.parent[node])
         return nodes
 
-    def ranks(self, particle: int, out: NDArray[np.int32]) -> None:
-        """Write each node's distance from the root, -1 where it is no ancestor of the particle."""
-        nodes = self.lineage(particle)
-        out[:] = -1
-        out[nodes] = np.arange(len(nodes) - 1, -1, -1)
-
     def resample(
         self, ancestors: NDArray[np.int64], *, forget: Callable[[int], None], merge: Callable[[int, int], int],
     ) -> None:  # fmt: skip

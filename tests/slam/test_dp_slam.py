@@ -18,7 +18,7 @@ from slam.particle_grids import PASSES, STOPS, Lattice, ScanCells
 from slam.paths import Paths
 from slam.resampling import ResamplingPolicy
 from slam.settings import from_mapping
-from slam.shared_grid import CopiedGrids, SharedGrid
+from slam.shared_grid import CopiedGrids, SharedGrid, _entry
 from tests.slam.simulated import circle_twist, drive, room_scan
 
 OFFSET = 0.2
@@ -73,10 +73,6 @@ def test_the_tree_stays_minimal_and_tells_who_saw_what(history: tuple[int, int])
         assert set(marks) <= set(tree.nodes.tolist())
         for i in range(n):
             assert set().union(*(marks.get(node, set()) for node in tree.lineage(i))) == alone[i]
-    ranks = np.zeros(2 * n, np.int32)
-    tree.ranks(0, ranks)
-    assert [int(ranks[node]) for node in tree.lineage(0)] == list(range(len(tree.lineage(0)) - 1, -1, -1))
-    assert np.count_nonzero(ranks >= 0) == len(tree.lineage(0))
 
 
 @settings(max_examples=30)
@@ -102,13 +98,15 @@ def test_paths_are_what_copies_would_be(history: tuple[int, int]) -> None:
 
 
 def check_entries(grid: SharedGrid) -> None:
-    """Entries belong to nodes there are, one a tile and node, and each is listed by its tile and by its node."""
-    listed = grid._listed()
-    assert len(listed) == grid.live == int(grid._held.sum())
-    assert set(listed[:, 2].tolist()) <= set(grid.ancestry.nodes.tolist())
-    assert len(np.unique(listed[:, :3], axis=0)) == len(listed)
-    for node in grid.ancestry.nodes.tolist():
-        assert grid.entries_of(node) == grid._held[node]
+    """Entries belong to nodes there are, one a tile and node, each in its node's list and found by its hash."""
+    entries = grid.entries()
+    assert len(entries) == grid.live == int(grid._held.sum())
+    assert set(entries[:, 2].tolist()) <= set(grid.ancestry.nodes.tolist())
+    assert len(np.unique(entries, axis=0)) == len(entries)
+    np.testing.assert_array_equal(np.bincount(entries[:, 2], minlength=len(grid._held)), grid._held)
+    for row, col, node in entries.tolist():
+        e = _entry(row, col, node, grid._head, grid._entries)
+        assert grid._entries[e, :3].tolist() == [row, col, node]
 
 
 @settings(max_examples=25, deadline=None)
