@@ -198,7 +198,7 @@ def _leave(e: int, head: Ints, entries: Ints) -> None:
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _entry(row: int, col: int, node: int, head: Ints, entries: Ints) -> int:
     """Return the entry of a tile and a node, or -1."""
-    e = head[_hash(row, col, node, head.shape[0])]
+    e: int = head[_hash(row, col, node, head.shape[0])]
     while e != _NONE and not (entries[e, _ROW] == row and entries[e, _COL] == col and entries[e, _NODE] == node):
         e = entries[e, _CHAIN]
     return e
