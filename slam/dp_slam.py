@@ -96,14 +96,14 @@ class DpSlam(Backend):
         self._updates = 0  # since the last resampling
         self.n_eff = float(n)
         self.resampled = False
-        self._believe()
+        self._believed: tuple[Array, Array] | None = None
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
         self._odometry.predict(odometry)
-        self._believe()
+        self._believed = None
 
     def update(self, scan: Scan) -> None:
         """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
@@ -115,7 +115,7 @@ class DpSlam(Backend):
             self._key.append((scan, self.extractor.surface.copy()))
             self._follow_the_lead()
             self._shown = np.vstack([self._shown, self._sensor(self._poses[self._lead])])
-        self._believe()
+        self._believed = None
         body = compose(self._poses[self._lead], self._motion())
         self.grid.integrate(
             self._sensor(body), scan, self.extractor.surface,
@@ -166,9 +166,7 @@ class DpSlam(Backend):
         normals = self._rng.standard_normal(self._poses.shape)
         for i, guess in enumerate(guesses):
             # From the local frame, in which the covariance is kept, to the particle's.
-            turn = float(guess[2] - odometry.pose[2])
-            c, s = math.cos(turn), math.sin(turn)
-            r = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+            r = _about_z(float(guess[2] - odometry.pose[2]))
             info = np.linalg.inv(r @ odometry.cov @ r.T + drift)
             best, curvature, log_likelihood = self._matcher.fit(
                 self.grids, i, points, guess, info, unknown=config.unknown, free=config.free
@@ -223,34 +221,30 @@ class DpSlam(Backend):
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
-    def _believe(self) -> None:
-        """Sum the particles up, carried along by the motion since their last update."""
-        config, odometry, motion = self.config, self._odometry, self._motion()
-        c, s = np.cos(self._poses[:, 2]), np.sin(self._poses[:, 2])
-        now = np.column_stack(
-            [
-                self._poses[:, 0] + c * motion[0] - s * motion[1],
-                self._poses[:, 1] + s * motion[0] + c * motion[1],
-                wrap(self._poses[:, 2] + motion[2]),
-            ]
-        )
-        self._mean, self._cov = np.zeros(3), np.zeros((3, 3))
-        floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
-        pose_moments(now, np.zeros((len(now), 3, 3)), self._weights, floor, self._mean, self._cov)
-        turn = float(self._mean[2] - odometry.pose[2])
-        c0, s0 = math.cos(turn), math.sin(turn)
-        r = np.array([[c0, -s0, 0.0], [s0, c0, 0.0], [0.0, 0.0, 1.0]])
-        self._cov += r @ odometry.cov @ r.T
+    def _moments(self) -> tuple[Array, Array]:
+        """Return mean and covariance of the particles, carried along by the motion since their last update."""
+        if self._believed is None:
+            config, odometry, motion = self.config, self._odometry, self._motion()
+            c, s = np.cos(self._poses[:, 2]), np.sin(self._poses[:, 2])
+            now = self._poses + np.column_stack(
+                [c * motion[0] - s * motion[1], s * motion[0] + c * motion[1], np.full(len(c), motion[2])]
+            )
+            mean, cov = np.zeros(3), np.zeros((3, 3))
+            floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
+            pose_moments(now, np.zeros((len(now), 3, 3)), self._weights, floor, mean, cov)
+            r = _about_z(float(mean[2] - odometry.pose[2]))
+            self._believed = mean, cov + r @ odometry.cov @ r.T
+        return self._believed
 
     @property
     def pose(self) -> Array:
         """Pose mean ``(3,)``."""
-        return self._mean.copy()
+        return self._moments()[0].copy()
 
     @property
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
-        return self._cov.copy()
+        return self._moments()[1].copy()
 
     @property
     def path(self) -> Array:
@@ -281,3 +275,9 @@ class DpSlam(Backend):
             landmark_ids=np.zeros(0, np.int64),
             grid=self.grid,
         )
+
+
+def _about_z(turn: float) -> Array:
+    """Return what turns the covariance of a pose into a frame turned by ``turn`` [rad]."""
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
