@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,9 @@ class Backend(abc.ABC):
 
     Subclasses estimate; this class draws the grid from the estimated poses.
     """
+
+    observes_landmarks: ClassVar[bool] = True
+    """Whether ``observe`` has a use for landmark observations; where not, it raises ``ValueError``."""
 
     def __init__(self, config: BackendConfig) -> None:
         self.config = config

@@ -8,6 +8,7 @@ from typing import Any
 from slam.backend import Backend, BackendConfig
 from slam.compressed import CompressedEkfConfig, CompressedEkfSlam
 from slam.dead_reckoning import OdometrySlam, TruthSlam
+from slam.dp_slam import DpSlam, DpSlamConfig
 from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
 from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
 from slam.invariant import InvariantEkfSlam
@@ -24,6 +25,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "compressed-ekf": (CompressedEkfSlam, CompressedEkfConfig),
     "fastslam1": (FastSlam1, FastSlamConfig),
     "fastslam2": (FastSlam2, FastSlamConfig),
+    "dp-slam": (DpSlam, DpSlamConfig),
 }
 
 

@@ -152,6 +152,8 @@ def prepare(options: ReplayOptions) -> Replay:
         if hasattr(backend, "give_pose") and not log.has_heading:
             lacks = "none: give --reference" if isinstance(log, ScanLog) else "only positions"
             raise ValueError(f"--slam {config.slam} needs true poses; log {log.name} has {lacks}")
+        if not (backend.observes_landmarks or isinstance(log, ScanLog)):
+            raise ValueError(f"--slam {config.slam} takes scans; log {log.name} holds landmark observations only")
         backend.reset(log.start_pose, seed=run["seed"])
     run |= {"log": str(options.log.absolute()), "clock_start_s": log.clock_start_s}
     if options.robot is not None:

@@ -242,7 +242,7 @@ def test_a_turned_start_gives_the_same_coverage_accounts() -> None:
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
-        ({"rooms": "flat"}, "unknown rooms 'flat'.*valid: apartment, corridors, rectangular"),
+        ({"rooms": "flat"}, "unknown rooms 'flat'.*valid: apartment, cave, corridors, maze, rectangular"),
         ({"slam": "ekff"}, "unknown SLAM backend 'ekff'"),
         ({"robot": "youbt"}, "unknown robot 'youbt'.*valid: cavity, youbot"),
         ({"lidar": {"beam": 3}}, "unknown key of LidarConfig 'beam'.*did you mean 'beams'"),

@@ -1,0 +1,283 @@
+"""DP-SLAM: particles over occupancy grids without landmarks, backend ``dp-slam`` (theory.md B and D).
+
+Eliazar and Parr's shared grid and ancestry tree (2003, 2004) hold the maps, so that memory and time do not
+multiply by the particles. Each particle's pose is drawn around where the scan fits its own map (Grisetti,
+Stachniss and Burgard 2007), starting from scan-matched odometry (Hähnel et al. 2003), so that few particles
+suffice. They are updated when the robot has moved on; between two updates the scan-matched odometry carries all
+of them along.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.backend import Backend, BackendConfig
+from slam.geometry import compose, inverse, wrap
+from slam.particle_grids import ParticleGrids, ScanCells
+from slam.particle_match import ParticleMatcher
+from slam.paths import Paths
+from slam.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.scan_matching import MatchConfig, body_points
+from slam.scan_odometry import ScanOdometry, ScanOdometryConfig
+from slam.settings import require
+from slam.shared_grid import CopiedGrids, SharedGrid
+from slam.types import Belief, Observations, Odometry, Scan
+
+__all__ = ["DpSlam", "DpSlamConfig"]
+
+Array = NDArray[np.float64]
+
+_LEAD_SHARE = 0.5  # the map's particle is followed until another weighs more than twice as much
+
+
+@dataclass(frozen=True, kw_only=True)
+class DpSlamConfig(BackendConfig):
+    """DP-SLAM: particles, when they are updated, how freely they are drawn."""
+
+    particles: int = 30
+    update_m: float = 0.2  # the particles are updated when the robot has moved …
+    update_rad: float = 0.2  # … or turned so far since the last time
+    # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More
+    # than it does: particles that all go one way cannot close a loop (docs/slam.md).
+    drift_m: float = 0.02
+    drift_rad: float = 0.01
+    # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
+    # of no surface: what is new says less against a particle than what contradicts its map.
+    unknown: float = 0.3
+    free: float = 0.1
+    resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
+    matching: MatchConfig = field(default_factory=MatchConfig)
+    scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
+    copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.particles >= 1, "DpSlamConfig.particles must be at least 1")
+        require(self.update_m >= 0 and self.update_rad >= 0, "DpSlamConfig.update_* must be ≥ 0")
+        require(self.drift_m > 0 and self.drift_rad > 0, "DpSlamConfig.drift_* must be > 0")
+        require(0 < self.free <= 1 and 0 < self.unknown <= 1, "DpSlamConfig.free and unknown must be in (0, 1]")
+
+
+class DpSlam(Backend):
+    """Particles with maps of their own in one grid.
+
+    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. There are no
+    landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses.
+    """
+
+    observes_landmarks = False
+    config: DpSlamConfig
+
+    def __init__(self, config: DpSlamConfig | None = None) -> None:
+        super().__init__(config or DpSlamConfig())
+        self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        config = self.config
+        n = config.particles
+        self._rng = np.random.Generator(np.random.PCG64(seed))
+        variances, axes = np.linalg.eigh(pose_cov)
+        spread = axes * np.sqrt(np.maximum(variances, 0.0))
+        self._poses = pose + self._rng.standard_normal((n, 3)) @ spread.T  # (particles, 3) at the last update
+        self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._log_weights = np.full(n, -math.log(n))
+        self._weights = np.full(n, 1.0 / n)
+        grids = CopiedGrids if config.copies else SharedGrid
+        self.grids: ParticleGrids = grids(n, config.matching.cell_m)
+        self._matcher, self._cells = ParticleMatcher(config.matching), ScanCells()
+        self._paths, self._shown = Paths(n), np.zeros((0, 3))  # poses that the grid was drawn from
+        self._key: list[tuple[Scan, NDArray[np.int16]]] = []  # one scan an update
+        self._odometry = ScanOdometry(config.scan_odometry, config.matching, config.odometry)
+        self._lead = 0
+        self._updates = 0  # since the last resampling
+        self.n_eff = float(n)
+        self.resampled = False
+        self._believed: tuple[Array, Array] | None = None
+
+    # ---- the filter ----------------------------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured."""
+        self._odometry.predict(odometry)
+        self._believed = None
+
+    def update(self, scan: Scan) -> None:
+        """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
+        points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
+        self._odometry.correct(points)
+        self.extractor.extract(scan)  # the surfaces that the grid is drawn with
+        if self._moved_on():
+            self._update_particles(points)
+            self._key.append((scan, self.extractor.surface.copy()))
+            self._follow_the_lead()
+            self._shown = np.vstack([self._shown, self._sensor(self._poses[self._lead])])
+        self._believed = None
+        body = compose(self._poses[self._lead], self._motion())
+        self.grid.integrate(
+            self._sensor(body), scan, self.extractor.surface,
+            body=(float(body[0]), float(body[1]), self.config.body_radius_m),
+        )  # fmt: skip
+
+    def observe(self, observations: Observations) -> None:
+        """Refuse: maps of occupied cells have no use for landmark observations."""
+        raise ValueError(
+            "dp-slam maps occupied cells, not landmarks: it takes scans (`update`), not landmark observations; "
+            "use ekf or fastslam2 for those"
+        )
+
+    def _motion(self) -> Array:
+        """Return how the robot has moved since the last update, in the body frame of then ``(3,)``."""
+        return compose(inverse(self._odometry.settled), self._odometry.pose)
+
+    def _moved_on(self) -> bool:
+        if not self._key:
+            return True
+        x, y, theta = self._motion().tolist()
+        return math.hypot(x, y) >= self.config.update_m or abs(theta) >= self.config.update_rad
+
+    def _update_particles(self, points: Array) -> None:
+        """Draw each particle's pose around where the scan fits its map, weigh it, write its map; resample."""
+        config = self.config
+        motion = self._motion()
+        guesses = np.array([compose(pose, motion) for pose in self._poses])
+        reach = float(np.sqrt((points * points).sum(axis=1).max(initial=0.0))) + abs(config.lidar_offset_m)
+        self.grids.enclose(guesses[:, :2].min(axis=0) - reach, guesses[:, :2].max(axis=0) + reach)
+        if self._key:
+            self._draw_poses(guesses, points)
+        else:
+            self._poses = guesses
+        self._odometry.settle()
+        ancestors = self._choose_survivors()
+        for i in np.unique(ancestors):  # the others' maps are forgotten at once
+            self._cells.trace(self.grids.lattice, self._poses[i], config.lidar_offset_m, points)
+            self.grids.write(int(i), self._cells)
+        self._paths.append(self._poses)
+        if self.resampled:
+            self._resample(ancestors)
+
+    def _draw_poses(self, guesses: Array, points: Array) -> None:
+        """Sample from the Gaussian around each particle's best fit; its weight is the evidence, at the peak."""
+        config, odometry = self.config, self._odometry
+        drift = np.diag(np.square([config.drift_m, config.drift_m, config.drift_rad]))
+        normals = self._rng.standard_normal(self._poses.shape)
+        for i, guess in enumerate(guesses):
+            # From the local frame, in which the covariance is kept, to the particle's.
+            r = _about_z(float(guess[2] - odometry.pose[2]))
+            info = np.linalg.inv(r @ odometry.cov @ r.T + drift)
+            best, curvature, log_likelihood = self._matcher.fit(
+                self.grids, i, points, guess, info, unknown=config.unknown, free=config.free
+            )
+            self._log_weights[i] += log_likelihood
+            best += np.linalg.solve(np.linalg.cholesky(curvature).T, normals[i])
+            best[2] = float(wrap(best[2]))
+            self._poses[i] = best
+        normalise(self._log_weights, self._weights)
+
+    def _choose_survivors(self) -> NDArray[np.int64]:
+        """Return whom each particle descends from after this update; ``resampled`` tells whether that is news."""
+        n = self.config.particles
+        self.n_eff = effective_particles(self._weights)
+        self._updates += 1
+        self.resampled = self.config.resampling.due(self.n_eff, n, self._updates)
+        ancestors = np.arange(n)
+        if self.resampled:
+            systematic(self._weights, self._rng.random(), ancestors)
+        if self._weights[self._lead] < _LEAD_SHARE * self._weights.max() or not np.any(ancestors == self._lead):
+            self._lead = int(np.argmax(self._weights))
+        return ancestors
+
+    def _resample(self, ancestors: NDArray[np.int64]) -> None:
+        n = self.config.particles
+        self._lead = int(np.flatnonzero(ancestors == self._lead)[0])
+        self.grids.resample(ancestors)
+        self._paths.resample(ancestors)
+        self._poses = self._poses[ancestors]
+        self._weights[:] = 1.0 / n
+        self._log_weights[:] = -math.log(n)
+        self._updates = 0
+
+    # ---- the map that is shown -----------------------------------------------------------------------------
+
+    def _sensor(self, body: Array) -> Array:
+        return compose(body, np.array([self.config.lidar_offset_m, 0.0, 0.0]))
+
+    def _follow_the_lead(self) -> None:
+        """Redraw the grid where the leading particle took another way than it was drawn from."""
+        drawn = self._shown
+        path = np.array([self._sensor(pose) for pose in self._paths.of(self._lead)[: len(drawn)]]).reshape(-1, 3)
+        off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
+            self.config.key_scans.lever_m
+        )
+        if len(off) and float(off.max()) > 0.5 * self.grid.resolution:
+            self.grid.clear()
+            for pose, (scan, surface) in zip(path, self._key, strict=False):
+                self.grid.integrate(pose, scan, surface)
+            self.grid.take_changes()  # the revision has gone up: followers start over
+            self._shown = path
+
+    # ---- the belief ----------------------------------------------------------------------------------------
+
+    def _moments(self) -> tuple[Array, Array]:
+        """Return mean and covariance of the particles, carried along by the motion since their last update."""
+        if self._believed is None:
+            config, odometry, motion = self.config, self._odometry, self._motion()
+            c, s = np.cos(self._poses[:, 2]), np.sin(self._poses[:, 2])
+            now = self._poses + np.column_stack(
+                [c * motion[0] - s * motion[1], s * motion[0] + c * motion[1], np.full(len(c), motion[2])]
+            )
+            mean, cov = np.zeros(3), np.zeros((3, 3))
+            floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
+            pose_moments(now, np.zeros((len(now), 3, 3)), self._weights, floor, mean, cov)
+            r = _about_z(float(mean[2] - odometry.pose[2]))
+            self._believed = mean, cov + r @ odometry.cov @ r.T
+        return self._believed
+
+    @property
+    def pose(self) -> Array:
+        """Pose mean ``(3,)``."""
+        return self._moments()[0].copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``."""
+        return self._moments()[1].copy()
+
+    @property
+    def path(self) -> Array:
+        """The leading particle's poses at every update ``(updates, 3)``: the path that its map belongs to."""
+        return self._paths.of(self._lead)
+
+    @property
+    def landmark_count(self) -> int:
+        """Always 0."""
+        return 0
+
+    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+        """Return empty arrays: there are no landmarks."""
+        return np.zeros(0, np.int64), np.zeros(0)
+
+    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+        """Write zeros: there are no landmarks."""
+        out[:] = 0.0
+
+    @property
+    def belief(self) -> Belief:
+        """Pose and grid; landmarks are empty, and there is no joint covariance."""
+        return Belief(
+            pose=self.pose,
+            pose_cov=self.pose_cov,
+            landmarks=np.zeros((0, 2)),
+            landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64),
+            grid=self.grid,
+        )
+
+
+def _about_z(turn: float) -> Array:
+    """Return what turns the covariance of a pose into a frame turned by ``turn`` [rad]."""
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
