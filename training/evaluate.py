@@ -162,6 +162,10 @@ def _csv(rows: list[Row]) -> str:
     return "\n".join([",".join(names), *(",".join(cell(row[name]) for name in names) for row in rows)]) + "\n"
 
 
+def _figure(value: float | None, places: int) -> str:
+    return "–" if value is None else f"{value:.{places}f}"
+
+
 def _table(summaries: list[Row]) -> str:
     lines = [
         "| rooms | backend | coverage ≥ 0.95 | no collision | final position error, median (max) [m] "
@@ -170,13 +174,12 @@ def _table(summaries: list[Row]) -> str:
     ]
     for s in summaries:
         n = s["episodes"]
-        to_95 = s["time_to_95_s_median"]
         lines.append(
             f"| {s['rooms']} | `{s['slam']}` | {s['covered_95']} of {n} | {s['without_collision']} of {n} "
             f"| {s['final_position_error_m_median']:.3f} ({s['final_position_error_m_max']:.3f}) "
-            f"| {s['corner_mean_m_median']:.3f} | {s['ate_rmse_m_median']:.3f} | {s['map_iou_median']:.3f} "
-            f"| {'–' if to_95 is None else format(to_95, '.0f')} "
-            f"| {s['nees_over_3_mean']:.2f} ({100 * s['fraction_in_band']:.0f} %) |"
+            f"| {_figure(s['corner_mean_m_median'], 3)} | {s['ate_rmse_m_median']:.3f} "
+            f"| {_figure(s['map_iou_median'], 3)} | {_figure(s['time_to_95_s_median'], 0)} "
+            f"| {_figure(s['nees_over_3_mean'], 2)} ({100 * s['fraction_in_band']:.0f} %) |"
         )
         if s["returned"]:
             lines.append(
