@@ -16,9 +16,9 @@ from mecanum_env.config import EnvConfig, from_toml, to_toml
         {"rooms": "cave", "rooms_config": {"area_m2": (40.0, 60.0), "pillars": [0, 1]}},
         {"slam_config": {"odometry": {"lever_m": 0.3}, "steps": ((1, 2), [3.0, 4.0])}},
         {"slam_config": {"map": None, "features": {"range_sigma_m": None, "wall_sigma_m": 0.02}}},
-        {"odometry_filter": "differential-transform", "odometry_filter_config": {"start_sigmas": (1e-3, 0.2, 0.5)}},
+        {"odometry_filter_config": {"start_sigmas": (1e-3, 0.2, 0.5)}},
     ],
-)  # fmt: skip
+)
 def test_a_configuration_is_read_back_equal(given: dict[str, Any], tmp_path: Path) -> None:
     config = EnvConfig(**given)
     path = tmp_path / "config.toml"
