@@ -22,8 +22,8 @@ def scan_metrics(replay: Replay, log: ScanLog) -> dict[str, Any]:
     """Return the entries of ``metrics.json`` that only a log of scans has; null where nothing can be said.
 
     Relations are of the trajectory as the backend believes it at the end where it has ``scan_poses``, an array
-    ``(scans, 3)`` of body poses, one an update so far: a trajectory SLAM's result. Else, and where that is short of
-    a pose, they are of the poses it believed at the time; ``relations_of`` says which.
+    ``(scans, 3)`` of body poses, one an update so far: a trajectory SLAM's result. Else, and where that lacks a
+    pose, they are of the poses it believed at the time; ``relations_of`` says which.
     """
     each_ms = 1e3 * np.array(replay.scan_times_s)
     found: dict[str, Any] = {
