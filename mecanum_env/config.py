@@ -201,7 +201,18 @@ class EnvConfig:
         require(self.time_limit_s > 0, "EnvConfig.time_limit_s must be > 0")
         require(self.max_landmarks_observed >= 1, "EnvConfig.max_landmarks_observed must be at least 1")
         for name in ("rooms_config", "slam_config", "odometry_filter_config"):
-            require(isinstance(getattr(self, name), Mapping), f"EnvConfig.{name} must be a table of settings")
+            value = getattr(self, name)
+            require(isinstance(value, Mapping), f"EnvConfig.{name} must be a table of settings")
+            object.__setattr__(self, name, _plain(value))
+
+
+def _plain(value: Any) -> Any:
+    """Return settings as TOML gives them back: tables of their own, without None; sequences as tuples."""
+    if isinstance(value, Mapping):
+        return {key: _plain(inner) for key, inner in value.items() if inner is not None}
+    if isinstance(value, list | tuple):
+        return tuple(_plain(inner) for inner in value)
+    return value
 
 
 # Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and

@@ -61,11 +61,6 @@ def power(exponent: float, t0: float, h: float, order: int) -> Array:
     whole = float(exponent).is_integer()
     require(t0 > 0 or whole, f"t to the power of {exponent:g} has no spectrum about t0 = {t0:g}")
     require(t0 != 0 or exponent >= 0, f"t to the power of {exponent:g} has no spectrum about 0")
-    if t0 == 0.0:
-        out = np.zeros(order + 1)
-        if exponent <= order:
-            out[int(exponent)] = h**exponent
-        return out
     out = np.empty(order + 1)
     _fill_power(out, float(exponent), float(t0), float(h))
     return out
@@ -130,6 +125,12 @@ def pade(x: Array) -> tuple[Array, Array] | None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_power(out: Array, exponent: float, t0: float, h: float) -> None:
+    """Write the spectrum of tᵖ about t₀; about 0, where p is whole and at least 0, it stands in one discrete."""
+    if t0 == 0.0 and exponent >= 0.0:
+        out[:] = 0.0
+        if exponent < out.shape[0]:
+            out[int(exponent)] = h**exponent
+        return
     out[0] = t0**exponent
     ratio = h / t0
     for k in range(out.shape[0] - 1):

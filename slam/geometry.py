@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["compose", "exp", "inverse", "log", "rotation", "transform_points", "wrap", "wrap_scalar"]
+__all__ = ["compose", "exp", "inverse", "log", "relative", "rotation", "transform_points", "wrap", "wrap_scalar"]
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,13 @@ def inverse(pose_a_b: Array) -> Array:
     x, y, theta = (float(v) for v in pose_a_b)
     c, s = math.cos(theta), math.sin(theta)
     return np.array([-c * x - s * y, s * x - c * y, wrap_scalar(-theta)])
+
+
+def relative(poses: Array, seen: Array) -> Array:
+    """Return poses ``(n, 3)`` as seen from other poses ``(n, 3)``, row by row: inverse(poses) ∘ seen."""
+    dx, dy = (seen[:, :2] - poses[:, :2]).T
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap(seen[:, 2] - poses[:, 2])])
 
 
 def exp(twist: Array) -> Array:

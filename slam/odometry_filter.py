@@ -52,9 +52,12 @@ class OdometryFilterConfig:
             value = getattr(self, name)
             require(math.isfinite(value) and value > 0, f"OdometryFilterConfig.{name} must be > 0, got {value}")
         for name in ("rest_speed_m_s", "rest_turn_rate_rad_s"):
-            require(getattr(self, name) >= 0, f"OdometryFilterConfig.{name} must be ≥ 0")
-        good = len(self.start_sigmas) == 3 and all(math.isfinite(s) and s >= 0 for s in self.start_sigmas)
-        require(good, "OdometryFilterConfig.start_sigmas takes three numbers of at least 0")
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"OdometryFilterConfig.{name} must be ≥ 0, got {value}")
+        given: Any = self.start_sigmas
+        good = isinstance(given, tuple | list) and len(given) == 3
+        good = good and all(isinstance(s, int | float) and math.isfinite(s) and s >= 0 for s in given)
+        require(good, f"OdometryFilterConfig.start_sigmas takes three numbers of at least 0, got {given!r}")
 
 
 class OdometryFilter:
@@ -64,21 +67,20 @@ class OdometryFilter:
         self.config = config = config or OdometryFilterConfig()
         model, n = make_model(config.model), make_model(config.model).size
         tolerances = Tolerances(relative=1e-4)  # of tenths of a millimetre: far below what any sensor can tell
-        self._rooms = [Workspace(n, tolerances.order) for _ in range(3)]
-        room = self._rooms[0]
+        work = Workspace(n, tolerances.order)
         drive = np.outer(model.drive, model.drive)
         process = (config.process_linear, config.process_linear, config.process_turn)
         measured = (config.measurement_m2_s, config.measurement_m2_s, config.measurement_rad2_s)
-        self._eta, self._x = np.stack([room.eta] * 3), np.stack([room.x] * 3)
+        self._eta, self._x = np.stack([work.eta] * 3), np.stack([work.x] * 3)
         self._poses = np.zeros((3, 3))  # rows: reckoned, filtered, where the filters started; θ unwrapped
         self._clock = np.zeros(1)  # [s] of the models
+        self._start_cov = np.diag(np.array(config.start_sigmas[:n]) ** 2)
         self._fixed = (
             model.powers, model.matrices, np.array([q * drive for q in process]), 1.0 / np.array(measured),
-            np.diag(np.array(config.start_sigmas[:n]) ** 2), config.rest_speed_m_s, config.rest_turn_rate_rad_s,
-            self._poses, self._clock, self._eta, self._x, room.f, room.z, room.column, tolerances.relative,
-            tolerances.absolute, room.system, room.below, room.is_fraction,
+            self._start_cov, config.rest_speed_m_s, config.rest_turn_rate_rad_s,
+            self._poses, self._clock, self._eta, self._x, work.f, work.z, work.column, tolerances.relative,
+            tolerances.absolute, work.system, work.below, work.is_fraction,
         )  # fmt: skip
-        self._start_cov = np.diag(np.array(config.start_sigmas[:n]) ** 2)
         self.reset()
 
     def reset(self) -> None:
@@ -89,11 +91,13 @@ class OdometryFilter:
         self._eta[:, 0] = self._start_cov
 
     def filter(self, odometry: Odometry) -> Odometry:
-        """Return the twist between the filtered poses before and after a step.
+        """Return the twist between the filtered poses before and after a step; over no time, the twist given.
 
         ``ValueError`` for a twist that is not finite.
         """
         vx, vy, omega = np.asarray(odometry.twist, np.float64).tolist()
+        if odometry.dt == 0.0 and math.isfinite(vx + vy + omega):
+            return Odometry(np.array([vx, vy, omega]), odometry.dt)
         out = np.empty(3)
         if not _filter(vx, vy, omega, odometry.dt, *self._fixed, out):
             raise ValueError(f"odometry must be finite, got {odometry}")

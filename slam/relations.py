@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam.geometry import wrap
+from slam.geometry import relative, wrap
 
 __all__ = ["RelationScore", "closing_relations", "local_relations", "relation_errors", "relation_score"]
 
@@ -98,9 +98,9 @@ def relation_errors(true_poses: ArrayLike, est_poses: ArrayLike, relations: Arra
     i, j = np.asarray(relations, np.int64).reshape(-1, 2).T
     if len(i) and not (min(i.min(), j.min()) >= 0 and max(i.max(), j.max()) < len(true)):
         raise ValueError(f"relations name poses outside 0 … {len(true) - 1}")
-    (x, y, turn), (x_true, y_true, turn_true) = _between(est, i, j), _between(true, i, j)
+    off = relative(est[i], est[j]) - relative(true[i], true[j])
     # δ*⁻¹ turns the difference of the translations, which keeps its length.
-    return np.hypot(x - x_true, y - y_true), np.abs(wrap(turn - turn_true))
+    return np.hypot(off[:, 0], off[:, 1]), np.abs(wrap(off[:, 2]))
 
 
 def relation_score(true_poses: ArrayLike, est_poses: ArrayLike, relations: ArrayLike) -> RelationScore:
@@ -110,9 +110,3 @@ def relation_score(true_poses: ArrayLike, est_poses: ArrayLike, relations: Array
         return RelationScore._make([math.nan] * 8 + [0])
     numbers = [f(v**p) for v in (trans, rot) for p in (1, 2) for f in (np.mean, np.std)]
     return RelationScore._make([float(v) for v in numbers] + [len(trans)])
-
-
-def _between(poses: Array, i: Pairs, j: Pairs) -> tuple[Array, Array, Array]:
-    dx, dy = (poses[j, :2] - poses[i, :2]).T
-    c, s = np.cos(poses[i, 2]), np.sin(poses[i, 2])
-    return c * dx + s * dy, c * dy - s * dx, poses[j, 2] - poses[i, 2]

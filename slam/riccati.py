@@ -24,10 +24,10 @@ __all__ = [
     "Tolerances",
     "Workspace",
     "advance",
-    "discretes",
+    "covariance_spectrum",
+    "estimate_spectrum",
     "expand",
     "recover",
-    "riccati",
 ]
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class Workspace:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def riccati(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> None:
+def covariance_spectrum(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> None:
     """Fill η(1) … from η(0), spectra ``(K, n, n)``: the Riccati equation as a recurrence (theory.md C).
 
     (k + 1)/h η(k + 1) = Σ_l F(l) η(k - l) + η(k - l) F(l)ᵀ - η(l) Hᵀ H η(k - l) / R, and G Q Gᵀ in k = 0.
@@ -118,7 +118,7 @@ def riccati(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> N
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def discretes(f: Array, inverse_r: float, h: float, eta: Array, z: Array, x: Array) -> None:
+def estimate_spectrum(f: Array, inverse_r: float, h: float, eta: Array, z: Array, x: Array) -> None:
     """Fill X(1) … of x̂ ``(K, n)`` from X(0) and all of η: (k + 1)/h X(k + 1) = Σ_l F(l) X(k - l) + K(l) E(k - l).
 
     E is the innovation z - x̂₁, of a measurement that changes linearly within the step.
@@ -253,8 +253,8 @@ def expand(
     The values at its end are then ``eta[0]`` and ``x[0]``, and ``z`` is what is left of the measurement's change.
     """
     n = eta.shape[1]
-    riccati(f, noise, inverse_r, h, eta)
-    discretes(f, inverse_r, h, eta, z, x)
+    covariance_spectrum(f, noise, inverse_r, h, eta)
+    estimate_spectrum(f, inverse_r, h, eta, z, x)
     share = step_share(eta, x, relative, absolute, try_pade, system, below, is_fraction)
     if share < 1.0:
         share = min(share * _SAFETY, 1.0)

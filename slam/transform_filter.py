@@ -58,7 +58,8 @@ class KalmanBucyFilter:
     ) -> None:  # fmt: skip
         """Start at ``time`` [s] from a state ``(n,)`` and its covariance ``(n, n)``; both zero if not given.
 
-        ``measurement`` is z at that time: the state's first component if not given.
+        ``measurement`` is z at that time: the state's first component if not given. ``ValueError`` for anything
+        that is not finite, and a covariance that is not symmetric.
         """
         n, work = self.model.size, self._work
         if isinstance(self.model, PowerModel) and self.model.needs_positive_time:
@@ -66,10 +67,15 @@ class KalmanBucyFilter:
         start = np.zeros(n) if state is None else np.asarray(state, np.float64)
         first = np.zeros((n, n)) if cov is None else np.asarray(cov, np.float64)
         require(start.shape == (n,) and first.shape == (n, n), f"{self.model.name} takes a state of {n} numbers")
+        last = float(start[0]) if measurement is None else float(measurement)
         require(bool(np.all(np.isfinite(start)) and np.all(np.isfinite(first))), "a start must be finite")
+        require(math.isfinite(time), f"a start's time must be finite, got {time}")
+        require(math.isfinite(last), f"a measurement must be finite, got {last}")
+        skew, largest = np.abs(first - first.T).max(), np.abs(first).max()
+        require(bool(skew <= 1e-9 * largest), "a start's covariance must be symmetric")
         self.time = float(time)
         work.x[0], work.eta[0] = start, first
-        self._last = float(start[0]) if measurement is None else float(measurement)
+        self._last = last
         self.expansions = 0
 
     @property
@@ -90,7 +96,7 @@ class KalmanBucyFilter:
         """
         require(math.isfinite(span) and span > 0, f"a step must be above 0 s, got {span}")
         z = self._last if measurement is None else float(measurement)
-        require(math.isfinite(z), "a measurement must be finite")
+        require(math.isfinite(z), f"a measurement must be finite, got {z}")
         work = self._work
         work.z[0], work.z[1] = self._last, z - self._last
         count = self._compiled(span) if isinstance(self.model, PowerModel) else self._expand_one_by_one(span)

@@ -22,8 +22,8 @@ def scan_metrics(replay: Replay, log: ScanLog) -> dict[str, Any]:
     """Return the entries of ``metrics.json`` that only a log of scans has; null where nothing can be said.
 
     Relations are of the trajectory as the backend believes it at the end where it has ``scan_poses``, an array
-    ``(scans, 3)`` of body poses, one an update so far: a trajectory SLAM's result. Else they are of the poses it
-    believed at the time.
+    ``(scans, 3)`` of body poses, one an update so far: a trajectory SLAM's result. Else, and where that lacks a
+    pose, they are of the poses it believed at the time; ``relations_of`` says which.
     """
     each_ms = 1e3 * np.array(replay.scan_times_s)
     found: dict[str, Any] = {
@@ -35,7 +35,8 @@ def scan_metrics(replay: Replay, log: ScanLog) -> dict[str, Any]:
     compared = np.flatnonzero(rows >= 0)
     believed = np.array(replay.estimates, np.float64).reshape(-1, 3)
     final = getattr(replay.backend, "scan_poses", None)
-    if final is not None and len(final) >= len(believed):
+    is_final = final is not None and len(final) >= len(believed)
+    if is_final:
         believed = np.asarray(final, np.float64)
     true = log.reference_poses[rows[compared]]
     relations = local_relations(len(true)), closing_relations(true)
@@ -43,7 +44,7 @@ def scan_metrics(replay: Replay, log: ScanLog) -> dict[str, Any]:
         for kind, pairs in zip(_KINDS, (np.vstack(relations), *relations), strict=True):
             score = relation_score(true, poses[compared], pairs)
             found |= _named(f"{start}relations_{kind}", score, short=bool(start))
-    found["relations_of"] = "online" if final is None else "final"
+    found["relations_of"] = "final" if is_final else "online"
     return found
 
 

@@ -83,7 +83,7 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
         What is replayed.
     path : path
         A CARMEN log, whose FLASER poses are taken; scans are matched by their time stamps, equal ones in order.
-        Or a DP-SLAM log, whose scans are matched by their number.
+        Or a DP-SLAM log of as many scans, which are matched by their number.
 
     Raises
     ------
@@ -100,7 +100,10 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
         raise ValueError(f"reference {path} is no log that is known: give a CARMEN or DP-SLAM log")
     note = f"reference: poses of {path.name} at the same scans; the start pose is the reference's"
     if kind == "dpslam":
-        poses = dpslam.read(path).odometry_poses[: len(log.times)]
+        poses = dpslam.read(path).odometry_poses
+        if len(poses) != len(log.times):
+            counts = f"{len(poses)} scans, {log.name} {len(log.times)}"
+            raise ValueError(f"reference {path} has {counts}; give a log of the same scans")
         return log.with_reference(np.arange(len(poses)), poses, note)
     stamps, poses = carmen.read_poses(path)
     scans, matched = _with_equal_stamps(log.stamps.tolist(), stamps.tolist())

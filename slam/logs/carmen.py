@@ -18,7 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.logs.scans import SETTINGS, ScanLog, chain, relative, rising, without_returns
+from slam.geometry import relative
+from slam.logs.laser import check_jumps, check_place, check_stamp, scan_of
+from slam.logs.scans import SETTINGS, ScanLog, chain, rising, without_returns
 from slam.logs.tables import numbers_of, read_lines
 
 __all__ = ["beam_angles", "read", "read_poses"]
@@ -26,9 +28,7 @@ __all__ = ["beam_angles", "read", "read_poses"]
 Array = NDArray[np.float64]
 
 _ODOM = "ODOM x y theta tv rv accel time host logger_time"
-_FLASER = "FLASER n r_1 … r_n x y theta odom_x odom_y odom_theta time host logger_time"
 _AFTER_RANGES = 9  # words
-_FEWEST_BEAMS, _MOST_BEAMS = 2, 10_000
 # A laser mounted off the robot's centre stays where it is; a corrected pose wanders off the odometry.
 _MOUNT_VARIES, _MOUNT_REACHES_M = 1e-3, 1.0
 
@@ -45,7 +45,8 @@ def read(path: Path) -> ScanLog:
     Raises
     ------
     ValueError
-        One line: the file and the line that is cut short or damaged, or that there is no scan.
+        One line: the file and the line that is cut short or damaged or says what no robot does, or that there is
+        no scan.
     """
     ranges, poses, odometry, stamps = _scans(path)
     robot = poses[:, 3:6]  # FLASER's odometry
@@ -91,6 +92,7 @@ def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
     poses: list[Array] = []
     odometry: list[Array] = []
     stamps: list[float] = []
+    lines: list[int] = []
     before: Array | None = None  # x y θ tv rv accel time of the ODOM line right before
     for number, line in read_lines(path):
         kind = line[:7].split(maxsplit=1)[:1]  # most lines are of a kind that is passed over
@@ -98,42 +100,35 @@ def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
             before = _odom(line.split()[1:], path, number)
         elif kind == ["FLASER"]:
             words = line.split()[1:]
-            n = _beams(words, path, number)
-            scan = numbers_of(words[1 : 1 + n], path=path, line=number, what="a range of FLASER")
-            if scan.min() < 0:
-                raise ValueError(f"{path}, line {number}: range {scan.min():g} is below 0; correct the line")
-            if ranges and n != len(ranges[0]):
-                raise ValueError(f"{path}, line {number}: a scan of {n} beams after scans of {len(ranges[0])}; "
-                                 "give a log of one laser")  # fmt: skip
-            at = numbers_of(words[1 + n : 8 + n], path=path, line=number, what="pose or time of FLASER")
+            scan = scan_of(words, kind="FLASER", after=_AFTER_RANGES, earlier=ranges, path=path, line=number)
+            at = numbers_of(
+                words[1 + len(scan) : 8 + len(scan)], path=path, line=number, what="pose or time of FLASER"
+            )
+            check_place(at[:3], path=path, line=number)
+            check_place(at[3:6], path=path, line=number)
+            check_stamp(float(at[6]), path=path, line=number)
             same = before is not None and before[6] == at[6]
             ranges.append(scan)
             poses.append(at[:6])
             odometry.append(before[:3] if same and before is not None else at[3:6])
             stamps.append(float(at[6]))
+            lines.append(number)
     if not ranges:
         raise ValueError(f"{path} holds no FLASER line, the only scans of a CARMEN log that are read")
-    return np.stack(ranges), np.stack(poses), np.stack(odometry), np.array(stamps)
+    both, reckoned = np.stack(poses), np.stack(odometry)
+    for each in (both[:, :3], both[:, 3:], reckoned):
+        check_jumps(each, path=path, lines=lines)
+    return np.stack(ranges), both, reckoned, np.array(stamps)
 
 
 def _odom(words: Sequence[str], path: Path, number: int) -> Array:
     if len(words) != 9:
         raise ValueError(f"{path}, line {number}: expected 9 values after ODOM ({_ODOM}), got {len(words)}; "
                          "the line is cut short or damaged")  # fmt: skip
-    return numbers_of(words[:7], path=path, line=number, what=_ODOM)
-
-
-def _beams(words: Sequence[str], path: Path, number: int) -> int:
-    """Return how many beams a FLASER line has, its length checked."""
-    count = words[0] if words else ""
-    if not (count.isascii() and count.isdigit() and _FEWEST_BEAMS <= int(count[:6]) <= _MOST_BEAMS):
-        raise ValueError(f"{path}, line {number}: {count[:40]!r} is no number of beams, {_FEWEST_BEAMS} to "
-                         f"{_MOST_BEAMS} ({_FLASER}); correct the line")  # fmt: skip
-    expected = 1 + int(count) + _AFTER_RANGES
-    if len(words) != expected:
-        raise ValueError(f"{path}, line {number}: a FLASER of {count} beams has {expected} values, here are "
-                         f"{len(words)}; the line is cut short or damaged")  # fmt: skip
-    return int(count)
+    values = numbers_of(words[:7], path=path, line=number, what=_ODOM)
+    check_place(values[:3], path=path, line=number)
+    check_stamp(float(values[6]), path=path, line=number)
+    return values
 
 
 def _moved_by(poses: Array, offset: Array) -> Array:

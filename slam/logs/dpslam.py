@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.logs.carmen import beam_angles
+from slam.logs.laser import check_jumps, check_place, scan_of
 from slam.logs.scans import SETTINGS, ScanLog, without_returns
 from slam.logs.tables import numbers_of, read_lines
 
@@ -33,7 +34,8 @@ def read(path: Path) -> ScanLog:
     Raises
     ------
     ValueError
-        One line: the file and the line that is cut short or damaged, or that there is no scan.
+        One line: the file and the line that is cut short or damaged or says what no robot does, or that there is
+        no scan.
     """
     odometry, ranges = _pairs(path)
     measured, reach = without_returns(ranges)
@@ -52,6 +54,7 @@ def _pairs(path: Path) -> tuple[Array, Array]:
     """Return the odometry poses ``(n, 3)`` and ranges ``(n, beams)`` of a log."""
     poses: list[Array] = []
     ranges: list[Array] = []
+    lines: list[int] = []
     pose: Array | None = None
     for number, line in read_lines(path):
         kind, words = (line.split() or [""])[0], line.split()[1:]
@@ -60,32 +63,17 @@ def _pairs(path: Path) -> tuple[Array, Array]:
                 raise ValueError(f"{path}, line {number}: expected 3 values after Odometry (x y theta), got "
                                  f"{len(words)}; the line is cut short or damaged")  # fmt: skip
             pose = numbers_of(words, path=path, line=number, what="Odometry x y theta")
+            check_place(pose, path=path, line=number)
         elif kind == "Laser":
             if pose is None:
                 raise ValueError(
                     f"{path}, line {number}: a Laser line without an Odometry line of its own before it"
                 )
-            ranges.append(_laser(words, path, number))
-            if len(ranges[-1]) != len(ranges[0]):
-                raise ValueError(f"{path}, line {number}: a scan of {len(ranges[-1])} beams after scans of "
-                                 f"{len(ranges[0])}; give a log of one laser")  # fmt: skip
+            ranges.append(scan_of(words, kind="Laser", after=0, earlier=ranges, path=path, line=number))
+            lines.append(number)
             poses.append(pose)
             pose = None
     if not ranges:
         raise ValueError(f"{path} holds no Laser line; is it cut short?")
+    check_jumps(np.stack(poses), path=path, lines=lines)
     return np.stack(poses), np.stack(ranges)
-
-
-def _laser(words: list[str], path: Path, number: int) -> Array:
-    count = words[0] if words else ""
-    if not (count.isascii() and count.isdigit() and 2 <= int(count[:6]) <= 10_000):
-        raise ValueError(
-            f"{path}, line {number}: {count[:40]!r} is no number of beams, 2 to 10000; correct the line"
-        )
-    if len(words) != 1 + int(count):
-        raise ValueError(f"{path}, line {number}: a Laser of {count} beams has as many ranges, here are "
-                         f"{len(words) - 1}; the line is cut short or damaged")  # fmt: skip
-    scan = numbers_of(words[1:], path=path, line=number, what="a range of Laser")
-    if scan.min() < 0:
-        raise ValueError(f"{path}, line {number}: range {scan.min():g} is below 0; correct the line")
-    return scan

@@ -16,7 +16,7 @@ from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
 from slam.types import Odometry, Scan
 
-__all__ = ["SETTINGS", "ScanLog", "chain", "relative", "rising", "without_returns"]
+__all__ = ["SETTINGS", "ScanLog", "chain", "rising", "without_returns"]
 
 Array = NDArray[np.float64]
 
@@ -117,13 +117,6 @@ class ScanLog(Log):
             self, reference_times=self.times[rows], reference_poses=poses, start_pose=compose(poses[0], back),
             note=note,
         )  # fmt: skip
-
-
-def relative(poses: Array, seen: Array) -> Array:
-    """Return poses ``(n, 3)`` as seen from other poses ``(n, 3)``, row by row: inverse(poses) ∘ seen."""
-    dx, dy = (seen[:, :2] - poses[:, :2]).T
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap(seen[:, 2] - poses[:, 2])])
 
 
 def chain(start: Array, steps: Array) -> Array:

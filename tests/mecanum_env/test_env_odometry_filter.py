@@ -103,7 +103,7 @@ def test_the_configuration_holds_it_and_toml_reads_it_back(tmp_path: Path) -> No
     path = tmp_path / "config.toml"
     path.write_text(to_toml(config))
     read = from_toml(path)
-    assert to_toml(read) == to_toml(config)
+    assert read == config and to_toml(read) == to_toml(config)
     again = make(config=str(path), rooms=None).unwrapped
     assert again._filter is not None
     assert again._filter.config.start_sigmas == (1e-3, 0.2, 0.5)

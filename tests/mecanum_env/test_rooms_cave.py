@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from mecanum_env import rooms
+from mecanum_env.rooms.cave import CaveConfig
 from mecanum_env.rooms.smooth_outline import MOST_TURN_DEG, bends_deg, facets, level_loops, rasterise
 
 seeds = st.integers(0, 2**32 - 1)
@@ -100,8 +101,14 @@ def test_the_config_of_a_cave_is_kept_to():
     assert mean(lambda plan: len(wall_loops(plan)), loops=0.0) < mean(
         lambda plan: len(wall_loops(plan)), loops=1.0
     )
-    with pytest.raises(ValueError, match=r"no cave of .* found"):
-        rooms.make("cave", seed=0, config={"area_m2": (30.0, 30.0)})
+
+
+def test_an_area_that_can_hardly_be_met_is_refused_at_once():
+    for area in ((30.0, 30.0), (100.0, 104.9)):
+        with pytest.raises(ValueError, match=r"area_m2 needs most ≥ 1.05 · least, got .*; widen it"):
+            CaveConfig(area_m2=area)
+    for seed in range(3):
+        assert 30.0 <= rooms.make("cave", seed=seed, config={"area_m2": (30.0, 31.5)}).area_m2 <= 31.5
 
 
 def disc_field(radius_m: float, cell_m: float) -> np.ndarray:

@@ -15,6 +15,7 @@ from scipy.linalg import solve_continuous_are
 from slam.differential_transform import (
     MODELS,
     Model,
+    PowerModel,
     SpectrumModel,
     constant,
     derivative,
@@ -312,6 +313,22 @@ def test_a_model_of_ones_own() -> None:
     np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
 
 
+def test_a_model_that_starts_at_time_zero() -> None:
+    """F₂₂ = -t, whose spectrum about 0 is one discrete; compiled, expanded by Python and by a stiff solver."""
+    model = PowerModel("slowing", powers=[0, 1], matrices=[[[0, 1], [0, 0]], [[0, 0], [0, -1]]], drive=[0.0, 1.0])
+
+    def slope(t: float, y: np.ndarray) -> Any:
+        p, f = y.reshape(2, 2), np.array([[0, 1], [0, -t]])
+        return (f @ p + p @ f.T - np.outer(p[:, 0], p[0]) / R + np.diag([0, Q])).ravel()
+
+    true = solve_ivp(slope, (0, 2), np.eye(2).ravel(), method="Radau", rtol=1e-10, atol=1e-13).y[:, -1]
+    for each in (model, SpectrumModel("again", model.spectrum, drive=model.drive)):
+        kalman = KalmanBucyFilter(each, measurement=R, process=Q)
+        kalman.reset(time=0, cov=np.eye(2))
+        kalman.advance(2.0)
+        np.testing.assert_allclose(kalman.cov.ravel(), true, rtol=1e-6)
+
+
 # ---- the estimate ----------------------------------------------------------------------------------------------
 
 
@@ -373,3 +390,21 @@ def test_errors_are_as_large_as_the_filter_says() -> None:
         e = kalman.state - x
         nees.append(e @ np.linalg.solve(kalman.cov, e) / 2)
     assert np.mean(nees) == pytest.approx(1.0, abs=0.2)
+
+
+def test_what_is_not_finite_or_not_a_covariance_is_refused() -> None:
+    kalman = KalmanBucyFilter("constant_velocity", measurement=R, process=Q)
+    for wrong, message in (
+        ({"measurement": math.nan}, "a measurement must be finite"),
+        ({"measurement": math.inf}, "a measurement must be finite"),
+        ({"time": math.nan}, "time must be finite"),
+        ({"state": [math.nan, 0.0]}, "a start must be finite"),
+        ({"cov": [[1.0, math.nan], [math.nan, 1.0]]}, "a start must be finite"),
+        ({"cov": [[1.0, 0.5], [0.0, 1.0]]}, "must be symmetric"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            kalman.reset(**wrong)
+    kalman.reset(cov=np.eye(2))
+    with pytest.raises(ValueError, match="a measurement must be finite"):
+        kalman.advance(0.1, math.nan)
+    np.testing.assert_array_equal(kalman.cov, np.eye(2))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam.geometry import compose, exp, inverse, log, rotation, transform_points, wrap, wrap_scalar
+from slam.geometry import compose, exp, inverse, log, relative, rotation, transform_points, wrap, wrap_scalar
 
 lengths = st.floats(-50, 50)
 angles = st.floats(-math.pi, math.pi - 1e-9)
@@ -31,6 +31,14 @@ def test_wrap_at_pi(angle: float) -> None:
 @given(poses)
 def test_inverse_undoes(pose: np.ndarray) -> None:
     np.testing.assert_allclose(wrap(compose(pose, inverse(pose))), 0, atol=1e-9)
+
+
+@given(poses, poses)
+def test_relative_poses_are_the_inverse_composed(pose: np.ndarray, seen: np.ndarray) -> None:
+    out = relative(np.array([pose, seen]), np.array([seen, pose]))
+    for row, (a, b) in zip(out, ((pose, seen), (seen, pose)), strict=True):
+        difference = row - compose(inverse(a), b)
+        np.testing.assert_allclose(np.append(difference[:2], wrap(difference[2])), 0, atol=1e-9)
 
 
 @given(poses, poses, poses)

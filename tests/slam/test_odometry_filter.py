@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from slam.differential_transform import MODELS
 from slam.motion import move
 from slam.odometry_filter import OdometryFilter, OdometryFilterConfig, make_odometry_filter
+from slam.riccati import Tolerances
+from slam.transform_filter import KalmanBucyFilter
 from slam.types import Odometry
 
 DT = 0.1
@@ -24,6 +27,11 @@ def reckon(twists: np.ndarray) -> np.ndarray:
     for twist in twists:
         pose = move(pose, twist, DT)
     return pose
+
+
+def unwrapped(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """What :func:`slam.motion.move` returns, its heading not wrapped."""
+    return np.append(move(pose, twist, DT)[:2], pose[2] + twist[2] * DT)
 
 
 def swing(steps: int = 80) -> np.ndarray:
@@ -78,3 +86,46 @@ def test_outputs_are_fresh_arrays() -> None:
     kept = np.array(first)
     behind.filter(Odometry((-0.3, 0.2, 0.4), DT))
     np.testing.assert_array_equal(first, kept)
+
+
+def test_a_step_of_no_time_passes_unchanged() -> None:
+    behind, other = OdometryFilter(), OdometryFilter()
+    run(behind, swing(10))
+    run(other, swing(10))
+    still = behind.filter(Odometry((0.3, 0.1, -0.2), 0.0))
+    np.testing.assert_array_equal(still.twist, (0.3, 0.1, -0.2))
+    np.testing.assert_array_equal(run(behind, swing(20)[10:]), run(other, swing(20)[10:]))
+    with pytest.raises(ValueError, match="odometry must be finite"):
+        behind.filter(Odometry((math.nan, 0.0, 0.0), 0.0))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_it_is_three_filters_of_one_coordinate_each(model: str) -> None:
+    config = OdometryFilterConfig(model=model)
+    behind, n = OdometryFilter(config), MODELS[model].size
+    strengths = [(config.measurement_m2_s, config.process_linear)] * 2
+    strengths.append((config.measurement_rad2_s, config.process_turn))
+    tolerances = Tolerances(relative=1e-4)  # the odometry filter's own
+    alone = [KalmanBucyFilter(model, measurement=r, process=q, tolerances=tolerances) for r, q in strengths]
+    for kalman in alone:
+        kalman.reset(time=0.1, cov=np.diag(np.square(config.start_sigmas[:n])))
+    reckoned, filtered = np.zeros(3), np.zeros(3)
+    for twist in swing()[1:]:  # at no step of which the robot rests
+        reckoned = unwrapped(reckoned, twist)
+        for kalman, z in zip(alone, reckoned, strict=True):
+            kalman.advance(DT, z)
+        filtered = unwrapped(filtered, np.asarray(behind.filter(Odometry(twist, DT)).twist))
+        np.testing.assert_allclose(filtered, [kalman.state[0] for kalman in alone], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("start_sigmas", ["a", 1, 2]), ("start_sigmas", 3.0), ("start_sigmas", (1.0, 2.0)),
+        ("start_sigmas", (1.0, 2.0, math.nan)), ("start_sigmas", "abc"), ("rest_speed_m_s", math.inf),
+        ("rest_turn_rate_rad_s", math.inf), ("rest_speed_m_s", -1.0), ("process_turn", math.nan),
+    ],
+)  # fmt: skip
+def test_bad_settings_are_named(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"OdometryFilterConfig.{name} "):
+        make_odometry_filter("differential-transform", {name: value})

@@ -30,7 +30,7 @@ from tests.slam.scans_on_disk import (
     room_ranges,
 )
 
-coordinates = st.floats(-1e3, 1e3, allow_nan=False)
+coordinates = st.floats(-300.0, 300.0)  # no farther apart than a robot can be from scan to scan
 poses = st.tuples(coordinates, coordinates, st.floats(-3.1, 3.1)).map(np.array)
 unknown_lines = st.sampled_from(
     ["", "# a comment", "NEFF 14.2", "PARAM a b", "SYNC x", "RLASER 2 1 1", "TRUEPOS 1", "  ", "FLASERX 3", "\x00"]
@@ -204,13 +204,17 @@ def test_references_that_do_not_fit(tmp_path):
     with pytest.raises(ValueError, match="leave --robot out"):
         open_log(other, robot=1)
     dpslam = scan_log(put_lines(tmp_path / "dp.log", dpslam_lines(5)))
-    matched = with_reference(dpslam, put_lines(tmp_path / "dp2.log", dpslam_lines(3)))
-    assert len(matched.reference_times) == 3
+    fewer, as_many = (put_lines(tmp_path / f"dp{n}.log", dpslam_lines(n)) for n in (3, 5))
+    for each in (dpslam, log):
+        with pytest.raises(ValueError, match=r"dp3.log has 3 scans, .* 5; give a log of the same scans"):
+            with_reference(each, fewer)
+        assert len(with_reference(each, as_many).reference_times) == 5
 
 
 # ---- what is wrong --------------------------------------------------------------------------------------------
 
 GOOD = carmen_lines(4)
+ONES = "FLASER 180 " + "1 " * 180
 SCAN = next(k for k, line in enumerate(GOOD) if line.startswith("FLASER"))
 
 
@@ -241,6 +245,13 @@ def test_a_damaged_scan_is_named_with_its_line(cut, word, tmp_path_factory):
         ("FLASER 3 1 1 1 0 0 0 0 0 0 1 host", "has 13 values, here are 12"),
         ("FLASER 3 1 -1 1 0 0 0 0 0 0 1 host 1", "range -1 is below 0"),
         ("FLASER 3 1 1 1 0 0 0 0 0 0 1 host 1", "a scan of 3 beams after scans of 180"),
+        ("ODOM 1 -1e6 0 0 0 0 1 host 1", "a coordinate of 1e[+]06 m is more than 100000 m"),
+        ("ODOM 1 1 0 0 0 0 1e12 host 1", "a time of 1e[+]12 s is more than 1e[+]11 s"),
+        (ONES + "1e200 0 0 0 0 0 1 host 1", "a coordinate of 1e[+]200 m"),
+        (ONES + "0 0 0 0 1e200 0 1 host 1", "a coordinate of 1e[+]200 m"),
+        (ONES + "0 0 0 0 0 0 -1e12 host 1", "a time of -1e[+]12 s"),
+        (ONES + "2e3 0 0 0 0 0 1 host 1", "a jump of .* m from the scan before is more than 1000 m"),
+        (ONES + "0 0 0 2e3 0 0 1 host 1", "a jump of .* m from the scan before is more than 1000 m"),
     ],
 )
 def test_what_carmen_lines_may_not_be(line, words, tmp_path):
@@ -261,6 +272,9 @@ def test_what_carmen_lines_may_not_be(line, words, tmp_path):
         ("Odometry 0 0 0\nLaser 2 1 1", "line 12: a scan of 2 beams after scans of 181"),
         ("Odometry 0 0 0\nLaser x 1 1", "line 12: 'x' is no number of beams"),
         ("Odometry 0 0 0\nLaser 2 -1 1", "line 12: range -1 is below 0"),
+        ("Odometry 0 1e6 0", "line 11: a coordinate of 1e[+]06 m is more than 100000 m"),
+        ("Odometry 0 0 1e300", "line 11: a heading of 1e[+]300 rad"),
+        ("Odometry 0 2e3 0\nLaser 181" + " 1" * 181, "line 12: a jump of .* m from the scan before"),
     ],
 )
 def test_what_dpslam_lines_may_not_be(line, words, tmp_path):

@@ -133,8 +133,12 @@ def test_a_start_inside_a_wall_or_too_near_to_one(tmp_path: Path, capsys: pytest
         ("[lidar]\nbeams = 'many'", ["LidarConfig.beams"]),
         ("slam = 'efk'", ["unknown SLAM backend 'efk'"]),
         ("[slam_config]\ngrid = 1", ["grid"]),
-        ("slam_config = 3", ["slam_config must be tables"]),
+        ("slam_config = 3", ["slam_config must be a table of settings"]),
         ("[rooms_config]\nwalls = 1", ["walls"]),
+        *(
+            (f"odometry_filter = 'differential-transform'\n[odometry_filter_config]\n{line}", [line.split()[0]])
+            for line in ("start_sigmas = ['a', 1, 2]", "start_sigmas = 3.0", "rest_speed_m_s = inf")
+        ),
         ("[run]\nagent = 'nobody'", ["unknown agent 'nobody'"]),
         ("[run]\nseed = 'x'", ["seed", "wrong type"]),
         ("[run]\nseed = -3", ["seed ≥ 0"]),

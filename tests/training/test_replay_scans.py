@@ -101,6 +101,9 @@ def test_a_backends_final_trajectory_is_what_relations_are_of(
     monkeypatch.setattr(type(prepared.backend), "scan_poses", drive(21)[0], raising=False)
     found = replay_report.metrics(prepared)
     assert found["relations_trans_m"] < 1e-6 and found["relations_of"] == "final"
+    monkeypatch.setattr(type(prepared.backend), "scan_poses", drive(20)[0], raising=False)  # one short
+    found = replay_report.metrics(prepared)
+    assert found["relations_trans_m"] > 1e-4 and found["relations_of"] == "online"
 
 
 def test_the_summary_speaks_of_scans(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

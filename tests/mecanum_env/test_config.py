@@ -1,0 +1,34 @@
+"""Configurations as files: what is written is read back equal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mecanum_env.config import EnvConfig, from_toml, to_toml
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"rooms": "cave", "rooms_config": {"area_m2": (40.0, 60.0), "pillars": [0, 1]}},
+        {"slam_config": {"odometry": {"lever_m": 0.3}, "steps": ((1, 2), [3.0, 4.0])}},
+        {"slam_config": {"map": None, "features": {"range_sigma_m": None, "wall_sigma_m": 0.02}}},
+        {"odometry_filter_config": {"start_sigmas": (1e-3, 0.2, 0.5)}},
+    ],
+)
+def test_a_configuration_is_read_back_equal(given: dict[str, Any], tmp_path: Path) -> None:
+    config = EnvConfig(**given)
+    path = tmp_path / "config.toml"
+    path.write_text(to_toml(config))
+    assert from_toml(path) == config
+
+
+def test_a_configuration_keeps_its_settings_when_the_callers_change() -> None:
+    given: dict[str, Any] = {"features": {"range_sigma_m": 0.01}}
+    config = EnvConfig(slam_config=given)
+    given["features"]["range_sigma_m"] = 9.0
+    given["gate"] = 1.0
+    assert config.slam_config == {"features": {"range_sigma_m": 0.01}}
