@@ -38,11 +38,6 @@ from slam.types import CONCAVE, CONVEX
 
 Array = NDArray[np.float64]
 
-_SIMPLER = 6.0  # by how much an end face must lower the misfit to be believed
-_MOST_BEAMS = 40  # after the last on a surface, in search of the first that passes it
-_LEAN = 0.1  # how much a beam must lean towards a surface to be taken for one that reaches its end face
-_POOR = 2.0  # range sigmas: largest 1σ of a convex corner that two fits make
-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
@@ -89,11 +84,6 @@ def meet(one: Array, two: Array, increment: float, limits: Array, corner: Array)
     # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
     # one that stands out into it.
     left = (-ax) * by - (-ay) * bx > 0.0
-    if not left:
-        # A short face gives a corner that is worse than its covariance; as the end of the other surface it is not.
-        half = 0.5 * (cxx - cyy)
-        if 0.5 * (cxx + cyy) + math.sqrt(half * half + cxy * cxy) > (_POOR * limits[SIGMA]) ** 2 + floor:
-            return 0
     sign = 1.0 if left else -1.0
     direction = math.atan2(sign * (ay + by), sign * (ax + bx))
     _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, 0, corner)
@@ -123,111 +113,6 @@ def _meets(line: Array, ray: Array) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _misfit(line: Array, reach: float, ray: Array, sigma: float) -> float:
-    """Return the squared distance, in units of its noise, of a range from where its beam meets a line."""
-    off = (reach - line[R] / (line[NX] * ray[0] + line[NY] * ray[1])) / sigma
-    return 0.0 if math.isnan(off) else off * off
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _past_the_end(
-    line: Array, step: int, last: int, ranges: Array, rays: Array, increment: float, range_max: float,
-    limits: Array,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Return how many beams after ``last`` the first that returned is, the last on an end face, the first past it.
-
-    The second is 0 where no end face shows; the third is 0 where the surface is hidden or goes on.
-    """
-    n = ranges.shape[0]
-    full = n * increment > 2.0 * math.pi - 1.5 * increment
-    end = _meets(line, rays[last])
-    first = inner = beams = 0
-    for _ in range(_MOST_BEAMS):
-        beams += 1
-        index = last + beams * step
-        if index < 0 or index >= n:
-            if not full:
-                return 0, 0, 0
-            index %= n
-        reach = ranges[index]
-        if math.isnan(reach):
-            continue
-        first = beams if first == 0 else first
-        across = line[NX] * rays[index, 0] + line[NY] * rays[index, 1]
-        if across < 0.05:
-            return 0, 0, 0
-        missed = line[R] / across  # range at which the beam would meet the line
-        if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
-            return 0, 0, 0
-        px, py = reach * rays[index, 0], reach * rays[index, 1]
-        beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
-        if reach > missed + limits[EDGE_JUMP]:
-            depth = line[NX] * px + line[NY] * py - line[R]
-            if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
-                return first, inner, beams
-        elif beyond > limits[EDGE_FACE]:
-            return 0, 0, 0  # the surface goes on, a little off the line
-        inner = beams
-    return 0, 0, 0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _end_before_face(
-    line: Array, step: int, last: int, inner: int, past: int, ranges: Array, rays: Array, limits: Array
-) -> tuple[float, float]:
-    """Return where a surface ends, along it from its centroid, and the variance that an end face brings to that.
-
-    The first points of a face that recedes at a right angle lie so near the surface's line that they passed for
-    points of the surface, the more of them the noisier the ranges. So its last beams, as far back from ``last`` as
-    that may be, and those after it up to ``inner`` are divided anew, where their ranges fit best: the surface lies
-    on the line, and all points of the face lie as far along it as its end. Where neither that fits nor all of them
-    lie on the line (a bevel), the surface is taken to end with the first beam that is off the line.
-    """
-    n, sigma = ranges.shape[0], limits[SIGMA]
-    lean = (-line[NY] * rays[last, 0] + line[NX] * rays[last, 1]) * step
-    across = line[NX] * rays[last, 0] + line[NY] * rays[last, 1]
-    end, back = _meets(line, rays[last]), 0
-    visible = lean < -_LEAN
-    if visible:
-        # How far beyond the end these beams meet the line where the face is 4σ behind it.
-        most = limits[SPLIT_SIGMAS] * sigma * -lean / across
-        while back < line[POINTS] - 4 and (end - _meets(line, rays[(last - back * step) % n])) * step < most:
-            back += 1
-    rest, on = 0.0, 0
-    for k in range(1 - back, inner + 1):
-        i = (last + k * step) % n
-        off = _misfit(line, ranges[i], rays[i], sigma)
-        rest += off
-        on = k if k == on + 1 and off < limits[SPLIT_SIGMAS] ** 2 else on
-    best, variance = rest - _SIMPLER, 0.0
-    s = _half_way(line, rays, last + inner * step, last + past * step)
-    # The face from its far end inwards: weight, first and second moment of its points along the line.
-    weight = first = second = 0.0
-    for k in range(inner, -back, -1):
-        i = (last + k * step) % n
-        lean = -line[NY] * rays[i, 0] + line[NX] * rays[i, 1]
-        if not visible or math.isnan(ranges[i]) or lean * step > -_LEAN:
-            continue
-        along = ranges[i] * lean + line[NY] * line[MX] - line[NX] * line[MY]
-        w = 1.0 / (sigma * lean) ** 2
-        weight, first, second = weight + w, first + w * along, second + w * along * along
-        rest -= _misfit(line, ranges[i], rays[i], sigma)
-        misfit = rest + second - first * first / weight
-        if misfit < best:
-            best, s, variance = misfit, first / weight, 1.0 / weight
-    if best < 2.0 * (inner + back) + _SIMPLER:
-        return s, variance
-    return _half_way(line, rays, last + on * step, last + (on + 1) * step), (limits[SPLIT_SIGMAS] * sigma) ** 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _half_way(line: Array, rays: Array, one: int, other: int) -> float:
-    """Return the middle between where two beams meet a line, along it from its centroid."""
-    n = rays.shape[0]
-    return 0.5 * (_meets(line, rays[one % n]) + _meets(line, rays[other % n]))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def edge(
     line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
     corner: Array,
@@ -241,19 +126,55 @@ def edge(
     """
     if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
         return 0
+    n = ranges.shape[0]
     step = 1 if side == 1 else -1
-    last = int(line[LAST]) if side == 1 else int(line[FIRST])
-    first, inner, past = _past_the_end(line, step, last, ranges, rays, increment, range_max, limits)
-    if past == 0:
-        return 0
+    index = int(line[LAST]) if side == 1 else int(line[FIRST])
+    full = n * increment > 2.0 * math.pi - 1.5 * increment
     # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
-    spacing = (_meets(line, rays[(last + first * step) % rays.shape[0]]) - _meets(line, rays[last])) * step
-    if spacing < 0.0 or spacing > limits[EDGE_SPACING]:
+    end = _meets(line, rays[index])
+    t = missed = 0.0
+    faces = 0
+    while True:
+        index += step
+        if index < 0 or index >= n:
+            if not full:
+                return 0
+            index %= n
+        reach = ranges[index]
+        if math.isnan(reach):
+            continue
+        across = line[NX] * rays[index, 0] + line[NY] * rays[index, 1]
+        if across < 0.05:
+            return 0
+        missed = line[R] / across  # range at which the beam would meet the line
+        if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
+            return 0
+        if faces == 0:
+            t = _meets(line, rays[index])
+        if reach > missed + limits[EDGE_JUMP]:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            depth = line[NX] * px + line[NY] * py - line[R]
+            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+            if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
+                break  # past the end face, or there is none to see
+        else:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+            if beyond > limits[EDGE_FACE]:
+                return 0  # the surface goes on, a little off the line
+        faces += 1
+        if faces > 40:
+            return 0
+    spacing = abs(t - end)
+    if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
-    s, variance = _end_before_face(line, step, last, inner, past, ranges, rays, limits)
-    # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
-    along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + variance
+    s = 0.5 * (t + end)
     x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
+    # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still.
+    # An end face that shows may be bevelled: its first points still pass for the surface's.
+    along = (
+        (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + (4.0 * limits[SIGMA] ** 2 if faces > 0 else 0.0)
+    )
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
     direction = math.atan2(step * ay - ny, step * ax - nx)

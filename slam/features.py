@@ -63,7 +63,7 @@ class FeatureConfig:
     edge_face_m: float = 0.25  # thickest wall of which the end face may show
     # 1σ of a visible end along the surface, as a share of the beams' spacing there. A uniform error would have
     # 0.29, but it lasts while the robot stands.
-    edge_sigma: float = 0.5
+    edge_sigma: float = 1.0
     edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
     # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen

@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 MAX_LINES = 128
 _GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _OUTLIER = 4.0  # σ along the beam by which a point may be off the line that it is fitted to
-_HIDDEN = 0.1  # 1σ of that shift; see :func:`fit`
+_HIDDEN = 0.25  # 1σ of that shift; see :func:`fit`
 _STEPS = 2  # of Gauss-Newton: the second takes its points by the line of the first
 MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
 

@@ -126,50 +126,6 @@ def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from(sigma: float) ->
     assert 0.7 < np.mean(nees) < 2.2
 
 
-def _ends_of_a_wall(
-    wall: np.ndarray, end: int, *, sigma: float, lost: float, extractor: FeatureExtractor
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a wall's end is seen from beyond it, less where it is ``(n, 2)``, and the NEES ``(n,)``."""
-    rng = np.random.default_rng(3)
-    errors, nees = [], []
-    for _ in range(300):
-        pose = np.array([rng.uniform(3.4, 5.0), rng.uniform(1.0, 2.5), rng.uniform(-3, 3)])
-        scan = polygon_scan(pose, [ROOM, wall])
-        scan.ranges[:] += sigma * rng.standard_normal(BEAMS)
-        scan.ranges[rng.random(BEAMS) < lost] = np.nan
-        extractor.extract(scan)
-        corners = extractor.corners()
-        true = polar(pose, wall[end : end + 1])[0]
-        near = np.abs(corners.range_bearing - true).max(axis=1) < 0.4
-        for z, cov in zip(corners.range_bearing[near], corners.cov[near], strict=True):
-            seen = pose[:2] + z[0] * np.array([math.cos(z[1] + pose[2]), math.sin(z[1] + pose[2])])
-            if np.argmin(np.hypot(*(wall - seen).T)) == end:  # not another corner of it
-                e = z - true
-                errors.append(seen - wall[end])
-                nees.append(e @ np.linalg.solve(cov, e))
-    return np.array(errors), np.array(nees)
-
-
-@pytest.mark.parametrize("thickness", [0.1, 0.15, 0.2])
-@pytest.mark.parametrize(("sigma", "lost"), [(0.01, 0.0), (0.01, 0.15), (0.03, 0.0)])
-def test_a_visible_end_face_does_not_move_the_end_of_a_wall(sigma: float, lost: float, thickness: float) -> None:
-    """A door jamb: seen from beyond it, noise hides where the wall ends and its end face begins."""
-    wall = np.array([[1.0, 3.0], [3.0, 3.0], [3.0, 3.0 + thickness], [1.0, 3.0 + thickness]])
-    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
-    errors, nees = _ends_of_a_wall(wall, 1, sigma=sigma, lost=lost, extractor=extractor)
-    assert len(errors) > 150
-    assert abs(float(errors[:, 0].mean())) < 0.5 * sigma
-    assert 0.4 < nees.mean() / 2 < 1.8  # a face of 3.3σ is missed at times
-
-
-def test_a_bevelled_end_of_a_wall_is_where_the_bevel_begins() -> None:
-    wall = np.array([[1.0, 3.0], [3.0, 3.0], [3.2, 3.2], [1.0, 3.2]])
-    errors, nees = _ends_of_a_wall(wall, 1, sigma=0.01, lost=0.0, extractor=FeatureExtractor())
-    assert len(errors) > 100
-    assert abs(float(errors[:, 0].mean())) < 0.08  # its first 4σ pass for the wall
-    assert nees.mean() / 2 < 2.0 and nees.max() < 30.0
-
-
 def test_noise_neither_turns_nor_moves_the_walls_of_a_closet() -> None:
     """Short walls seen at an angle, with a corner at both ends, and noise that hides where one begins."""
     rng = np.random.default_rng(2)
