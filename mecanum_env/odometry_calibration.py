@@ -18,10 +18,9 @@ from mecanum_env.robot import twist_action_to_wheels
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensors import WheelEncoders
 from mecanum_env.world import World
-from slam.geometry import wrap_scalar
-from slam.motion import OdometryNoise
+from slam.motion import OdometryNoise, twist_between
 
-__all__ = ["Calibration", "Drives", "calibrate", "drift_ratios", "drive", "fit", "open_floor", "twist_between"]
+__all__ = ["Calibration", "Drives", "calibrate", "drift_ratios", "drive", "fit", "open_floor"]
 
 Array = NDArray[np.float64]
 
@@ -134,15 +133,6 @@ def open_floor() -> FloorPlan:
         origin=(-half, -half),
         start=(0.0, 0.0, 0.0),
     )
-
-
-def twist_between(before: Array, after: Array, dt: float) -> Array:
-    """Return the twist ``(3,)`` with which :func:`slam.motion.move` goes from one pose to the other in ``dt``."""
-    turn = wrap_scalar(float(after[2] - before[2]))
-    middle = float(before[2]) + 0.5 * turn
-    c, s = math.cos(middle), math.sin(middle)
-    dx, dy = float(after[0] - before[0]), float(after[1] - before[1])
-    return np.array([c * dx + s * dy, c * dy - s * dx, turn]) / dt
 
 
 class _Driver:

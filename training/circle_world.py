@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.odometry_calibration import twist_between
 from slam.backend import Backend
 from slam.geometry import wrap
-from slam.motion import move
+from slam.motion import move, twist_between
 from slam.types import Observations, Odometry
 
 __all__ = ["WORLDS", "LandmarkWorld", "Step", "drive", "simulate"]

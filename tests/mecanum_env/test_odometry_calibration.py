@@ -10,9 +10,9 @@ import pytest
 
 from mecanum_env.calibration import odometry_noise
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig, RobotConfig
-from mecanum_env.odometry_calibration import Drives, drift_ratios, drive, fit, open_floor, twist_between
+from mecanum_env.odometry_calibration import Drives, drift_ratios, drive, fit, open_floor
 from slam.geometry import wrap
-from slam.motion import OdometryNoise, move
+from slam.motion import OdometryNoise
 from training.calibrate import main
 
 ROBOT = RobotConfig()
@@ -29,13 +29,6 @@ def sigma(noise: OdometryNoise, speed: float) -> tuple[float, float]:
     """Return σ of v and of ω at a speed."""
     v, w = noise.variances(speed, 0.0, 0.0)
     return math.sqrt(v), math.sqrt(w)
-
-
-def test_the_twist_between_two_poses_leads_from_one_to_the_other() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        pose, twist = rng.uniform(-3, 3, 3), rng.uniform(-1, 1, 3)
-        np.testing.assert_allclose(twist_between(pose, move(pose, twist, 0.4), 0.4), twist, atol=1e-12)
 
 
 def test_drives_are_varied_and_touch_nothing(nominal: Drives) -> None:
