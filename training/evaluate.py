@@ -21,8 +21,14 @@ from typing import Any
 
 import numpy as np
 
+import agents
+from mecanum_env.config import NOISE_PRESETS
+from mecanum_env.rooms.registry import check as check_rooms
 from slam.formats import atomic_write
 from slam.metrics import nees_band
+from slam.registry import config_type
+from slam.settings import unknown_name
+from training.errors import BadInput
 from training.rooms_command import parse_seeds
 
 __all__ = ["evaluate", "main", "summarise"]
@@ -189,6 +195,17 @@ def _table(summaries: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def _check_names(options: argparse.Namespace) -> None:
+    """Raise ``ValueError`` for a name that is not registered, before any episode is run."""
+    for rooms in options.rooms.split(","):
+        check_rooms(rooms)
+    for backend in options.slam.split(","):
+        config_type(backend)
+    for what, name, valid in (("agent", options.agent, agents.names()), ("noise", options.noise, NOISE_PRESETS)):
+        if name not in valid:
+            raise unknown_name(what, name, valid)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run the module's command line; return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m training.evaluate", description=__doc__)
@@ -201,13 +218,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("results/episodes"))
     options = parser.parse_args(argv)
     try:
+        _check_names(options)
         seeds = parse_seeds(options.seeds)
         jobs = [(r, b, s) for r in options.rooms.split(",") for b in options.slam.split(",") for s in seeds]
         rows = evaluate(jobs, agent=options.agent, noise=options.noise, workers=options.workers, out=options.out)
     except KeyboardInterrupt:
         print("interrupted; run the same command again to go on", file=sys.stderr)
         return 130
-    except ValueError as error:
+    except (BadInput, ValueError) as error:
         print(f"training.evaluate: {error}", file=sys.stderr)
         return 2
     summaries = summarise(rows)
