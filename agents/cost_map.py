@@ -89,8 +89,9 @@ class CostMap:
 
 def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
     """Return the grid's classes, all or a window, with what the robot's body has passed over taken for free."""
-    classes: NDArray[np.int8] = CLASS_OF[belief.grid.log_odds[rows, cols].view(np.uint8)]
-    classes[(classes == UNKNOWN) & (belief.grid.visited[rows, cols] != 0)] = FREE
+    log_odds = belief.grid.log_odds[rows, cols]
+    classes = np.empty(log_odds.shape, dtype=np.int8)
+    _classify(log_odds, belief.grid.visited[rows, cols], CLASS_OF, classes)
     return classes
 
 
@@ -196,6 +197,16 @@ def _weigh(
         weight,
     )
     return weight
+
+
+@njit(cache=True, nogil=True)
+def _classify(
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], table: NDArray[np.int8], classes: NDArray[np.int8]
+) -> None:
+    for row in range(classes.shape[0]):
+        for col in range(classes.shape[1]):
+            kind = table[np.uint8(log_odds[row, col])]
+            classes[row, col] = FREE if kind == UNKNOWN and visited[row, col] != 0 else kind
 
 
 @njit(cache=True, nogil=True)
