@@ -84,14 +84,9 @@ def mean_shift(points: Array, bandwidth: float, iterations: int = 20) -> NDArray
     A flat kernel (Comaniciu and Meer, 2002): each point moves to the mean of the points within ``bandwidth`` until
     it rests; what comes to rest together is a cluster.
     """
-    modes = points.copy()
-    _shift(points, bandwidth, iterations, modes)
-    chosen: list[int] = []
-    for i, mode in enumerate(modes):
-        if all(np.hypot(*(modes[j] - mode)) > 0.5 * bandwidth for j in chosen):
-            chosen.append(i)
-    nearest = [int(np.argmin(np.hypot(*(points - modes[i]).T))) for i in chosen]
-    return np.unique(np.array(nearest, dtype=np.int64))
+    chosen = np.empty(len(points), dtype=np.int64)
+    count = _shift(np.ascontiguousarray(points), bandwidth, iterations, np.empty((len(points), 2)), chosen)
+    return np.unique(chosen[:count])
 
 
 def _in_cells(cost_map: CostMap, points: Array) -> Array:
@@ -200,18 +195,34 @@ def _prune(classes: NDArray[np.int8], cells: Array, parents: NDArray[np.int64], 
 
 
 @njit(cache=True, nogil=True)
-def _shift(points: Array, bandwidth: float, iterations: int, modes: Array) -> None:
+def _shift(points: Array, bandwidth: float, iterations: int, modes: Array, chosen: NDArray[np.int64]) -> int:
+    """Fill ``modes`` with one mode per cluster and ``chosen`` with the point nearest to it; return how many."""
+    count = 0
     for i in range(points.shape[0]):
+        mx, my = points[i, 0], points[i, 1]
+        nearest = i
         for _ in range(iterations):
             x = y = 0.0
-            near = 0
+            near, least = 0, np.inf
             for j in range(points.shape[0]):
-                if (points[j, 0] - modes[i, 0]) ** 2 + (points[j, 1] - modes[i, 1]) ** 2 <= bandwidth**2:
+                square = (points[j, 0] - mx) ** 2 + (points[j, 1] - my) ** 2
+                if square <= bandwidth**2:
                     x += points[j, 0]
                     y += points[j, 1]
                     near += 1
-            x, y = x / near, y / near
-            moved = (x - modes[i, 0]) ** 2 + (y - modes[i, 1]) ** 2
-            modes[i, 0], modes[i, 1] = x, y
+                if square < least:
+                    least, nearest = square, j
+            if near == 0:  # a mean that has drifted off all points: only by rounding
+                break
+            moved = (x / near - mx) ** 2 + (y / near - my) ** 2
+            mx, my = x / near, y / near
             if moved < 1e-8:
                 break
+        known = False
+        for k in range(count):
+            known = known or (modes[k, 0] - mx) ** 2 + (modes[k, 1] - my) ** 2 <= 0.25 * bandwidth**2
+        if not known:
+            modes[count, 0], modes[count, 1] = mx, my
+            chosen[count] = nearest
+            count += 1
+    return count
