@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -109,16 +110,16 @@ class NextBestView(Explorer):
         live = np.flatnonzero(np.isfinite(own.costs))
         if not len(live) or self._config.samples == 0:
             return own
-        places = self._places(own.cost_map, own.travel)
+        targets = own.cost_map.to_cells(own.frontiers.targets)
+        reach = _NEARER * self._watch_kept().range_m
+        places = self._places(own.cost_map, own.travel, targets[live], reach)
         cost = own.travel.cost[places[:, 0], places[:, 1]].astype(np.float64)
         worth = self.worth(own.cost_map, places, cost, rays=_SAMPLE_RAYS)
         if self._goal is not None and len(worth):
             worth[0] *= 1.0 + self._config.switch_share  # the present goal: see _places
         least = self.worth(own.cost_map, own.cells, own.costs, rays=_SAMPLE_RAYS)
         cells, costs = own.cells.copy(), own.costs.copy()
-        targets = own.cost_map.to_cells(own.frontiers.targets)
         points = own.cost_map.to_points(places)
-        reach = _NEARER * self._watch_kept().range_m
         for k in np.argsort(-worth, kind="stable"):
             live = live[least[live] < worth[k]]  # places that are left make nothing better for the others
             if not len(live):
@@ -129,18 +130,22 @@ class NextBestView(Explorer):
             least[seen] = np.inf
         return replace(own, cells=cells, costs=costs)
 
-    def _places(self, cost_map: CostMap, travel: TravelCosts) -> Cells:
+    def _places(self, cost_map: CostMap, travel: TravelCosts, targets: Cells, reach_m: float) -> Cells:
         """Return the places ``(k, 2)`` to weigh, the present goal first where there is one.
 
-        The lattice is that of the belief's frame, so that a growing map does not shift it; on it, where the robot
-        has room to turn.
+        They are points of a lattice of the belief's frame, so that a growing map does not shift it: within
+        ``reach_m`` of one of the frontier cells ``targets`` ``(t, 2)``, and where the robot has room to turn.
         """
         config, resolution = self._config, cost_map.resolution
         step = max(1, round(config.spacing_m / resolution))
         first = [-round(cost_map.origin[axis] / resolution) % step for axis in (1, 0)]
         rows, cols = slice(first[0], None, step), slice(first[1], None, step)
+        apart = np.ones(cost_map.classes.shape, dtype=np.uint8)
+        apart[targets[:, 0], targets[:, 1]] = 0
+        away = cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_5)[rows, cols]
         roomy = cost_map.weight[rows, cols] <= 1.0 + config.planner.near_cost
-        lattice = np.argwhere(np.isfinite(travel.cost[rows, cols]) & roomy) * step + first
+        near = np.isfinite(travel.cost[rows, cols]) & roomy & (away * resolution <= reach_m)
+        lattice = np.argwhere(near) * step + first
         if len(lattice) > config.samples:
             lattice = lattice[np.sort(self._rng.choice(len(lattice), config.samples, replace=False))]
         if self._goal is None:

@@ -48,7 +48,7 @@ class RrtConfig(ExplorerConfig):
     near_piece_m: float = 0.8  # a frontier point farther than this from every piece has been seen since
     gain_radius_m: float = 2.0  # information gain: the unknown in view within this
     min_gain_m2: float = 0.1  # frontier points with less in view are dropped
-    weight_m_m2: float = 2.0  # λ: weighted metres that a square metre of gain is worth
+    weight_m_m2: float = 1.0  # λ: weighted metres that a square metre of gain is worth
     near_gain: float = 2.0  # hysteresis h of frontier points …
     near_m: float = 3.0  # … that are this near to the robot
     switch_m: float = 1.0  # another piece must earn more by this [weighted m] to be worth turning round

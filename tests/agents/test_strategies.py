@@ -114,8 +114,12 @@ def test_places_stay_where_they_are_when_the_map_grows():
         belief = belief_of(classes, (3.0, 2.0, 0.0), origin=origin)
         agent.reset(belief)
         own = agent._candidates(belief)
-        places = own.cost_map.to_points(agent._places(own.cost_map, own.travel))
-        points.append({tuple(p) for p in places.round(6) if p[0] > 2.0})
+        targets = own.cost_map.to_cells(own.frontiers.targets)
+        places = own.cost_map.to_points(agent._places(own.cost_map, own.travel, targets, 3.0))
+        # Its cut-off side is a frontier, too: beyond the reach of that one they are the same.
+        away = np.hypot(*(places[:, None] - own.frontiers.targets[None]).transpose(2, 0, 1)).min(axis=1)
+        assert (away < 3.2).all()  # all of them near enough to see something
+        points.append({tuple(p) for p in places.round(6) if p[0] > 4.0})
     assert points[0] and points[0] == points[1]
 
 
@@ -126,7 +130,8 @@ def test_more_places_than_are_weighed_are_drawn_by_the_seed():
     for seed in (1, 1, 2):
         agent.reset(belief, seed)
         own = agent._candidates(belief)
-        drawn.append(agent._places(own.cost_map, own.travel))
+        targets = own.cost_map.to_cells(own.frontiers.targets)
+        drawn.append(agent._places(own.cost_map, own.travel, targets, 3.0))
     assert len(drawn[0]) == 5
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0], drawn[2])
