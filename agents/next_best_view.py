@@ -2,7 +2,7 @@
 
 A place q that promises the new area A(q) and costs L(q) to reach is worth A(q) · exp(−λ L(q)), with A(q) by
 ray casting on the map (González-Baños and Latombe, "Navigation strategies for exploring indoor environments",
-IJRR 2002, equation 1; the same trade-off, over the branches of a tree, in Bircher et al., ICRA 2016).
+IJRR 2002; the same trade-off, over the branches of a tree, in Bircher et al., ICRA 2016).
 
 Places are the points of a lattice over what can be reached, and each frontier's own view point. Only a place that
 has a piece of frontier in good sight counts: what promises area through a crack in a wall's drawing, looked at

@@ -1,4 +1,4 @@
-"""Cost-utility and next-best-view: on maps where it is known which way is right."""
+"""Strategies that weigh what there is to see: on maps where it is known which way is right."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import agents
+from mecanum_env.config import RobotConfig
 from slam.occupancy import FREE, UNKNOWN
-from tests.agents.grids import belief_of, fill, half_known, room
+from tests.agents.grids import belief_of, drive, fill, half_known, room
 
 WEIGHING = ("cost-utility", "next-best-view")
 # These maps stand still: with the usual range their frontiers would count as seen from where the robot stands.
@@ -58,6 +59,23 @@ def test_of_two_alike_the_nearer_and_it_is_kept(name):
     assert agent.choose(belief_of(classes, (4.8, 2.0, 0.0))).pose[0] < 4.8
     assert agent.choose(belief_of(classes, (5.2, 2.0, 0.0))).pose[0] < 4.8
     assert agent.choose(belief_of(classes, (8.0, 2.0, 0.0))).pose[0] > 7.0
+
+
+@pytest.mark.parametrize("name", [*WEIGHING, "rrt"])
+def test_a_frontier_that_never_yields_ends_it(name):
+    """The map stands still whatever is looked at: the agent looks, from near enough, and ends."""
+    classes = room(5.0, 4.0)
+    fill(classes, 4.5, 1.5, 5.0, 2.5, UNKNOWN)
+    pose = np.array([1.0, 2.0, 0.0])
+    agent = agents.make(name, config={"frontiers": SHORT})
+    agent.reset(belief_of(classes, tuple(pose)))
+    for _ in range(400):
+        belief = belief_of(classes, tuple(pose))
+        pose = drive(pose, agent.act(None, belief), RobotConfig())
+        if agent.goal is None:
+            break
+    assert agent.status == "covered"
+    assert pose[0] > 2.5  # it did go there
 
 
 @pytest.mark.parametrize(
