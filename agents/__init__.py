@@ -18,9 +18,12 @@ __all__ = ["make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
-    "random": "agents.random:RandomAgent",
+    "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "nearest-frontier": "agents.frontier:NearestFrontier",
+    "next-best-view": "agents.next_best_view:NextBestView",
+    "random": "agents.random:RandomAgent",
+    "rrt": "agents.rrt:Rrt",
 }
 
 GROUP = "mecanum_slam.agents"
