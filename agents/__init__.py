@@ -21,6 +21,7 @@ _REGISTRY = {
     "random": "agents.random:RandomAgent",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "nearest-frontier": "agents.frontier:NearestFrontier",
+    "tour": "agents.tour:Tour",
 }
 
 GROUP = "mecanum_slam.agents"
