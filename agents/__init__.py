@@ -24,6 +24,7 @@ _REGISTRY = {
     "next-best-view": "agents.next_best_view:NextBestView",
     "random": "agents.random:RandomAgent",
     "rrt": "agents.rrt:Rrt",
+    "tour": "agents.tour:Tour",
 }
 
 GROUP = "mecanum_slam.agents"

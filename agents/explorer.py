@@ -121,6 +121,7 @@ class Explorer(Agent):
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
+        self._keep_watch(belief)
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
         if not np.isfinite(candidates.costs).any():
