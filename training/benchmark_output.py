@@ -1,0 +1,216 @@
+"""A benchmark's tables: as JSON, as CSV, and as text for the terminal."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from slam.formats import atomic_write
+from training.benchmark_figures import METRICS, Figure, Group, Metric, comparisons, figures
+from training.running import plain
+from training.statistics import Comparison, Interval
+
+__all__ = ["FILES", "Entry", "Report", "as_json", "shown", "table", "write_tables"]
+
+FILES = ("results.sqlite", "config.toml", "episodes.csv", "summary.csv", "comparison.csv", "summary.json")
+"""What a benchmark writes, beside settings.json and, if asked for, report.html."""
+
+_BY_KEY = {metric.key: metric for metric in METRICS}
+# What a terminal has room for: metric, heading, whether with its interval.
+_COLUMNS = (
+    ("reached_95", "95 %", False), ("time_to_95_s", "time to 95 % [s]", True),
+    ("path_length_m", "path [m]", False), ("collisions_per_100_m", "coll/100 m", False),
+    ("map_iou", "IoU", False), ("corner_mean_m", "corner [cm]", False), ("ate_rmse_m", "ATE [cm]", True),
+    ("anees", "NEES/3", False), ("decision_ms_median", "decide [ms]", False),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One agent on one backend in one suite."""
+
+    group: Group
+    name: str  # the agent, with its backend where there are several
+    figures: dict[str, Figure]  # of METRICS
+    against: dict[str, Comparison]  # of COMPARED, with the baseline on the same backend; empty where there is none
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """All that a benchmark has to tell."""
+
+    entries: tuple[Entry, ...]
+    baseline: str | None
+    config: dict[str, Any]
+
+    @classmethod
+    def of(cls, groups: Sequence[Group], *, baseline: str | None, config: dict[str, Any]) -> Report:
+        """Work out every table of the groups."""
+        several = len({group.slam for group in groups}) > 1
+        bases = {(g.suite, g.slam): g for g in groups if g.agent == baseline}
+        entries = []
+        for group in groups:
+            base = bases.get((group.suite, group.slam))
+            entries.append(Entry(
+                group,
+                f"{group.agent}@{group.slam}" if several else group.agent,
+                figures(group),
+                comparisons(group, base) if base is not None and base is not group else {},
+            ))  # fmt: skip
+        return cls(tuple(entries), baseline, config)
+
+    def suites(self) -> dict[str, list[Entry]]:
+        """Return the entries by suite."""
+        found: dict[str, list[Entry]] = {}
+        for entry in self.entries:
+            found.setdefault(entry.group.suite, []).append(entry)
+        return found
+
+
+def shown(metric: Metric, value: float) -> str:
+    """Return a value of a metric in the unit shown."""
+    if math.isnan(value):
+        return "–"
+    return "∞" if math.isinf(value) else f"{metric.scale * value:.{metric.digits}f}"
+
+
+# ---- JSON and CSV ----------------------------------------------------------------------------------------------
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """Return suite → agent → metric → figures, and beside the suites ``comparison``, ``ends`` and ``config``.
+
+    ``low`` and ``high`` are the limits of ``value``, the figure in the tables: the IQM, but the mean for shares
+    and the ratio of two sums for collisions a way. null is what is not defined, or infinite: never reached.
+    """
+    out: dict[str, Any] = {}
+    against: dict[str, Any] = {}
+    ends: dict[str, Any] = {}
+    for suite, entries in report.suites().items():
+        out[suite] = {e.name: {key: _figure(_BY_KEY[key], f) for key, f in e.figures.items()} for e in entries}
+        ends[suite] = {e.name: e.group.ends() for e in entries}
+        found = {e.name: {key: _compared(c) for key, c in e.against.items()} for e in entries if e.against}
+        if found:
+            against[suite] = found
+    return out | {"comparison": against, "ends": ends, "config": report.config}
+
+
+def write_tables(out: Path, report: Report) -> None:
+    """Write ``episodes.csv``, ``summary.csv``, ``comparison.csv`` and ``summary.json``."""
+    atomic_write(out / "episodes.csv", _csv(_episodes(report)))
+    atomic_write(out / "summary.csv", _csv(_summary(report)))
+    atomic_write(out / "comparison.csv", _csv(_comparison(report)))
+    text = json.dumps(as_json(report), indent=1, ensure_ascii=False, allow_nan=False)
+    atomic_write(out / "summary.json", text + "\n")
+
+
+def _figure(metric: Metric, figure: Figure) -> dict[str, Any]:
+    a = figure.averages
+    values = {
+        "value": figure.centre.value, "low": figure.centre.low, "high": figure.centre.high, "iqm": a.iqm.value,
+        "median": a.median.value, "median_low": a.median.low, "median_high": a.median.high, "mean": a.mean.value,
+    }  # fmt: skip
+    return {key: plain(v) for key, v in values.items()} | {"n": a.n, "value_is": metric.centre}
+
+
+def _compared(c: Comparison) -> dict[str, Any]:
+    parts = {"difference": c.difference, "ratio": c.ratio, "probability_of_improvement": c.probability}
+    return {name: _interval(found) for name, found in parts.items()} | {"n": c.n}
+
+
+def _interval(found: Interval) -> dict[str, Any]:
+    return {"value": plain(found.value), "low": plain(found.low), "high": plain(found.high)}
+
+
+def _episodes(report: Report) -> list[dict[str, Any]]:
+    rows = []
+    for entry in report.entries:
+        for (suite, place, seed, agent, slam), row in zip(entry.group.keys, entry.group.rows, strict=True):
+            who = {"suite": suite, "place": place, "seed": seed, "agent": agent, "slam": slam}
+            rows.append(who | row.metrics)
+    return rows
+
+
+def _who(entry: Entry) -> dict[str, Any]:
+    return {"suite": entry.group.suite, "agent": entry.group.agent, "slam": entry.group.slam}
+
+
+def _summary(report: Report) -> list[dict[str, Any]]:
+    return [
+        _who(entry) | {"metric": key} | _figure(_BY_KEY[key], figure)
+        for entry in report.entries
+        for key, figure in entry.figures.items()
+    ]
+
+
+def _comparison(report: Report) -> list[dict[str, Any]]:
+    rows = []
+    for entry in report.entries:
+        for key, c in entry.against.items():
+            row: dict[str, Any] = _who(entry) | {"baseline": report.baseline, "metric": key, "n": c.n}
+            for name, found in (("difference", c.difference), ("ratio", c.ratio), ("probability", c.probability)):
+                limits = _interval(found)
+                row |= {name: limits["value"], f"{name}_low": limits["low"], f"{name}_high": limits["high"]}
+            rows.append(row)
+    return rows
+
+
+def _csv(rows: Iterable[dict[str, Any]]) -> str:
+    """Return rows as CSV with every column that one of them has; empty where there is no value."""
+    rows = list(rows)
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
+
+
+# ---- the terminal ----------------------------------------------------------------------------------------------
+
+
+def table(report: Report) -> str:
+    """Return the main figures of every suite as text."""
+    lines: list[str] = []
+    for suite, entries in report.suites().items():
+        lines += ["", *_suite_table(suite, entries)] if lines else _suite_table(suite, entries)
+        lines += _against_lines(entries, report.baseline)
+    lines.append("IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts")
+    return "\n".join(lines)
+
+
+def _suite_table(suite: str, entries: Sequence[Entry]) -> list[str]:
+    cells = [[f"{suite}", *(heading for _, heading, _ in _COLUMNS)]]
+    for entry in entries:
+        row = [entry.name]
+        for key, _, with_limits in _COLUMNS:
+            metric, centre = _BY_KEY[key], entry.figures[key].centre
+            text = shown(metric, centre.value) + (" %" if metric.unit.startswith("%") else "")
+            if with_limits:
+                text += f" [{shown(metric, centre.low)}, {shown(metric, centre.high)}]"
+            row.append(text)
+        cells.append(row)
+    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
+    return [
+        "  ".join([row[0].ljust(widths[0]), *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True))])
+        for row in cells
+    ]
+
+
+def _against_lines(entries: Sequence[Entry], baseline: str | None) -> list[str]:
+    lines = []
+    for entry in entries:
+        if not entry.against:
+            continue
+        c = entry.against["time_to_95_s"]
+        change = " … ".join(f"{100 * (limit - 1):+.1f} %" for limit in (c.ratio.low, c.ratio.high))
+        lines.append(
+            f"  {entry.name}: time to 95 % {100 * (c.ratio.value - 1):+.1f} % [{change}] against {baseline}, "
+            f"faster in {100 * c.probability.value:.0f} % of {c.n} episodes"
+        )
+    return lines
