@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ FILES = ("results.sqlite", "config.toml", "episodes.csv", "summary.csv", "compar
 """What a benchmark writes, beside settings.json and, if asked for, report.html."""
 
 _BY_KEY = {metric.key: metric for metric in METRICS}
+_WHO_COLUMNS = ("suite", "agent", "slam")
+_KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
 # What a terminal has room for: metric, heading, whether with its interval.
 _COLUMNS = (
     ("reached_95", "95 %", False), ("time_to_95_s", "time to 95 % [s]", True),
@@ -103,9 +105,9 @@ def as_json(report: Report) -> dict[str, Any]:
 
 def write_tables(out: Path, report: Report) -> None:
     """Write ``episodes.csv``, ``summary.csv``, ``comparison.csv`` and ``summary.json``."""
-    atomic_write(out / "episodes.csv", _csv(_episodes(report)))
-    atomic_write(out / "summary.csv", _csv(_summary(report)))
-    atomic_write(out / "comparison.csv", _csv(_comparison(report)))
+    atomic_write(out / "episodes.csv", _csv(_episodes(report), _KEY_COLUMNS))
+    atomic_write(out / "summary.csv", _csv(_summary(report), _WHO_COLUMNS))
+    atomic_write(out / "comparison.csv", _csv(_comparison(report), _WHO_COLUMNS))
     text = json.dumps(as_json(report), indent=1, ensure_ascii=False, allow_nan=False)
     atomic_write(out / "summary.json", text + "\n")
 
@@ -161,11 +163,11 @@ def _comparison(report: Report) -> list[dict[str, Any]]:
     return rows
 
 
-def _csv(rows: Iterable[dict[str, Any]]) -> str:
-    """Return rows as CSV with every column that one of them has; empty where there is no value."""
-    rows = list(rows)
+def _csv(rows: Sequence[dict[str, Any]], first: Sequence[str]) -> str:
+    """Return rows as CSV with the first columns and every other that a row has; empty where there is no value."""
     file = io.StringIO()
-    writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
+    columns = dict.fromkeys((*first, *(name for row in rows for name in row)))
+    writer = csv.DictWriter(file, list(columns), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return file.getvalue()

@@ -296,4 +296,5 @@ def _described(report: Report) -> str:
     config = report.config
     version = config.get("mecanum-slam", "")
     which = f"{config['split']} seeds" if config.get("split") else "chosen seeds"
-    return f"{len(report.suites())} suites, {len(config['agents'])} agents, {which}, mecanum-slam {version}"
+    suites = ", ".join(report.suites())
+    return f"{suites}: {', '.join(config['agents'])}; {which}; mecanum-slam {version}"

@@ -81,13 +81,12 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         at = _to_x(tick, last)
         parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{bottom}"/>')
         parts.append(f'<text class="tick" x="{at:.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>')
-    for share in (0.0, 0.25, 0.5, 0.75, 0.95):
+    for share in (0.0, 0.25, 0.5, 0.75, 0.95, 1.0):
         at = _to_y(share)
         kind = "grid goal" if share == 0.95 else "grid"
+        y = at + {0.95: 8, 1.0: 0}.get(share, 4)  # these two shall not touch
         parts.append(f'<line class="{kind}" x1="{_LEFT}" x2="{right}" y1="{at:.1f}" y2="{at:.1f}"/>')
-        parts.append(
-            f'<text class="tick" x="{_LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{100 * share:g}</text>'
-        )
+        parts.append(f'<text class="tick" x="{_LEFT - 6}" y="{y:.1f}" text-anchor="end">{100 * share:g}</text>')
     for b, colour in zip(bands, colours, strict=True):
         parts.append(f'<path class="band c{colour % COLOURS}" d="{_outline(b, last)}"/>')
     for b, colour in zip(bands, colours, strict=True):

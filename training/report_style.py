@@ -38,12 +38,12 @@ svg text { fill: var(--soft); font-size: 13px } .grid { stroke: var(--rule) } .g
 .band { fill: var(--c); fill-opacity: .13 }
 .key { display: inline-block; width: 1.1rem; border-top: 3px solid var(--c); vertical-align: middle;
   margin-right: .4rem } .key.dashed { border-top-style: dashed }
-.cases { display: flex; flex-wrap: wrap; gap: .8rem; margin: 0 0 .8rem }
-figure { margin: 0; width: 190px; font-size: .8rem; line-height: 1.35 }
+.cases { display: grid; grid-template-columns: repeat(auto-fill, minmax(9.5rem, 1fr)); gap: .8rem;
+  margin: .4rem 0 }
+figure { margin: 0; font-size: .8rem; line-height: 1.35 }
 figure img { display: block; width: 100%; height: 150px; object-fit: contain; background: #e9ebec;
   border-radius: 6px }
 figcaption { margin-top: .3rem; color: var(--soft) } figcaption b { color: var(--ink) }
-@media (max-width: 30rem) { figure { width: calc(50% - .4rem) } figure img { height: 120px } }
 details { margin: .6rem 0 } summary { cursor: pointer; font-weight: 600 }
 pre { overflow-x: auto; background: var(--panel); padding: .8rem; border-radius: 6px; font-size: .8rem }
 """ + "".join(f".c{k} {{ --c: var(--c{k}) }}\n" for k in range(8))
