@@ -22,7 +22,7 @@ from training.statistics import (
     ratio_of_sums,
 )
 
-__all__ = ["COMPARED", "METRICS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows"]
+__all__ = ["COMPARED", "METRICS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows", "merged"]
 
 Array = NDArray[np.float64]
 Row = dict[str, Any]  # an episode's metrics
@@ -53,7 +53,7 @@ class Metric:
 METRICS: tuple[Metric, ...] = (
     Metric(key="coverage", label="coverage", unit="%", scale=100, better="high"),
     Metric(
-        key="reached_95", label="reached 95 %", unit="% of episodes", scale=100, digits=0, better="high",
+        key="reached_95", label="reached 95 %", unit="%", scale=100, digits=0, better="high",
         centre="mean", of=lambda row: row["time_to_95_s"] is not None,
     ),
     *(
@@ -129,6 +129,18 @@ def group_rows(rows: Sequence[tuple[Key, EpisodeRow]]) -> list[Group]:
         )
         for (suite, agent, slam), found in members.items()
     ]
+
+
+def merged(groups: Sequence[Group], *, suite: str) -> Group:
+    """Return one agent's episodes of several suites as those of one, with each suite's places as its strata."""
+    pairs = [(key, row) for group in groups for key, row in zip(group.keys, group.rows, strict=True)]
+    return Group(
+        suite=suite,
+        agent=groups[0].agent,
+        slam=groups[0].slam,
+        keys=tuple((suite, f"{key[0]}/{key[1]}", *key[2:]) for key, _ in pairs),
+        rows=tuple(row for _, row in pairs),
+    )
 
 
 def figures(group: Group) -> dict[str, Figure]:

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from slam.formats import atomic_write
-from training.benchmark_figures import METRICS, Figure, Group, Metric, comparisons, figures
+from training.benchmark_figures import METRICS, Figure, Group, Metric, comparisons, figures, merged
 from training.running import plain
 from training.statistics import Comparison, Interval
+from training.suites import SLIPPERY
 
 __all__ = ["FILES", "Entry", "Report", "as_json", "shown", "table", "write_tables"]
 
@@ -48,6 +49,7 @@ class Report:
     """All that a benchmark has to tell."""
 
     entries: tuple[Entry, ...]
+    overall: dict[str, dict[str, dict[str, Comparison]]]  # all suites of a noise together → name → of COMPARED
     baseline: str | None
     config: dict[str, Any]
 
@@ -55,17 +57,21 @@ class Report:
     def of(cls, groups: Sequence[Group], *, baseline: str | None, config: dict[str, Any]) -> Report:
         """Work out every table of the groups."""
         several = len({group.slam for group in groups}) > 1
-        bases = {(g.suite, g.slam): g for g in groups if g.agent == baseline}
         entries = []
-        for group in groups:
-            base = bases.get((group.suite, group.slam))
+        for group, base in _with_baseline(groups, baseline):
             entries.append(Entry(
                 group,
                 f"{group.agent}@{group.slam}" if several else group.agent,
                 figures(group),
                 comparisons(group, base) if base is not None and base is not group else {},
             ))  # fmt: skip
-        return cls(tuple(entries), baseline, config)
+        overall: dict[str, dict[str, dict[str, Comparison]]] = {}
+        names = {(entry.group.agent, entry.group.slam): entry.name for entry in entries}
+        for group, base in _with_baseline(_all_suites(groups), baseline):
+            if base is not None and base is not group:
+                found = overall.setdefault(group.suite, {})
+                found[names[group.agent, group.slam]] = comparisons(group, base)
+        return cls(tuple(entries), overall, baseline, config)
 
     def suites(self) -> dict[str, list[Entry]]:
         """Return the entries by suite."""
@@ -73,6 +79,24 @@ class Report:
         for entry in self.entries:
             found.setdefault(entry.group.suite, []).append(entry)
         return found
+
+
+def _with_baseline(groups: Sequence[Group], baseline: str | None) -> list[tuple[Group, Group | None]]:
+    bases = {(g.suite, g.slam): g for g in groups if g.agent == baseline}
+    return [(group, bases.get((group.suite, group.slam))) for group in groups]
+
+
+def _all_suites(groups: Sequence[Group]) -> list[Group]:
+    """Return each agent's episodes of all nominal suites as one group, and of all slippery ones."""
+    found = []
+    for name, slippery in (("all-nominal", False), ("all-slippery", True)):
+        parts = [group for group in groups if group.suite.endswith(SLIPPERY) == slippery]
+        suites = {group.suite for group in parts}
+        for who in dict.fromkeys((group.agent, group.slam) for group in parts):
+            own = [group for group in parts if (group.agent, group.slam) == who]
+            if len(own) == len(suites) > 1:
+                found.append(merged(own, suite=name))
+    return found
 
 
 def shown(metric: Metric, value: float) -> str:
@@ -88,6 +112,8 @@ def shown(metric: Metric, value: float) -> str:
 def as_json(report: Report) -> dict[str, Any]:
     """Return suite → agent → metric → figures, and beside the suites ``comparison``, ``ends`` and ``config``.
 
+    ``comparison`` also has all nominal and all slippery suites together, each place counting the same.
+
     ``low`` and ``high`` are the limits of ``value``, the figure in the tables: the IQM, but the mean for shares
     and the ratio of two sums for collisions a way. null is what is not defined, or infinite: never reached.
     """
@@ -100,6 +126,8 @@ def as_json(report: Report) -> dict[str, Any]:
         found = {e.name: {key: _compared(c) for key, c in e.against.items()} for e in entries if e.against}
         if found:
             against[suite] = found
+    for suite, by_name in report.overall.items():
+        against[suite] = {name: {key: _compared(c) for key, c in found.items()} for name, found in by_name.items()}
     return out | {"comparison": against, "ends": ends, "config": report.config}
 
 
@@ -152,12 +180,19 @@ def _summary(report: Report) -> list[dict[str, Any]]:
 
 
 def _comparison(report: Report) -> list[dict[str, Any]]:
+    every = [(_who(entry), entry.against) for entry in report.entries]
+    for suite, by_name in report.overall.items():
+        for name, found in by_name.items():
+            agent, _, slam = name.partition("@")
+            slam = slam or report.entries[0].group.slam
+            every.append(({"suite": suite, "agent": agent, "slam": slam}, found))
     rows = []
-    for entry in report.entries:
-        for key, c in entry.against.items():
-            row: dict[str, Any] = _who(entry) | {"baseline": report.baseline, "metric": key, "n": c.n}
-            for name, found in (("difference", c.difference), ("ratio", c.ratio), ("probability", c.probability)):
-                limits = _interval(found)
+    for who, against in every:
+        for key, c in against.items():
+            row: dict[str, Any] = who | {"baseline": report.baseline, "metric": key, "n": c.n}
+            parts = {"difference": c.difference, "ratio": c.ratio, "probability": c.probability}
+            for name, part in parts.items():
+                limits = _interval(part)
                 row |= {name: limits["value"], f"{name}_low": limits["low"], f"{name}_high": limits["high"]}
             rows.append(row)
     return rows

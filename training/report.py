@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from training.benchmark_figures import METRICS, Metric
 from training.benchmark_output import Entry, Report, shown
 from training.report_charts import COLOURS, Along, band, coverage_chart, extent
 from training.report_style import STYLE
-from training.statistics import Interval
+from training.statistics import Comparison, Interval
 
 __all__ = ["FILE", "page", "worst_first", "write_report"]
 
@@ -52,6 +52,10 @@ def page(report: Report, *, config_text: str) -> str:
         f"<nav>{links}<a href='#made'>configuration</a></nav>",
         _READING,
         _overview(report, suites),
+        *(
+            _against_table(found, f"Against {report.baseline}, {name.replace('-', ' ')} suites together")
+            for name, found in report.overall.items()
+        ),
         *(_suite(name, entries, report, colours) for name, entries in suites.items()),
         _made(report.config, config_text),
     ]
@@ -76,7 +80,10 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
         f'<h2 id="{_anchor(name)}">{escape(name)}</h2>',
         f'<p class="soft">{episodes} episodes an agent, {escape(backends)}</p>',
         _figures_table(entries, [_BY_KEY[key] for key in _HEADLINE], colours),
-        _against_table(entries, report.baseline),
+        _against_table(
+            {entry.name: entry.against for entry in entries if entry.against},
+            f"Against {report.baseline}, on the same episodes",
+        ),
         _charts(entries, colours),
         "<h3>How the episodes ended</h3>",
         _ends_table(entries),
@@ -114,23 +121,23 @@ def _figures_table(
     return _table(head, rows)
 
 
-def _against_table(entries: Sequence[Entry], baseline: str | None) -> str:
-    compared = [entry for entry in entries if entry.against]
-    if not compared:
-        return ""
+def _against_table(against: Mapping[str, Mapping[str, Comparison]], title: str) -> str:
+    """Return a table of name → metric → comparison, nothing where there is none."""
     metrics = [_BY_KEY[key] for key in _AGAINST]
     rows = []
-    for entry in compared:
-        cells = [escape(entry.name)]
+    for name, found in against.items():
+        cells = [escape(name)]
         for metric in metrics:
-            c = entry.against[metric.key]
+            c = found[metric.key]
             cells.append(f"{_change(metric, c.ratio)}<small>{_better(c.probability)}</small>")
-        rows.append([*cells, str(entry.against["time_to_95_s"].n)])
+        rows.append([*cells, str(found["time_to_95_s"].n)])
+    if not rows:
+        return ""
     head = ["", *(escape(metric.label) for metric in metrics), "episodes"]
     return (
-        f"<h3>Against {escape(str(baseline))}, on the same episodes</h3>"
+        f"<h3>{escape(title)}</h3>"
         '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
-        "change; below, in what share of the episodes it did better.</p>" + _table(head, rows)
+        "change; below, in what share of the episodes it did better, ties counted half.</p>" + _table(head, rows)
     )
 
 
@@ -265,11 +272,11 @@ def _limits(metric: Metric, found: Interval) -> str:
 def _change(metric: Metric, ratio: Interval) -> str:
     if math.isnan(ratio.value):
         return "–"
-    text = f"{100 * (ratio.value - 1):+.1f} % [{100 * (ratio.low - 1):+.1f}, {100 * (ratio.high - 1):+.1f}]"
-    if ratio.low <= 1.0 <= ratio.high or math.isnan(ratio.low):
-        return text
-    good = (ratio.value < 1.0) == (metric.better == "low")
-    return f'<span class="{"better" if good else "worse"}">{text}</span>'
+    text = f"{100 * (ratio.value - 1):+.1f} %"
+    if not (ratio.low <= 1.0 <= ratio.high or math.isnan(ratio.low)):
+        good = (ratio.value < 1.0) == (metric.better == "low")
+        text = f'<span class="{"better" if good else "worse"}">{text}</span>'
+    return f"{text}<small>{100 * (ratio.low - 1):+.1f} … {100 * (ratio.high - 1):+.1f}</small>"
 
 
 def _better(p: Interval) -> str:

@@ -24,9 +24,9 @@ p { margin: .3rem 0 .7rem; max-width: 52rem } .soft { color: var(--soft) } a { c
 nav { display: flex; flex-wrap: wrap; gap: .3rem 1rem; margin: .8rem 0 }
 .wide { overflow-x: auto; margin: 0 0 .6rem }
 table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums }
-th, td { padding: .35rem .65rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap;
+th, td { padding: .35rem .5rem; text-align: right; border-bottom: 1px solid var(--rule); white-space: nowrap;
   vertical-align: top }
-thead th { color: var(--soft); font-weight: 600; vertical-align: bottom }
+thead th { color: var(--soft); font-weight: 600; vertical-align: bottom; white-space: normal; min-width: 4.6rem }
 th:first-child { text-align: left; position: sticky; left: 0; background: var(--page) }
 tbody th { font-weight: 600 } td small { display: block; color: var(--soft); font-size: .78rem }
 .better { color: var(--good); font-weight: 600 } .worse { color: var(--bad); font-weight: 600 }
@@ -43,6 +43,7 @@ svg text { fill: var(--soft); font-size: 13px } .grid { stroke: var(--rule) } .g
 figure { margin: 0; font-size: .8rem; line-height: 1.35 }
 figure img { display: block; width: 100%; height: 150px; object-fit: contain; background: #e9ebec;
   border-radius: 6px }
+@media (max-width: 40rem) { th:first-child { white-space: normal; max-width: 8rem } }
 figcaption { margin-top: .3rem; color: var(--soft) } figcaption b { color: var(--ink) }
 details { margin: .6rem 0 } summary { cursor: pointer; font-weight: 600 }
 pre { overflow-x: auto; background: var(--panel); padding: .8rem; border-radius: 6px; font-size: .8rem }

@@ -14,7 +14,7 @@ from slam.settings import unknown_name
 from training.errors import BadInput, bad_input
 from training.provenance import short_digest
 
-__all__ = ["FLOOR_PLANS", "SPLITS", "Place", "Suite", "choose", "names", "read_floor_plans"]
+__all__ = ["FLOOR_PLANS", "SLIPPERY", "SPLITS", "Place", "Suite", "choose", "names", "read_floor_plans"]
 
 SPLITS: dict[str, range] = {
     "train": range(0, 1000),
@@ -26,8 +26,10 @@ SPLITS: dict[str, range] = {
 FLOOR_PLANS = "floor-plans"
 """The suite of the plans in ``--floor-plans DIR``."""
 
+SLIPPERY = "-slippery"
+"""What the names of the suites with the slippery noise end in."""
+
 _SEEDS_A_PLAN = 5  # a real plan is large, and the same in every episode: a few starts and noises do
-_SLIPPERY = "-slippery"
 _ROOMS = {
     "rooms": "rectangular",
     "apartments": "apartment",
@@ -123,7 +125,7 @@ def _read(path: Path) -> Place:
 
 
 def _make(name: str, plans: tuple[Place, ...]) -> Suite:
-    base = name.removesuffix(_SLIPPERY)
+    base = name.removesuffix(SLIPPERY)
     noise = "nominal" if base == name else "slippery"
     places = plans if base == FLOOR_PLANS else (Place(name=_ROOMS[base], rooms=_ROOMS[base]),)
     return Suite(name=name, noise=noise, places=places)
@@ -132,7 +134,7 @@ def _make(name: str, plans: tuple[Place, ...]) -> Suite:
 def _all_names(bases: Sequence[str] | dict[str, str]) -> Iterator[str]:
     for base in bases:
         yield base
-        yield base + _SLIPPERY
+        yield base + SLIPPERY
 
 
 def _suffixes() -> str:
