@@ -101,7 +101,7 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
 def _figures_table(
     entries: Sequence[Entry], metrics: Sequence[Metric], colours: dict[str, int], *, medians: bool = False
 ) -> str:
-    head = ["", *(f"{escape(m.label)}<br>{escape(f'[{m.unit}]' if m.unit else '')}" for m in metrics)]
+    head = ["", *(_heading(m) + (f"<br>[{_unbroken(m.unit)}]" if m.unit else "") for m in metrics)]
     best = {metric.key: _best(metric, entries) for metric in metrics}
     rows = []
     for entry in entries:
@@ -133,7 +133,7 @@ def _against_table(against: Mapping[str, Mapping[str, Comparison]], title: str) 
         rows.append([*cells, str(found["time_to_95_s"].n)])
     if not rows:
         return ""
-    head = ["", *(escape(metric.label) for metric in metrics), "episodes"]
+    head = ["", *map(_heading, metrics), "episodes"]
     return (
         f"<h3>{escape(title)}</h3>"
         '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
@@ -254,6 +254,14 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     for row in rows:
         lines.append(f"<tr><th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>")
     return "".join([*lines, "</tbody></table></div>"])
+
+
+def _heading(metric: Metric) -> str:
+    return escape(metric.label.replace(" %", "\u00a0%"))
+
+
+def _unbroken(text: str) -> str:
+    return escape(text.replace(" ", "\u00a0"))
 
 
 def _best(metric: Metric, entries: Sequence[Entry]) -> str | None:

@@ -13,11 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 
 __all__ = [
     "CONFIDENCE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval", "iqm",
-    "mean_interval", "ratio_of_sums", "resampled_indices",
+    "mean_interval", "median", "ratio_of_sums", "resampled_indices",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -62,7 +61,17 @@ def iqm(values: ArrayLike, axis: int = -1) -> Array:
 
     Of n values, ⌊n / 4⌋ are left out at either end, so that up to three are averaged whole.
     """
-    return np.asarray(stats.trim_mean(np.asarray(values, np.float64), 0.25, axis=axis))
+    # Sorting whole rows takes a tenth of the time of NumPy's partition, and so of scipy.stats.trim_mean.
+    ordered = np.sort(np.asarray(values, np.float64), axis=axis)
+    n = ordered.shape[axis]
+    return np.asarray(np.take(ordered, range(n // 4, n - n // 4), axis=axis).mean(axis=axis))
+
+
+def median(values: ArrayLike) -> Array:
+    """Return the median along the last axis; between a number and infinity it is infinite."""
+    ordered = np.sort(np.asarray(values, np.float64), axis=-1)
+    n = ordered.shape[-1]
+    return np.asarray(0.5 * (ordered[..., (n - 1) // 2] + ordered[..., n // 2]))
 
 
 # ---- resampling ------------------------------------------------------------------------------------------------
@@ -134,7 +143,7 @@ def estimate(values: ArrayLike, strata: Sequence[Hashable], *, for_median: Array
     m = v if for_median is None else np.asarray(for_median, np.float64)
     return Estimate(
         iqm=interval(lambda at: iqm(v[at]), strata),
-        median=interval(lambda at: np.asarray(np.median(m[at], axis=-1)), strata),
+        median=interval(lambda at: median(m[at]), strata),
         mean=mean_interval(v, strata),
         n=len(v),
     )

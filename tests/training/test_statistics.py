@@ -16,6 +16,7 @@ from training.statistics import (
     interval,
     iqm,
     mean_interval,
+    median,
     ratio_of_sums,
     resampled_indices,
 )
@@ -26,8 +27,11 @@ def test_iqm_is_the_mean_of_the_middle(n: int) -> None:
     values = np.random.default_rng(n).normal(size=n)
     cut = n // 4
     expected = np.sort(values)[cut : n - cut].mean()
+    np.testing.assert_allclose(stats.trim_mean(values, 0.25), expected)
+    np.testing.assert_allclose(median(np.stack([values, -values])), [np.median(values), -np.median(values)])
     np.testing.assert_allclose(iqm(values), expected)
-    np.testing.assert_allclose(iqm(np.stack([values, 2 * values])), [expected, 2 * expected])
+    for axis, both in ((-1, np.stack([values, 2 * values])), (0, np.column_stack([values, 2 * values]))):
+        np.testing.assert_allclose(iqm(both, axis=axis), [expected, 2 * expected])
 
 
 def test_an_iqm_is_not_moved_by_a_few_outliers() -> None:
