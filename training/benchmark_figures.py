@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.benchmark_episode import EpisodeRow, Key
+from training.evaluate import consistency_figures
 from training.statistics import (
     Comparison,
     Estimate,
@@ -104,6 +105,10 @@ class Group:
     def ends(self) -> dict[str, int]:
         """Return how many episodes ended how, the commonest first."""
         return dict(Counter(str(row.metrics["end"]) for row in self.rows).most_common())
+
+    def consistency(self) -> dict[str, Any]:
+        """Return ``nees_over_3_mean``, ``nees_band_95`` and ``fraction_in_band`` over all episodes' seconds."""
+        return consistency_figures([row.nees.tolist() for row in self.rows])
 
     def values(self, metric: Metric) -> Array:
         """Return every episode's value ``(n,)``, nan where it has none."""

@@ -110,7 +110,7 @@ def shown(metric: Metric, value: float) -> str:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """Return suite → agent → metric → figures, and beside the suites ``comparison``, ``ends`` and ``config``.
+    """Return suite → agent → metric → figures, and ``comparison``, ``ends``, ``consistency``, ``config`` beside.
 
     ``comparison`` also has all nominal and all slippery suites together, each place counting the same.
 
@@ -120,15 +120,19 @@ def as_json(report: Report) -> dict[str, Any]:
     out: dict[str, Any] = {}
     against: dict[str, Any] = {}
     ends: dict[str, Any] = {}
+    consistency: dict[str, Any] = {}
     for suite, entries in report.suites().items():
         out[suite] = {e.name: {key: _figure(_BY_KEY[key], f) for key, f in e.figures.items()} for e in entries}
         ends[suite] = {e.name: e.group.ends() for e in entries}
+        consistency[suite] = {e.name: _plain(e.group.consistency()) for e in entries}
         found = {e.name: {key: _compared(c) for key, c in e.against.items()} for e in entries if e.against}
         if found:
             against[suite] = found
     for suite, by_name in report.overall.items():
         against[suite] = {name: {key: _compared(c) for key, c in found.items()} for name, found in by_name.items()}
-    return out | {"comparison": against, "ends": ends, "config": report.config}
+    return out | {
+        "comparison": against, "ends": ends, "consistency": consistency, "config": report.config,
+    }  # fmt: skip
 
 
 def write_tables(out: Path, report: Report) -> None:
@@ -146,16 +150,20 @@ def _figure(metric: Metric, figure: Figure) -> dict[str, Any]:
         "value": figure.centre.value, "low": figure.centre.low, "high": figure.centre.high, "iqm": a.iqm.value,
         "median": a.median.value, "median_low": a.median.low, "median_high": a.median.high, "mean": a.mean.value,
     }  # fmt: skip
-    return {key: plain(v) for key, v in values.items()} | {"n": a.n, "value_is": metric.centre}
+    return _plain(values) | {"n": a.n, "value_is": metric.centre}
 
 
 def _compared(c: Comparison) -> dict[str, Any]:
     parts = {"difference": c.difference, "ratio": c.ratio, "probability_of_improvement": c.probability}
-    return {name: _interval(found) for name, found in parts.items()} | {"n": c.n}
+    return {name: _interval(part) for name, part in parts.items()} | {"n": c.n}
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: plain(value) for key, value in values.items()}
 
 
 def _interval(found: Interval) -> dict[str, Any]:
-    return {"value": plain(found.value), "low": plain(found.low), "high": plain(found.high)}
+    return _plain({"value": found.value, "low": found.low, "high": found.high})
 
 
 def _episodes(report: Report) -> list[dict[str, Any]]:

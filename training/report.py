@@ -87,6 +87,8 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
         _charts(entries, colours),
         "<h3>How the episodes ended</h3>",
         _ends_table(entries),
+        "<h3>Is the robot's own uncertainty right?</h3>",
+        _consistency_table(entries),
         "<h3>Maps, worst cases first</h3>",
         '<p class="soft">Of those that did not reach 95 % the least covered, then of the others those with the '
         "largest trajectory error.</p>",
@@ -162,6 +164,19 @@ def _ends_table(entries: Sequence[Entry]) -> str:
     kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
     rows = [[escape(name), *(str(found.get(kind, "–")) for kind in kinds)] for name, found in ends.items()]
     return _table(["", *map(escape, kinds)], rows)
+
+
+def _consistency_table(entries: Sequence[Entry]) -> str:
+    rows = []
+    for entry in entries:
+        found = entry.group.consistency()
+        mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
+        average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
+        rows.append([
+            escape(entry.name), average, f"{low:.2f} … {high:.2f}", f"{100 * found['fraction_in_band']:.0f} %"
+        ])  # fmt: skip
+    head = ["", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]
+    return _table(head, rows)
 
 
 def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
