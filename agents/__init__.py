@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any
 
 from slam.settings import unknown_name
@@ -21,10 +23,19 @@ _REGISTRY = {
     "nearest-frontier": "agents.frontier:NearestFrontier",
 }
 
+GROUP = "mecanum_slam.agents"
+"""Entry points of this group, ``name = "module:class"``, are agents, too: so other packages add theirs."""
+
+
+@cache
+def _installed() -> dict[str, str]:
+    """Return every agent's entry point: other packages' ones, then ours, which none of them replaces."""
+    return {point.name: point.value for point in entry_points(group=GROUP)} | _REGISTRY
+
 
 def names() -> tuple[str, ...]:
     """Return the names that :func:`make` takes, sorted."""
-    return tuple(sorted(_REGISTRY))
+    return tuple(sorted(_installed()))
 
 
 def make(
@@ -53,8 +64,9 @@ def make(
     ValueError
         For a name or key that is not known; the message lists the valid ones.
     """
-    if name not in _REGISTRY:
-        raise unknown_name("agent", name, _REGISTRY)
-    module, _, attribute = _REGISTRY[name].partition(":")
+    known = _installed()
+    if name not in known:
+        raise unknown_name("agent", name, known)
+    module, _, attribute = known[name].partition(":")
     agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)
     return agent

@@ -20,6 +20,7 @@ import numpy as np
 import tomli_w
 
 import agents
+from agents.base import ENDINGS as AGENT_ENDINGS
 from agents.base import Agent
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import EnvConfig
@@ -32,7 +33,7 @@ from slam.settings import to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
 from training.running import interrupt_flag, plain, versions
 
-__all__ = ["FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
+__all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
@@ -42,6 +43,14 @@ FILES = (
 
 LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
 """The step limit where none is given: so many, or so many a square metre of free space."""
+
+ENDINGS = {
+    **AGENT_ENDINGS,
+    "time": "the step limit was reached first",
+    "collision": "it touched a wall, and the configuration ends an episode there",
+    "interrupted": "broken off by Ctrl-C",
+}
+"""Why an episode ended: the word in ``metrics.json``, and what it means."""
 
 _DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
@@ -83,7 +92,7 @@ class Episode:
     config: EnvConfig  # with the coverage that counts as success
     run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
     out: Path
-    end: str = "step limit"
+    end: str = "time"  # a word of ENDINGS
     interrupted: bool = False
     wall_time_s: float = 0.0
     decisions_ms: list[float] = field(default_factory=list)
@@ -209,7 +218,7 @@ def run(episode: Episode, progress: Progress) -> None:
             if interrupted.is_set():
                 episode.end, episode.interrupted = "interrupted", True
             elif terminated and not (info["is_success"] and agent.outlives_coverage):
-                episode.end = "all mapped" if info["is_success"] else "collision"
+                episode.end = "covered" if info["is_success"] else "collision"
             elif idle >= patience:
                 episode.end = agent.status
             elif not truncated:

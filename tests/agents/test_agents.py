@@ -41,7 +41,7 @@ def ready(name: str, belief: Belief, seed: int = 0, **kwargs) -> Agent:
 
 
 def test_registry():
-    assert set(NAMES) == {"random", "nearest-frontier", "explore-and-return"}
+    assert set(NAMES) >= {"random", "nearest-frontier", "explore-and-return"}
     with pytest.raises(ValueError, match="nearest-frontier"):
         agents.make("nearest-frontierr")
     with pytest.raises(ValueError, match="switch_m"):
@@ -52,6 +52,25 @@ def test_registry():
         agents.make("random", step_s=0.0)
     agent = agents.make("nearest-frontier", config={"control": {"turn_gain": 1.0}, "switch_m": 1})
     assert agent.config.control.turn_gain == 1.0
+
+
+def test_another_package_adds_an_agent(tmp_path, monkeypatch):
+    info = tmp_path / "somebodys_agents-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: somebodys-agents\nVersion: 1.0\n")
+    points = "[mecanum_slam.agents]\ntheirs = somebodys_agents:Theirs\nrandom = somebodys_agents:Theirs\n"
+    (info / "entry_points.txt").write_text(points)
+    (tmp_path / "somebodys_agents.py").write_text(
+        "from agents.frontier import NearestFrontier\n\n\nclass Theirs(NearestFrontier):\n    pass\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    agents._installed.cache_clear()
+    try:
+        assert set(agents.names()) == {*NAMES, "theirs"}
+        assert type(agents.make("theirs")).__name__ == "Theirs"
+        assert type(agents.make("random")).__name__ == "RandomAgent"  # ours stay ours
+    finally:
+        agents._installed.cache_clear()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -168,7 +187,7 @@ def test_nothing_left_to_explore():
     belief = belief_of(room(6.0, 4.0), (2.0, 2.0, 0.0))
     agent = ready("nearest-frontier", belief)
     assert agent.choose(belief) is None
-    assert agent.status == "covered"
+    assert agent.ended and agent.status == "covered"
     np.testing.assert_array_equal(agent.act(BLANK, belief), np.zeros(3, np.float32))
     assert agent.goal is None and len(agent.frontiers) == 0
 
@@ -181,6 +200,7 @@ def test_enclosed_robot_stays():
     agent = ready("nearest-frontier", belief)
     assert agent.choose(belief) is None
     assert len(agent.frontiers) > 0
+    assert agent.ended and agent.status == "unreachable"
     np.testing.assert_array_equal(agent.act(None, belief), np.zeros(3, np.float32))
     # One door, and it leaves.
     fill(classes, 4.8, 3.5, 5.1, 4.5, FREE)
