@@ -22,7 +22,7 @@ from training.benchmark_episode import EpisodeFailure, EpisodeJob, EpisodeRow, r
 from training.benchmark_figures import Group, group_rows
 from training.benchmark_output import FILES, Report, write_tables
 from training.campaign import backend_names, check_settings, run_all, write_settings
-from training.errors import BadInput, bad_input
+from training.errors import BadInput, bad_input, one_line
 from training.explore import LEAST_STEPS, STEPS_PER_M2
 from training.provenance import code_digest, short_digest
 from training.rooms_command import parse_seeds
@@ -106,8 +106,7 @@ class BenchmarkPlan:
         BadInput
             For an agent that cannot be made without settings of its own.
         """
-        with bad_input():
-            modules = {name: type(agents.make(name)).__module__ for name in self.agents}
+        modules = {name: _module_of_agent(name) for name in self.agents}
         modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
         common = json.dumps(self.settings(), sort_keys=True)
         out = {}
@@ -209,6 +208,16 @@ def _agent_names(text: str) -> tuple[str, ...]:
         if name not in agents.names():
             raise unknown_name("agent", name, agents.names())
     return chosen
+
+
+def _module_of_agent(name: str) -> str:
+    try:
+        with bad_input():
+            return type(agents.make(name)).__module__
+    except (ImportError, AttributeError) as error:  # another package's, or one that needs what is not installed
+        raise BadInput(
+            f"cannot load agent {name} ({one_line(error)}); install what it needs, or leave it out"
+        ) from error
 
 
 def _config_text(suite: Suite, backend: str) -> str:

@@ -14,6 +14,7 @@ from slam.formats import atomic_write
 from training.benchmark_episode import EpisodeRow, Key
 from training.benchmark_figures import METRICS, Metric
 from training.benchmark_output import Entry, Report, shown
+from training.explore import ENDINGS
 from training.report_charts import COLOURS, Along, band, coverage_chart, extent
 from training.report_style import STYLE
 from training.statistics import Comparison, Interval
@@ -163,7 +164,8 @@ def _ends_table(entries: Sequence[Entry]) -> str:
     ends = {entry.name: entry.group.ends() for entry in entries}
     kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
     rows = [[escape(name), *(str(found.get(kind, "–")) for kind in kinds)] for name, found in ends.items()]
-    return _table(["", *map(escape, kinds)], rows)
+    means = "; ".join(f"{kind}: {ENDINGS[kind]}" for kind in kinds if kind in ENDINGS)
+    return f'{_table(["", *map(escape, kinds)], rows)}<p class="soft">{escape(means)}</p>'
 
 
 def _consistency_table(entries: Sequence[Entry]) -> str:

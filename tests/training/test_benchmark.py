@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
+import tomllib
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ import cv2
 import numpy as np
 import pytest
 
+import agents
 from tests.training.plans import write_room
 from tests.training.test_cli_bad_input import refused
 from training import benchmark, suites
@@ -271,6 +274,35 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+@pytest.mark.usefixtures("here")
+def test_the_documented_agent_is_found_by_its_entry_point(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (Path(__file__).resolve().parents[2] / "docs" / "benchmark.md").read_text("utf-8")
+    code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
+    assert len(code.splitlines()) <= 20
+    toml = tomllib.loads(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0])
+    site = tmp_path / "site"
+    info = site / "my_agents-0.1.dist-info"
+    info.mkdir(parents=True)
+    (site / "my_agents.py").write_text(code, "utf-8")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-agents\nVersion: 0.1\n")
+    ((group, points),) = toml["project"]["entry-points"].items()
+    (info / "entry_points.txt").write_text(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()))
+    monkeypatch.syspath_prepend(site)
+    agents._installed.cache_clear()
+    try:
+        result = measure(small(tmp_path / "out", "--agents", "farthest-frontier", seeds="0"), capsys)
+        (info / "entry_points.txt").write_text(f"[{group}]\nfarthest-frontier = nowhere:Agent\n")
+        agents._installed.cache_clear()
+        line = refused(small(tmp_path / "out", "--agents", "farthest-frontier"), capsys)
+    finally:
+        monkeypatch.undo()
+        agents._installed.cache_clear()
+    assert result["rooms"]["farthest-frontier"]["coverage"]["value"] > 0.3
+    assert "cannot load agent farthest-frontier" in line and "nowhere" in line
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------
