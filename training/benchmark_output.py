@@ -236,7 +236,7 @@ def _suite_table(suite: str, entries: Sequence[Entry]) -> list[str]:
         for key, _, with_limits in _COLUMNS:
             metric, centre = _BY_KEY[key], entry.figures[key].centre
             text = shown(metric, centre.value) + (" %" if metric.unit.startswith("%") else "")
-            if with_limits:
+            if with_limits and not math.isnan(centre.low):
                 text += f" [{shown(metric, centre.low)}, {shown(metric, centre.high)}]"
             row.append(text)
         cells.append(row)
@@ -253,9 +253,9 @@ def _against_lines(entries: Sequence[Entry], baseline: str | None) -> list[str]:
         if not entry.against:
             continue
         c = entry.against["time_to_95_s"]
-        change = " … ".join(f"{100 * (limit - 1):+.1f} %" for limit in (c.ratio.low, c.ratio.high))
-        lines.append(
-            f"  {entry.name}: time to 95 % {100 * (c.ratio.value - 1):+.1f} % [{change}] against {baseline}, "
-            f"faster in {100 * c.probability.value:.0f} % of {c.n} episodes"
-        )
+        text = f"  {entry.name}: time to 95 % {100 * (c.ratio.value - 1):+.1f} %"
+        if not math.isnan(c.ratio.low):
+            text += f" [{100 * (c.ratio.low - 1):+.1f} %, {100 * (c.ratio.high - 1):+.1f} %]"
+        text += f" against {baseline}, faster in {100 * c.probability.value:.0f} % of {c.n} episodes"
+        lines.append(text)
     return lines

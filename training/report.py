@@ -91,8 +91,8 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
         "<h3>Is the robot's own uncertainty right?</h3>",
         _consistency_table(entries),
         "<h3>Maps, worst cases first</h3>",
-        '<p class="soft">Of those that did not reach 95 % the least covered, then of the others those with the '
-        "largest trajectory error.</p>",
+        '<p class="soft">Those that did not reach 95 %, the least covered first; then those with a collision, '
+        "then the others, the largest trajectory error first.</p>",
         *(_cases(entry) for entry in entries),
         "<details><summary>All metrics</summary>",
         _figures_table(entries, METRICS, colours, medians=True),
@@ -184,13 +184,15 @@ def _consistency_table(entries: Sequence[Entry]) -> str:
 def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
     """Return episodes with the worst first.
 
-    Those that did not reach 95 % by their coverage, then the others by their trajectory error.
+    Those that did not reach 95 % by their coverage; of the others those with a collision, then those without, by
+    their trajectory error.
     """
 
-    def rank(pair: tuple[Key, EpisodeRow]) -> tuple[bool, float]:
+    def rank(pair: tuple[Key, EpisodeRow]) -> tuple[bool, bool, float]:
         m = pair[1].metrics
-        reached = m["time_to_95_s"] is not None
-        return reached, -(m["ate_rmse_m"] or 0.0) if reached else (m["coverage"] or 0.0)
+        if m["time_to_95_s"] is None:
+            return False, False, m["coverage"] or 0.0
+        return True, m["collisions"] == 0, -(m["ate_rmse_m"] or 0.0)
 
     return sorted(zip(keys, rows, strict=True), key=rank)
 
@@ -291,25 +293,26 @@ def _best(metric: Metric, entries: Sequence[Entry]) -> str | None:
 
 
 def _limits(metric: Metric, found: Interval) -> str:
-    return f"{shown(metric, found.low)} … {shown(metric, found.high)}"
+    return "" if math.isnan(found.low) else f"{shown(metric, found.low)} … {shown(metric, found.high)}"
 
 
 def _change(metric: Metric, ratio: Interval) -> str:
     if math.isnan(ratio.value):
         return "–"
     text = f"{100 * (ratio.value - 1):+.1f} %"
-    if not (ratio.low <= 1.0 <= ratio.high or math.isnan(ratio.low)):
+    if math.isnan(ratio.low):
+        return text
+    if not ratio.low <= 1.0 <= ratio.high:
         good = (ratio.value < 1.0) == (metric.better == "low")
         text = f'<span class="{"better" if good else "worse"}">{text}</span>'
     return f"{text}<small>{100 * (ratio.low - 1):+.1f} … {100 * (ratio.high - 1):+.1f}</small>"
 
 
 def _better(p: Interval) -> str:
-    return (
-        f"better in {100 * p.value:.0f} % [{100 * p.low:.0f}, {100 * p.high:.0f}]"
-        if not math.isnan(p.value)
-        else "–"
-    )
+    if math.isnan(p.value):
+        return "–"
+    limits = "" if math.isnan(p.low) else f" [{100 * p.low:.0f}, {100 * p.high:.0f}]"
+    return f"better in {100 * p.value:.0f} %{limits}"
 
 
 def _key(colour: int) -> str:

@@ -7,6 +7,7 @@ Everything is drawn from fixed seeds: the same values give the same intervals.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -118,11 +119,11 @@ def interval(statistic: Callable[[Indices], Array], strata: Sequence[Hashable]) 
     Notes
     -----
     The limits are order statistics, not interpolated between: a statistic may be infinite in some resamples. Where
-    it is not defined in one of them, neither are the limits.
+    it is not defined in one of them, or a stratum has but one episode, neither are the limits.
     """
     if not len(strata):
         return _NONE
-    return _limits(float(statistic(np.arange(len(strata))[None])[0]), statistic(resampled_indices(strata)))
+    return _limits(float(statistic(np.arange(len(strata))[None])[0]), statistic(resampled_indices(strata)), strata)
 
 
 def estimate(values: ArrayLike, strata: Sequence[Hashable], *, for_median: ArrayLike | None = None) -> Estimate:
@@ -208,14 +209,16 @@ def compare(
         found.append(((ours_at - theirs_at).mean(axis=0), ratio, probability))
     (difference, ratio, probability), resampled = found
     return Comparison(
-        difference=_limits(float(difference[0]), resampled[0]),
-        ratio=_limits(float(ratio[0]), resampled[1]),
-        probability=_limits(float(probability[0]), resampled[2]),
+        difference=_limits(float(difference[0]), resampled[0], strata),
+        ratio=_limits(float(ratio[0]), resampled[1], strata),
+        probability=_limits(float(probability[0]), resampled[2], strata),
         n=len(a),
     )
 
 
-def _limits(value: float, resampled: Array) -> Interval:
+def _limits(value: float, resampled: Array, strata: Sequence[Hashable]) -> Interval:
+    if min(Counter(strata).values()) < 2:  # one episode of a place cannot tell how much others would differ
+        return Interval(value, np.nan, np.nan)
     tail = 0.5 * (1.0 - CONFIDENCE)
     low, high = np.quantile(resampled, (tail, 1.0 - tail), method="inverted_cdf").tolist()
     return Interval(value, low, high)

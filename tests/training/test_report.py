@@ -87,13 +87,22 @@ def test_a_page_of_one_agent_compares_nothing() -> None:
     assert "comparison" in as_json(report) and as_json(report)["comparison"] == {}
 
 
+def test_one_episode_has_figures_but_no_intervals() -> None:
+    groups = [made_up_group(agent, time_to_95_s=[50.0]) for agent in ("nearest-frontier", "b")]
+    report = some_report(groups)
+    text = page(report, config_text="") + table(report)
+    assert "nan" not in text and "50.0" in text
+    assert as_json(report)["rooms"]["b"]["time_to_95_s"]["low"] is None
+
+
 def test_the_worst_come_first() -> None:
     group = made_up_group(
-        time_to_95_s=[50.0, None, 40.0, None], coverage=[0.99, 0.9, 0.97, 0.4], ate_rmse_m=[0.1, 9.0, 0.2, 0.0]
-    )
-    assert [key[2] for key, _ in worst_first(group.keys, group.rows)] == [3, 1, 2, 0]
+        time_to_95_s=[50.0, None, 40.0, None, 45.0], coverage=[0.99, 0.9, 0.97, 0.4, 0.99],
+        ate_rmse_m=[0.1, 9.0, 0.2, 0.0, 0.05], collisions=[0, 0, 0, 1, 1],
+    )  # fmt: skip
+    assert [key[2] for key, _ in worst_first(group.keys, group.rows)] == [3, 1, 4, 2, 0]
     text = page(some_report([group], baseline=None), config_text="")
-    assert re.findall(r"<b>seed (\d)</b>", text) == ["3", "1", "2", "0"]
+    assert re.findall(r"<b>seed (\d)</b>", text) == ["3", "1", "4", "2", "0"]
 
 
 def test_curves_hold_their_last_value_and_have_the_middle_half_around_them() -> None:

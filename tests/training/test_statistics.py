@@ -162,6 +162,13 @@ def test_brute_force_of_a_stratified_comparison() -> None:
     assert (found.ratio.low, found.ratio.high) == pytest.approx((low, high))
 
 
+def test_one_episode_of_a_place_has_no_interval() -> None:
+    found = estimate([1.0, 2.0, 3.0], ["a", "a", "b"])
+    assert found.iqm.value == 2.0 and math.isnan(found.iqm.low) and math.isnan(found.mean.high)
+    against = compare([1.0, 2.0], [2.0, 4.0], ["a", "b"], lower_is_better=True)
+    assert against.ratio.value == pytest.approx(0.5) and math.isnan(against.ratio.high)
+
+
 def test_no_pairs_and_no_ratio() -> None:
     assert math.isnan(compare([], [], [], lower_is_better=True).ratio.value)
     zero = compare([0.0, 0.0], [0.0, 0.0], ["a", "a"], lower_is_better=True)
