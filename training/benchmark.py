@@ -20,6 +20,7 @@ from slam.settings import to_mapping, unknown_name
 from training import benchmark_store, suites
 from training.benchmark_episode import EpisodeFailure, EpisodeJob, EpisodeRow, run_job
 from training.benchmark_figures import Group, group_rows
+from training.benchmark_markdown import markdown
 from training.benchmark_output import FILES, Report, write_tables
 from training.campaign import backend_names, check_settings, run_all, write_settings
 from training.errors import BadInput, bad_input, one_line
@@ -171,6 +172,7 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int) -> Report:
         groups = _groups(plan, store)
     report = Report.of(groups, baseline=plan.baseline, config=_described(plan))
     write_tables(out, report)
+    atomic_write(out / "tables.md", markdown(report))
     if failures:
         job, message = failures[0]
         raise EpisodesFailed(

@@ -19,7 +19,15 @@ from training.suites import SLIPPERY
 
 __all__ = ["FILES", "Entry", "Report", "as_json", "shown", "table", "write_tables"]
 
-FILES = ("results.sqlite", "config.toml", "episodes.csv", "summary.csv", "comparison.csv", "summary.json")
+FILES = (
+    "results.sqlite",
+    "config.toml",
+    "episodes.csv",
+    "summary.csv",
+    "comparison.csv",
+    "summary.json",
+    "tables.md",
+)
 """What a benchmark writes, beside settings.json and, if asked for, report.html."""
 
 _BY_KEY = {metric.key: metric for metric in METRICS}

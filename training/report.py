@@ -13,6 +13,7 @@ from typing import Any
 from slam.formats import atomic_write
 from training.benchmark_episode import EpisodeRow, Key
 from training.benchmark_figures import METRICS, Metric
+from training.benchmark_markdown import AGAINST, HEADLINE
 from training.benchmark_output import Entry, Report, shown
 from training.explore import ENDINGS
 from training.report_charts import COLOURS, Along, band, coverage_chart, extent
@@ -25,11 +26,6 @@ FILE = "report.html"
 
 _CASES = 6  # maps shown of an agent in a suite
 _BY_KEY = {metric.key: metric for metric in METRICS}
-_HEADLINE = (
-    "reached_95", "coverage", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
-    "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
-)  # fmt: skip
-_AGAINST = ("time_to_90_s", "time_to_95_s", "path_length_m", "ate_rmse_m", "corner_mean_m", "map_iou")
 _READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
 and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
 reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
@@ -80,7 +76,7 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
     parts = [
         f'<h2 id="{_anchor(name)}">{escape(name)}</h2>',
         f'<p class="soft">{episodes} episodes an agent, {escape(backends)}</p>',
-        _figures_table(entries, [_BY_KEY[key] for key in _HEADLINE], colours),
+        _figures_table(entries, [_BY_KEY[key] for key in HEADLINE], colours),
         _against_table(
             {entry.name: entry.against for entry in entries if entry.against},
             f"Against {report.baseline}, on the same episodes",
@@ -126,7 +122,7 @@ def _figures_table(
 
 def _against_table(against: Mapping[str, Mapping[str, Comparison]], title: str) -> str:
     """Return a table of name → metric → comparison, nothing where there is none."""
-    metrics = [_BY_KEY[key] for key in _AGAINST]
+    metrics = [_BY_KEY[key] for key in AGAINST]
     rows = []
     for name, found in against.items():
         cells = [escape(name)]
@@ -254,7 +250,7 @@ def _made(config: dict[str, Any], config_text: str) -> str:
     return (
         '<h2 id="made">Configuration and versions</h2>'
         '<p class="soft">Beside this page: episodes.csv (a row an episode), summary.csv, comparison.csv, '
-        "results.sqlite, config.toml.</p>"
+        "tables.md, results.sqlite, config.toml.</p>"
         f"<details><summary>What was asked for, and versions</summary><pre>{escape(lines)}</pre></details>"
         f"<details><summary>config.toml</summary><pre>{escape(config_text)}</pre></details>"
     )

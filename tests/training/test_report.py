@@ -12,6 +12,7 @@ import pytest
 
 from tests.training.test_benchmark import made_up_group
 from training.benchmark_figures import Group
+from training.benchmark_markdown import markdown
 from training.benchmark_output import Report, as_json, table, write_tables
 from training.report import page, worst_first, write_report
 from training.report_charts import band, coverage_chart, extent
@@ -90,7 +91,7 @@ def test_a_page_of_one_agent_compares_nothing() -> None:
 def test_one_episode_has_figures_but_no_intervals() -> None:
     groups = [made_up_group(agent, time_to_95_s=[50.0]) for agent in ("nearest-frontier", "b")]
     report = some_report(groups)
-    text = page(report, config_text="") + table(report)
+    text = page(report, config_text="") + table(report) + markdown(report)
     assert "nan" not in text and "50.0" in text
     assert as_json(report)["rooms"]["b"]["time_to_95_s"]["low"] is None
 
@@ -134,6 +135,10 @@ def test_tables_say_the_same_in_every_form(tmp_path: Path) -> None:
     assert sum(line.startswith("all-nominal,random <b>,ekf,nearest-frontier,") for line in lines) == len(
         found["comparison"]["mazes"]["random <b>"]
     )
+    tables = markdown(report)
+    assert tables.startswith("## all nominal suites together") and "| `random <b>` | 4 | 50 [" in tables
+    rows = [line.count("|") for line in tables.splitlines() if "` | 4 |" in line]
+    assert len(rows) == 6 and len(set(rows)) == 1
     printed = table(report)
     assert "195.0" in printed and "against nearest-frontier" in printed
 
