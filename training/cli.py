@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from training.cli_benchmark import benchmark
+from training.cli_options import Json
 from training.errors import BadInput, Interrupted, bad_input, one_line, suggestion
 
 if TYPE_CHECKING:
@@ -36,8 +38,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help needs no rich, and shows the examples as they are typed
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
 
 
 def _show_version(wanted: bool) -> None:
@@ -315,6 +315,9 @@ def replay(
     )
     if prepared.interrupted:
         raise Interrupted(f"interrupted after {metrics['duration_s']:.1f} s of the log; what was done is in {out}")
+
+
+app.command()(benchmark)
 
 
 # ---- running it ------------------------------------------------------------------------------------------------
