@@ -31,6 +31,8 @@ from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
 from slam.settings import to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
+from training.known_map import NAME as KNOWN_MAP
+from training.known_map import KnownMap
 from training.running import interrupt_flag, plain, versions
 
 __all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
@@ -134,7 +136,7 @@ def prepare(options: ExploreOptions) -> Episode:
             # Other rooms: neither the start nor the step limit is meant for them.
             past = {name: value for name, value in past.items() if name in _DEFAULTS}
         run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
-        if run["agent"] not in agents.names():
+        if run["agent"] not in (*agents.names(), KNOWN_MAP):
             raise unknown_name("agent", run["agent"], agents.names())
         config = make_config(
             config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
@@ -159,10 +161,17 @@ def prepare(options: ExploreOptions) -> Episode:
         observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
         env = wrapped.unwrapped
         assert isinstance(env, ExploreEnv)
-        agent = agents.make(run["agent"], robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent = _make_agent(run["agent"], env)
         agent.reset(env.belief, run["seed"])
     run |= {"max_steps": limit}
     return Episode(env, wrapped, agent, observation, config, run, options.out)
+
+
+def _make_agent(name: str, env: ExploreEnv) -> Agent:
+    config = env.config
+    if name == KNOWN_MAP:
+        return KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    return agents.make(name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
 
 
 def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
