@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 class CostUtilityConfig(ExplorerConfig):
     """The parts of the agent, what it expects to see, and what a metre of the way must bring."""
 
-    beta_m2_m: float = 1.0  # β [m² per weighted m]
+    beta_m2_m: float = 2.0  # β [m² per weighted m]
     range_m: float = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
     depth_m: float = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
     switch_m2: float = 0.5  # another target must be better by this …
