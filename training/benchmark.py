@@ -25,6 +25,8 @@ from training.benchmark_output import FILES, Report, write_tables
 from training.campaign import backend_names, check_settings, run_all, write_settings
 from training.errors import BadInput, bad_input, one_line
 from training.explore import LEAST_STEPS, STEPS_PER_M2
+from training.known_map import NAME as KNOWN_MAP
+from training.known_map import KnownMap
 from training.provenance import code_digest, short_digest
 from training.rooms_command import parse_seeds
 from training.running import versions
@@ -206,13 +208,16 @@ def _groups(plan: BenchmarkPlan, store: benchmark_store.Store) -> list[Group]:
 
 def _agent_names(text: str) -> tuple[str, ...]:
     chosen = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    valid = (*agents.names(), KNOWN_MAP)
     for name in chosen:
-        if name not in agents.names():
-            raise unknown_name("agent", name, agents.names())
+        if name not in valid:
+            raise unknown_name("agent", name, valid)
     return chosen
 
 
 def _module_of_agent(name: str) -> str:
+    if name == KNOWN_MAP:
+        return KnownMap.__module__
     try:
         with bad_input():
             return type(agents.make(name)).__module__

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from training.cli_options import Json
+from training.errors import BadInput, suggestion
 
 __all__ = ["benchmark"]
 
@@ -22,7 +23,9 @@ def benchmark(
             "all.  [default: apartments, or floor-plans where --floor-plans is given]"
         ),
     ] = None,
-    agents: Annotated[str, typer.Option(help="Agents, separated by commas.")] = "nearest-frontier",
+    agents: Annotated[
+        str, typer.Option(help="Agents, separated by commas; known-map for a bound.")
+    ] = "nearest-frontier",
     slam: Annotated[
         str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")
     ] = None,
@@ -40,6 +43,14 @@ def benchmark(
         str | None,
         typer.Option(help="Agent to compare the others with.  [default: nearest-frontier, if it is one of them]"),
     ] = None,
+    protocol: Annotated[
+        str | None,
+        typer.Option(help="dungeons: the published path-length protocol on --maps, instead of suites."),
+    ] = None,
+    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of that protocol's PNG maps.")] = None,
+    scan: Annotated[
+        str, typer.Option(help="How that protocol looks around: way-points or continuous.")
+    ] = "way-points",
     max_steps: Annotated[
         int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
     ] = None,
@@ -64,7 +75,21 @@ def benchmark(
       mecanum benchmark --suite apartments,apartments-slippery --slam ekf,invariant-ekf --workers 2 --out out/two
       mecanum benchmark --suite all --split validation --out out/validation --json
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
+      mecanum benchmark --protocol dungeons --maps dungeons --agents nearest-frontier,tour --out out/dungeons
     """  # noqa: D301
+    if protocol is not None or maps is not None:
+        suites_only = {
+            "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
+            "--baseline": baseline, "--max-steps": max_steps, "--report": report or None,
+        }  # fmt: skip
+        _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
+        assert maps is not None
+        from training import dungeons
+
+        names = [part.strip() for part in agents.split(",")]
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers or os.cpu_count() or 1, scan=scan)
+        print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
+        return
     from training import benchmark as task
     from training.benchmark_output import as_json as as_mapping
     from training.benchmark_output import table
@@ -79,3 +104,14 @@ def benchmark(
 
         write_report(out, result)
     print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
+
+
+def _check_protocol(protocol: str | None, maps: Path | None, not_its: list[str]) -> None:
+    if protocol is None:
+        raise BadInput("--maps belongs to a protocol; give --protocol dungeons with it")
+    if protocol != "dungeons":
+        raise BadInput(f"unknown protocol {protocol!r}{suggestion(protocol, ['dungeons'])}; valid: dungeons")
+    if maps is None:
+        raise BadInput("--protocol dungeons needs its maps; give --maps DIR, a folder of PNG maps")
+    if not_its:
+        raise BadInput(f"--protocol dungeons has no {not_its[0]}; leave it out")

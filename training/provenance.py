@@ -12,8 +12,9 @@ from pathlib import Path
 __all__ = ["code_digest", "modules_behind", "short_digest"]
 
 _PROJECT = ("slam", "mecanum_env", "agents", "training")
-# Only says which module a name stands for, and that module is asked for: one more agent changes no other's rows.
-_REGISTRIES = frozenset({"agents"})
+# Who explores is asked for by its own module: neither the registry of the agents nor the bound that knows the map,
+# which stand beside what runs an episode, changes what another agent does.
+_ONLY_IF_ASKED = frozenset({"agents", "training.known_map"})
 
 
 def short_digest(parts: Iterable[bytes]) -> str:
@@ -35,14 +36,16 @@ def modules_behind(*modules: str) -> dict[str, Path]:
     """Return the modules that ``modules`` import, themselves included, as name → file; read, not run.
 
     Imports inside of functions count. Followed are the project's own packages and those that ``modules`` are of;
-    left out is the registry of the agents.
+    left out are the registry of the agents and the planner that knows the map, unless it is one of ``modules``.
     """
     roots = {*_PROJECT, *(name.partition(".")[0] for name in modules)}
     found: dict[str, Path] = {}
     open_names = list(modules)
     while open_names:
         name = open_names.pop()
-        if name in found or name in _REGISTRIES or name.partition(".")[0] not in roots:
+        if name in _ONLY_IF_ASKED and name not in modules:
+            continue
+        if name in found or name.partition(".")[0] not in roots:
             continue
         path = _file(name)
         if path is None:  # something within a module, or not written in Python

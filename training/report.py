@@ -16,6 +16,7 @@ from training.benchmark_figures import METRICS, Metric
 from training.benchmark_markdown import AGAINST, HEADLINE
 from training.benchmark_output import Entry, Report, shown
 from training.explore import ENDINGS
+from training.known_map import NAME as KNOWN_MAP
 from training.report_charts import COLOURS, Along, band, coverage_chart, extent
 from training.report_style import STYLE
 from training.statistics import Comparison, Interval
@@ -29,6 +30,9 @@ _BY_KEY = {metric.key: metric for metric in METRICS}
 _READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
 and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
 reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
+
+_BOUND = f"""<p><b>{KNOWN_MAP}</b> is no agent: it plans on the true map, and stands here as a bound in practice
+for what agents can do.</p>"""
 
 
 def write_report(out: Path, report: Report) -> None:
@@ -48,6 +52,7 @@ def page(report: Report, *, config_text: str) -> str:
         f'<p class="soft">{escape(_described(report))}</p>',
         f"<nav>{links}<a href='#made'>configuration</a></nav>",
         _READING,
+        _BOUND if any(entry.group.agent == KNOWN_MAP for entry in report.entries) else "",
         _overview(report, suites),
         *(
             _against_table(found, f"Against {report.baseline}, {name.replace('-', ' ')} suites together")
@@ -280,8 +285,8 @@ def _unbroken(text: str) -> str:
 
 
 def _best(metric: Metric, entries: Sequence[Entry]) -> str | None:
-    """Return the best value as shown, None where there is nothing to choose between."""
-    values = [entry.figures[metric.key].centre.value for entry in entries]
+    """Return the agents' best value as shown, None where there is nothing to choose between."""
+    values = [e.figures[metric.key].centre.value for e in entries if e.group.agent != KNOWN_MAP]
     values = [v for v in values if not math.isnan(v)]
     if not metric.better or len(values) < 2:
         return None

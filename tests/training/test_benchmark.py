@@ -164,6 +164,15 @@ def test_json_has_the_contract_s_keys_and_the_files_are_there(
 
 
 @pytest.mark.usefixtures("here")
+def test_the_planner_that_knows_the_map_stands_beside_the_agents(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    result = measure(small(tmp_path, "--agents", "nearest-frontier,known-map", "--report", seeds="0:1"), capsys)
+    assert result["rooms"].keys() == {"nearest-frontier", "known-map"}
+    assert "is no agent" in (tmp_path / "report.html").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("here")
 def test_config_toml_explores_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     measure(small(tmp_path, seeds="0"), capsys)
     argv = ["explore", "--config", str(tmp_path / "config.toml"), "--max-steps", "5", "--out", str(tmp_path / "e")]
@@ -327,6 +336,11 @@ def test_the_documented_agent_is_found_by_its_entry_point(
         (["--baseline", "random"], ["--baseline random", "--agents"]),
         (["--max-steps", "0"], ["--max-steps"]),
         (["--workers", "0"], ["--workers"]),
+        (["--protocol", "dungeon"], ["unknown protocol 'dungeon'", "did you mean dungeons?"]),
+        (["--protocol", "dungeons"], ["--maps DIR"]),
+        (["--maps", "somewhere"], ["--protocol dungeons"]),
+        (["--protocol", "dungeons", "--maps", "x", "--slam", "ekf"], ["no --slam"]),
+        (["--protocol", "dungeons", "--maps", "nowhere"], ["--maps nowhere", "no folder"]),
         (["--floor-plans", "nowhere"], ["--floor-plans nowhere", "no folder"]),
     ],
 )
@@ -401,6 +415,24 @@ def test_a_store_that_cannot_be_used(
     assert path.read_bytes() == before
 
 
+def test_the_dungeons_protocol_gets_its_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from training import dungeons
+
+    given: list[Any] = []
+
+    def run(*args: Any, **more: Any) -> dict[str, Any]:
+        given.append((args, more))
+        return {"agents": {}}
+
+    monkeypatch.setattr(dungeons, "run_dungeons", run)
+    argv = ["--protocol", "dungeons", "--maps", "m", "--agents", "random, tour", "--workers", "2", "--json"]
+    assert main(["benchmark", "--out", str(tmp_path), *argv, "--scan", "continuous"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"agents": {}}
+    assert given == [((Path("m"), ["random", "tour"]), {"out": tmp_path, "workers": 2, "scan": "continuous"})]
+
+
 # ---- the parts -------------------------------------------------------------------------------------------------
 
 
@@ -428,6 +460,8 @@ def test_a_digest_follows_imports_and_nothing_else(tmp_path: Path, monkeypatch: 
     for name, text in (("__init__", ""), ("agent", "from .parts import x"), ("parts", "x = 1"), ("rest", "")):
         (package / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
+    bound = modules_behind("training.benchmark_episode", "training.known_map").keys()
+    assert "training.known_map" in bound - behind and "agents.routing" in bound - behind
     assert modules_behind("an_agent_of_mine.agent").keys() == {
         "an_agent_of_mine", "an_agent_of_mine.agent", "an_agent_of_mine.parts",
     }  # fmt: skip
