@@ -8,6 +8,7 @@ OTHER := $(VENV)/gymnasium-$(OTHER_GYMNASIUM)
 SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
+AGENTS := nearest-frontier,cost-utility,next-best-view,rrt,tour,active,explore-and-return,random,known-map
 API_TESTS := $(wildcard tests/mecanum_env/test_env*.py)
 
 # The libraries' own threads only get in each other's way here: tests run in processes of their own.
@@ -17,7 +18,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo evaluate speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo evaluate benchmark speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -66,6 +67,10 @@ monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 
 evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the test seeds
 	$(BIN)/python -m training.evaluate --workers $(WORKERS) --out out/evaluate
+
+benchmark: $(VENV)/core.stamp ## BENCHMARK.md: every agent on every suite (hours; goes on where it was broken off)
+	$(BIN)/mecanum benchmark --suite all --agents $(AGENTS) --workers $(WORKERS) --out out/benchmark --report
+	$(BIN)/python -m training.leaderboard out/benchmark BENCHMARK.md
 
 speed: $(VENV)/core.stamp ## steps per second, and where the time goes
 	$(BIN)/mecanum speed
