@@ -40,7 +40,17 @@ _EPISODE = "training.benchmark_episode"  # the code that makes a row, with all t
 
 
 class EpisodesFailed(Exception):
-    """Errors ended some of the episodes; the rows of the others are kept and their tables written."""
+    """Errors ended some of the episodes; the rows of the others are kept and their tables written.
+
+    Attributes
+    ----------
+    report : Report
+        Of the others.
+    """
+
+    def __init__(self, message: str, report: Report) -> None:
+        super().__init__(message)
+        self.report = report
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +189,8 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int) -> Report:
         job, message = failures[0]
         raise EpisodesFailed(
             f"{len(failures)} of {len(missing)} episodes failed, the first on {job.suite} ({job.place}) with seed "
-            f"{job.seed}, {job.agent}, {job.slam}: {message}; the others are kept in {out}"
+            f"{job.seed}, {job.agent}, {job.slam}: {message}; the others are kept in {out}",
+            report,
         )
     return report
 

@@ -93,15 +93,19 @@ def benchmark(
     from training import benchmark as task
     from training.benchmark_output import as_json as as_mapping
     from training.benchmark_output import table
+    from training.report import write_report
 
     plan = task.BenchmarkPlan.parse(
         suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
         floor_plans=floor_plans, max_steps=max_steps,
     )  # fmt: skip
-    result = task.benchmark(plan, out=out, workers=workers or os.cpu_count() or 1)
+    try:
+        result = task.benchmark(plan, out=out, workers=workers or os.cpu_count() or 1)
+    except task.EpisodesFailed as failed:
+        if report:
+            write_report(out, failed.report)
+        raise
     if report:
-        from training.report import write_report
-
         write_report(out, result)
     print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
 

@@ -113,7 +113,7 @@ def _figures_table(
         for metric in metrics:
             figure = entry.figures[metric.key]
             value = shown(metric, figure.centre.value)
-            if value == best[metric.key]:
+            if value == best[metric.key] and entry.group.agent != KNOWN_MAP:
                 value = f'<span class="best">{value}</span>'
             text = f"{value}<small>{_limits(metric, figure.centre)}</small>"
             if medians:

@@ -15,7 +15,7 @@ STYLE = """
   --c0: #5ab4f0; --c1: #ff8a3d; --c2: #35c99b; --c3: #e094c0;
   --c4: #f0b93a; --c5: #9bd5f5; --c6: #c8cdd1; --c7: #cdb182 } }
 * { box-sizing: border-box }
-body { margin: 0 auto; max-width: 76rem; padding: 1.2rem clamp(.8rem, 3vw, 2rem) 4rem; background: var(--page);
+body { margin: 0 auto; max-width: 84rem; padding: 1.2rem clamp(.8rem, 3vw, 2rem) 4rem; background: var(--page);
   color: var(--ink); font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif }
 h1 { font-size: 1.7rem; line-height: 1.2; margin: .4rem 0 .3rem }
 h2 { font-size: 1.35rem; margin: 2.8rem 0 .3rem; padding-top: .8rem; border-top: 2px solid var(--rule) }

@@ -232,11 +232,12 @@ def test_an_episode_that_fails_does_not_stop_the_others(
         inner(self, belief, seed)
 
     monkeypatch.setattr(NearestFrontier, "reset", breaks)
-    assert main(small(tmp_path)) == 1
+    assert main(small(tmp_path, "--report")) == 1
     error = capsys.readouterr().err.splitlines()[-1]
     assert "1 of 3 episodes failed" in error and "seed 1" in error and "ZeroDivisionError: of all things" in error
     assert {key[2] for key in contents(tmp_path)} == {0, 2}
     assert "nearest-frontier" in (tmp_path / "summary.csv").read_text("utf-8")
+    assert "2 episodes an agent" in (tmp_path / "report.html").read_text("utf-8")
 
 
 def test_killed_in_the_middle_and_run_again_it_has_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
