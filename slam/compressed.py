@@ -255,8 +255,9 @@ class CompressedEkfSlam(EkfSlam):
         ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
         x = self._all_points()
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
-        keep = _state_rows(rows, robot=True)
-        joint = joint[np.ix_(keep, keep)]
+        order = _state_rows(np.concatenate([rows, lines]), robot=True)
+        whole = joint[np.ix_(order, order)]
+        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy()
         index = 3 + 2 * np.arange(len(rows))
         cov = np.array([[joint[index + a, index + b] for b in range(2)] for a in range(2)]).transpose(2, 0, 1)
         near = super().belief
@@ -269,6 +270,7 @@ class CompressedEkfSlam(EkfSlam):
             joint_cov=joint,
             lines=x[lines],
             line_ends=self._ends_of(x[lines], marks[lines, 6:8]),
+            whole_cov=whole,
         )
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:

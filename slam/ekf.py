@@ -325,11 +325,14 @@ class EkfSlam(Backend):
     @property
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
-        joint, rows = self.joint_cov, self._point_rows()
+        whole = joint = self.joint_cov
+        rows = self._point_rows()
         lines = np.setdiff1d(np.arange(self._book.count), rows)
         if len(lines):
-            keep = np.concatenate([np.arange(3), np.column_stack([3 + 2 * rows, 4 + 2 * rows]).ravel()])
-            joint = joint[np.ix_(keep, keep)]
+            marks = np.concatenate([rows, lines])
+            order = np.concatenate([np.arange(3), np.column_stack([3 + 2 * marks, 4 + 2 * marks]).ravel()])
+            whole = joint[np.ix_(order, order)]
+            joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy()
         index = 3 + 2 * np.arange(len(rows))
         cov = np.empty((len(index), 2, 2))
         for a in range(2):
@@ -346,6 +349,7 @@ class EkfSlam(Backend):
             landmark_kinds=self._book.kinds()[rows],
             lines=self._points[lines],
             line_ends=self._ends_of(self._points[lines], self._book.marks[lines, 6:8]),
+            whole_cov=whole,
         )
 
     @staticmethod
