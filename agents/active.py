@@ -1,8 +1,8 @@
 """Active SLAM: where to go, when to look first and how gently to drive, by the uncertainty it would leave.
 
-A frontier's price is the time to get there, what is expected to be seen there counted against it, and what the way
-would leave of the pose's uncertainty on top (:mod:`agents.foresight`; D-optimality, Carrillo et al., 2012). Where a
-detour past well known landmarks leaves so much less that it pays, the robot goes back there first.
+A frontier's price is the time to get there, less what is expected to be seen there, plus what the way would leave
+of the pose's uncertainty (:mod:`agents.foresight`; D-optimality, Carrillo et al., 2012). Where a detour past well
+known landmarks leaves so much less that it pays, the robot goes back there first.
 
 What a map gets wrong at its very beginning it never loses. The start pose is known by definition; a robot that
 drives off before its landmarks are settled has its wheels alone to tell where it was when it first saw them, and
@@ -164,9 +164,7 @@ class ActiveSlam(Explorer):
 
     def _path(self, candidates: Candidates, belief: Belief, cell: tuple[int, int]) -> Array:
         spacing = self.config.planner.path_spacing_m
-        return shortest_path(
-            candidates.cost_map, candidates.travel, cell, start=belief.pose, spacing_m=spacing
-        )
+        return shortest_path(candidates.cost_map, candidates.travel, cell, start=belief.pose, spacing_m=spacing)
 
     def _foresight(self) -> Foresight:
         return Foresight(

@@ -1,10 +1,10 @@
 """What driving a path would leave of a belief's uncertainty: the filter's covariance, propagated before driving.
 
 Along a path without noise the innovations are zero, the estimate stays where it is, and so do the Jacobians: the
-filter's own prediction and update (theory.md A; :mod:`slam.motion`, :mod:`slam.stacked_update`) yield the covariance
-that it will have, with the corners and walls that the belief's grid lets the sensor see from each place. Then the
-right-invariant filter's reset is the identity, and the change to its error coordinates has determinant one, so this
-is its covariance, too (invariant-ekf.md).
+filter's own prediction and update (theory.md A; :mod:`slam.motion`, :mod:`slam.stacked_update`) yield the
+covariance that it will have, with the corners and walls that the belief's grid lets the sensor see from each
+place. Then the right-invariant filter's reset is the identity, and the change to its error coordinates has
+determinant one, so this is its covariance, too (invariant-ekf.md).
 
 How much uncertainty that is, D-optimality says (Carrillo, Reid and Castellanos, "On the comparison of uncertainty
 criteria for active SLAM", ICRA 2012): the n-th root of the determinant, which alone of the usual criteria keeps
@@ -32,7 +32,16 @@ from slam.stacked_update import whiten, work_space
 from slam.tiles import downdate
 from slam.types import LINE, Belief
 
-__all__ = ["Foresight", "ForesightConfig", "Foreseen", "Marks", "anchoring", "d_optimality", "marks_of", "spread_m"]
+__all__ = [
+    "Foreseen",
+    "Foresight",
+    "ForesightConfig",
+    "Marks",
+    "anchoring",
+    "d_optimality",
+    "marks_of",
+    "spread_m",
+]
 
 Array = NDArray[np.float64]
 
@@ -197,8 +206,8 @@ class Foresight:
 def anchoring(marks: Marks, seen: NDArray[np.bool_], offset_m: float) -> Array:
     """Return how badly the landmarks in sight alone would tell the pose ``(3, 3)``: the error a map starts with.
 
-    Each speaks by what is uncertain of it *relative to the robot*, H P Hᵀ. A robot that leaves its well known place
-    takes their word for where it is, and what it maps from there on has this error in common.
+    Each speaks by what is uncertain of it *relative to the robot*, H P Hᵀ. A robot that leaves its well known
+    place takes their word for where it is, and what it maps from there on has this error in common.
     """
     information = np.zeros((3, 3))
     h = np.zeros((2, 5))

@@ -1,8 +1,8 @@
 """How well the wheels tell the motion, learnt on the way; and a follower that drives as gently as they slip.
 
 Nobody tells the agent on what floor it drives. What the wheels claim and what the filter makes of it, with the
-landmarks' help, differ by the odometry's error: its share of the wheels' speed is V's (:mod:`slam.motion`), and what
-a wheel that slips adds to it.
+landmarks' help, differ by the odometry's error: V's share of the wheels' speed (:mod:`slam.motion`), and what a
+wheel that slips adds to it.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class GentleFollower(PathFollower):
         )
 
     def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
-        """Return the next twist ``(3,)`` of coming to a stand: wheels that stop at once slide, and tell nothing."""
+        """Return the next twist ``(3,)`` on the way to a stand: wheels stopped at once slide, and tell nothing."""
         self._velocity, self._turn = self._sent
         return self.drive(np.zeros(2), 0.0, observation, belief)
 
