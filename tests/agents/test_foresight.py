@@ -18,6 +18,7 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.association import predicted
 from slam.motion import OdometryNoise, jacobians, move, twist_between
+from slam.occupancy import FREE
 from slam.types import LINE, Belief, Observations, Odometry
 from tests.agents.grids import belief_of, fill, room
 
@@ -292,3 +293,36 @@ def test_anchoring_is_the_error_that_a_robot_inherits():
         see(backend, CORNERS)
     later = anchoring(marks_of(backend.belief), np.ones(4, np.bool_), LIDAR.offset_m)
     assert spread_m(later, 4.0) == pytest.approx(0.5 * spread_m(expected, 4.0), rel=0.1)
+
+
+def plainly_seen(cost_map, pose, point) -> bool:
+    """Sight by the simple way: every cell of the line but its last ones is free."""
+    sensor = geometry.compose(np.asarray(pose, dtype=np.float64), np.array([LIDAR.offset_m, 0.0, 0.0]))[:2]
+    rho = float(np.hypot(*(point - sensor)))
+    if not 0.05 < rho < LIDAR.range_max_m:
+        return False
+    steps = np.arange(0.0, rho / cost_map.resolution - 2.5, 0.7) * cost_map.resolution
+    line = sensor + steps[:, None] * (point - sensor) / rho
+    cells = np.floor((line - np.array(cost_map.origin)) / cost_map.resolution).astype(int)[:, ::-1]
+    inside = np.all((cells >= 0) & (cells < cost_map.classes.shape), axis=1)
+    return bool(inside.all() and (cost_map.classes[tuple(cells.T)] == FREE).all())
+
+
+def test_sight_against_the_simple_way():
+    rng = np.random.default_rng(5)
+    classes = room(8.0, 4.0)
+    for _ in range(12):
+        x, y = rng.uniform(0.5, 7.0), rng.uniform(0.3, 3.3)
+        fill(classes, x, y, x + 0.3, y + 0.3)
+    corners = np.column_stack([rng.uniform(-0.5, 8.5, 200), rng.uniform(-0.5, 4.5, 200)])
+    poses = np.column_stack([rng.uniform(0.3, 7.7, 10), rng.uniform(0.3, 3.7, 10), rng.uniform(-3.0, 3.0, 10)])
+    cost_map = cost_map_of(belief_of(classes, (1.5, 2.0, 0.0)))
+    seen, cov = expected_sightings(
+        cost_map, poses, corners, np.zeros(200), np.zeros((200, 4)), lidar=LIDAR, model=SensorModel(), most=200
+    )
+    expected = np.array([[plainly_seen(cost_map, pose, corner) for corner in corners] for pose in poses])
+    np.testing.assert_array_equal(seen, expected)
+    assert 0.05 < seen.mean() < 0.95
+    for pose, row, each in zip(poses, seen, cov, strict=True):
+        _, simple = sightings(corners[row], pose)
+        np.testing.assert_allclose(each[row][:, [0, 2]], simple[:, [0, 1], [0, 1]], rtol=1e-12)
