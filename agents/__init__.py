@@ -18,10 +18,14 @@ __all__ = ["make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
-    "random": "agents.random:RandomAgent",
     "active": "agents.active:ActiveSlam",
+    "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "nearest-frontier": "agents.frontier:NearestFrontier",
+    "next-best-view": "agents.next_best_view:NextBestView",
+    "random": "agents.random:RandomAgent",
+    "rrt": "agents.rrt:Rrt",
+    "tour": "agents.tour:Tour",
 }
 
 GROUP = "mecanum_slam.agents"

@@ -15,9 +15,17 @@ from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotC
 from slam.settings import require
 from slam.types import Belief
 
-__all__ = ["Agent", "Goal"]
+__all__ = ["ENDINGS", "Agent", "Goal"]
 
 Array = NDArray[np.float64]
+
+ENDINGS = {
+    "covered": "no frontier worth a visit is left",
+    "unreachable": "frontiers are left, and no way to a place to see them from",
+    "stuck": "frontiers are left that could not be driven to, though there seemed to be a way",
+    "returned": "all explored, and back at the start",
+}
+"""Why an agent has nothing left to do: the word of its status, and what it means."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +80,13 @@ class Agent(ABC):
 
     @property
     def status(self) -> str:
-        """A word for what it is doing, such as ``driving``, ``recovering``, ``covered`` or ``stuck``."""
+        """A word for what it is doing, such as ``driving`` or ``recovering``, or one of :data:`ENDINGS`."""
         return self._status
+
+    @property
+    def ended(self) -> bool:
+        """Whether it has nothing left to do; ``status`` says why. What is seen later may set it off again."""
+        return self._status in ENDINGS
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Forget everything and start an episode; the same seed and beliefs give the same actions."""

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.cost_map import position_sigma
 from agents.safety import LocalMap, body_gaps, footprint, local_map, scan_points
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
@@ -44,7 +45,8 @@ class ControlConfig:
     max_look_ahead_m: float = 0.6
     lateral_m_s2: float = 0.5  # in turns of the path
     align_rad: float = 0.25  # heading error within which a tight passage is entered
-    map_gap_m: float = 0.04  # between body and occupied cells
+    map_gap_m: float = 0.04  # between body and occupied cells, and 2σ of the position more, capped
+    max_sigma_gap_m: float = 0.05  # the planner's cap: where a path is planned, it can be driven
     scan_gap_m: float = 0.04  # between body and what the scan hit
     arrival_m_s: float = 0.2  # speed at which the goal is reached; what is left is braked away there
     arrived_m: float = 0.12
@@ -65,7 +67,6 @@ class PathFollower:
         self._robot, self._lidar, self._step_s = robot, lidar, step_s
         self._rim = footprint(robot)
         self._half = 0.5 * np.array([robot.length_m, robot.width_m])
-        self._turning_room = robot.circumscribed_radius_m + config.map_gap_m
         self._max_speed = config.speed_share * robot.max_speed_m_s
         self._max_turn = min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s)
         # A sensor that sees all round can as well be driven backwards out of a narrow place.
@@ -74,6 +75,7 @@ class PathFollower:
 
     def reset(self) -> None:
         """Stand still, with no path."""
+        self._map_gap = self.config.map_gap_m
         self._velocity = np.zeros(2)  # last command in the belief's frame [m/s]
         self._turn = 0.0  # last command [rad/s]
         self._path = np.zeros((1, 2))
@@ -96,7 +98,7 @@ class PathFollower:
     def follow(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the next body twist ``(3,)`` [m/s, m/s, rad/s] along the path."""
         pose = np.asarray(belief.pose, dtype=np.float64)
-        near = local_map(belief, _WINDOW_M)
+        near = self._look_around(belief)
         at = self._locate(pose[:2])
         along = np.minimum(self._arc[self._index :] - at, self._arc[-1] - at)
         room = near.at(self._path[self._index :][along <= _WINDOW_M])
@@ -120,8 +122,18 @@ class PathFollower:
     def drive(self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the twist ``(3,)`` nearest to a velocity ``(2,)`` in the belief's frame that is safe."""
         pose = np.asarray(belief.pose, dtype=np.float64)
-        near = local_map(belief, _WINDOW_M)
+        near = self._look_around(belief)
         return self._send(velocity, turn, pose, near, scan_points(observation, self._lidar))
+
+    def _look_around(self, belief: Belief) -> LocalMap:
+        """Return the map nearby, and keep the farther from it the less sure the position is."""
+        sigma = position_sigma(belief.pose_cov)
+        self._map_gap = self.config.map_gap_m + min(2.0 * sigma, self.config.max_sigma_gap_m)
+        return local_map(belief, _WINDOW_M)
+
+    @property
+    def _turning_room(self) -> float:
+        return self._robot.circumscribed_radius_m + self._map_gap
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""
@@ -246,6 +258,6 @@ class PathFollower:
             twist, pose, timing, self._half, self._rim, near.clearance, near.origin, near.resolution, hits
         )
         # Already too near: any motion that brings it no nearer is allowed, or it would never get away.
-        clear_of_map = map_ahead >= min(config.map_gap_m, map_now - 0.002)
+        clear_of_map = map_ahead >= min(self._map_gap, map_now - 0.002)
         clear_of_scan = scan_ahead >= min(config.scan_gap_m, scan_now - 0.002)
         return bool(clear_of_map and clear_of_scan)

@@ -20,7 +20,7 @@ from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import require
 from slam.types import Belief
 
-__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance"]
+__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,8 @@ class PlannerConfig:
 
     resolution_m: float = 0.1  # of the planning grid; made finer for a small robot
     margin_m: float = 0.05  # comfortable: circumscribed radius + margin + 2σ of the position, capped
-    max_sigma_margin_m: float = 0.05
-    tight_margin_m: float = 0.07  # tight: inscribed radius + this
+    tight_margin_m: float = 0.07  # tight: inscribed radius + this + the same
+    max_sigma_margin_m: float = 0.05  # far from the start σ is large, and the walls nearby are no less certain
     unknown_margin_m: float = 0.02  # from what is not known: inscribed radius + this
     preferred_m: float = 0.2  # clearance beyond the comfortable one from which nearness costs nothing
     near_cost: float = 1.0  # added to the price of a metre at the comfortable clearance
@@ -89,8 +89,9 @@ class CostMap:
 
 def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
     """Return the grid's classes, all or a window, with what the robot's body has passed over taken for free."""
-    classes: NDArray[np.int8] = CLASS_OF[belief.grid.log_odds[rows, cols].view(np.uint8)]
-    classes[(classes == UNKNOWN) & (belief.grid.visited[rows, cols] != 0)] = FREE
+    log_odds = belief.grid.log_odds[rows, cols]
+    classes = np.empty(log_odds.shape, dtype=np.int8)
+    _classify(log_odds, belief.grid.visited[rows, cols], CLASS_OF, classes)
     return classes
 
 
@@ -134,7 +135,7 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     x, y = float(belief.pose[0]), float(belief.pose[1])
     row = min(max(int((y - origin[1]) // resolution), 1), rows - 2)
     col = min(max(int((x - origin[0]) // resolution), 1), cols - 2)
-    weight = _weigh(classes, wall, resolution, config, robot, _sigma(belief.pose_cov))
+    weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
     # Wherever the robot stands, it is allowed to stand, and to leave.
     reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
     highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
@@ -147,9 +148,9 @@ def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: fl
     return robot.circumscribed_radius_m + config.margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
 
 
-def tight_clearance(config: PlannerConfig, robot: RobotConfig) -> float:
+def tight_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
     """Return the clearance [m] that the robot needs while its long side lies along the path."""
-    return robot.inscribed_radius_m + config.tight_margin_m
+    return robot.inscribed_radius_m + config.tight_margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
 
 
 def _extent(belief: Belief) -> tuple[slice, slice]:
@@ -164,7 +165,7 @@ def _extent(belief: Belief) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _sigma(pose_cov: Array) -> float:
+def position_sigma(pose_cov: Array) -> float:
     """Largest standard deviation of the position [m]."""
     block = np.asarray(pose_cov)[:2, :2]
     mean = 0.5 * (block[0, 0] + block[1, 1])
@@ -182,7 +183,7 @@ def _weigh(
 ) -> NDArray[np.float32]:
     known = (classes != UNKNOWN).view(np.uint8)
     unknown = cv2.distanceTransform(known, cv2.DIST_L2, cv2.DIST_MASK_3)
-    tight = tight_clearance(config, robot)
+    tight = tight_clearance(config, robot, sigma_m)
     comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
     need_unknown = (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5
     weight = np.zeros(classes.shape, dtype=np.float32)
@@ -196,6 +197,16 @@ def _weigh(
         weight,
     )
     return weight
+
+
+@njit(cache=True, nogil=True)
+def _classify(
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], table: NDArray[np.int8], classes: NDArray[np.int8]
+) -> None:
+    for row in range(classes.shape[0]):
+        for col in range(classes.shape[1]):
+            kind = table[np.uint8(log_odds[row, col])]
+            classes[row, col] = FREE if kind == UNKNOWN and visited[row, col] != 0 else kind
 
 
 @njit(cache=True, nogil=True)

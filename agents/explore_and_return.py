@@ -100,7 +100,7 @@ class ExploreAndReturn(NearestFrontier):
     def _turn_back(self) -> None:
         homing = self._homing
         self._returning = True
-        self._troubles = []  # what could not be seen has no bearing on the way back
+        self._troubles.clear()  # what could not be seen has no bearing on the way back
         self._target = None
         # Aimed at more exactly than what counts as there: the last of the speed is still to be braked away.
         control = replace(
@@ -114,7 +114,7 @@ class ExploreAndReturn(NearestFrontier):
     def _choose_home(self, belief: Belief) -> Goal | None:
         """Return the start as the goal: the way to it, or as near to it as the map allows."""
         patience = self.config.patience
-        trouble = self._note(_HOME[:2])
+        trouble = self._troubles.note(_HOME[:2])
         if trouble.looks and not self._end:
             if self._is_home(belief):
                 self._end = "returned"

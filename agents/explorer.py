@@ -21,6 +21,7 @@ from agents.cost_map import CostMap, PlannerConfig
 from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask
 from agents.planning import TravelCosts, shortest_path, travel_costs
 from agents.sight import Watch, view_points
+from agents.troubles import Troubles
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.settings import from_mapping, require
@@ -74,16 +75,6 @@ class Candidates:
     current: int | None  # the piece it is driving to now, if it is still there
 
 
-@dataclass(slots=True)
-class _Trouble:
-    """A piece of frontier that was looked at in vain, or could not be driven to."""
-
-    point: Array  # (2,) [m]
-    looks: int = 0
-    failures: int = 0
-    avoid_until_s: float = 0.0
-
-
 class Explorer(Agent):
     """Drives from view point to view point until no frontier is left that it can reach."""
 
@@ -118,8 +109,8 @@ class Explorer(Agent):
         self._recover_until = -math.inf
         self._anchor = np.zeros(3)
         self._anchored_at = 0.0
-        self._troubles: list[_Trouble] = []
-        self._gave_up = False  # something worth it is left that could not be driven to
+        self._troubles = Troubles(0.6 * self.config.patience.same_m)
+        self._ending = "covered"  # why there is nothing left to choose, once there is nothing
         self._track: list[Array] = []  # sensor poses (3,) that frontiers were seen from
 
     # ---- choosing ------------------------------------------------------------------------------------------
@@ -130,11 +121,12 @@ class Explorer(Agent):
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
+        self._keep_watch(belief)
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
         if not np.isfinite(candidates.costs).any():
             self._target = None
-            self._status = "stuck" if self._gave_up else "covered"
+            self._status = self._ending
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]
@@ -151,7 +143,7 @@ class Explorer(Agent):
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
             if self._target is not None and candidates.current is None:
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
-                self._note(self._target).looks += 1
+                self._troubles.note(self._target).looks += 1
             cost = float(candidates.costs[index])
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
             self._arrived_for = 0.0
@@ -165,7 +157,7 @@ class Explorer(Agent):
         travel = travel_costs(cost_map)
         watch = self._watch_kept()
         frontiers = find(cost_map, self._frontier_config, watch)
-        troubles = [self._trouble(point) for point in frontiers.targets]
+        troubles = self._troubles.near(frontiers.targets)
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
         views = view_points(
             cost_map,
@@ -181,7 +173,8 @@ class Explorer(Agent):
         costs[~worth] = np.inf
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
         given_up = failures >= config.patience.attempts
-        self._gave_up = bool((given_up & worth & (looks < config.patience.looks)).any())
+        left = worth & (looks < config.patience.looks)
+        self._ending = "stuck" if (left & given_up).any() else "unreachable" if left.any() else "covered"
         costs[(looks >= config.patience.looks) | given_up] = np.inf
         # What did not work out lately comes last, but comes before giving up.
         avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
@@ -217,21 +210,6 @@ class Explorer(Agent):
         away[~np.isfinite(costs)] = np.inf
         nearest = int(np.argmin(away))
         return nearest if away[nearest] <= self.config.patience.same_m else None
-
-    def _trouble(self, point: Array) -> _Trouble | None:
-        near = [
-            (float(np.hypot(*(t.point - point))), i)
-            for i, t in enumerate(self._troubles)
-            if np.hypot(*(t.point - point)) <= 0.6 * self.config.patience.same_m
-        ]
-        return self._troubles[min(near)[1]] if near else None
-
-    def _note(self, point: Array) -> _Trouble:
-        trouble = self._trouble(point)
-        if trouble is None:
-            trouble = _Trouble(point.copy())
-            self._troubles.append(trouble)
-        return trouble
 
     # ---- driving -------------------------------------------------------------------------------------------
 
@@ -289,7 +267,7 @@ class Explorer(Agent):
         assert self._target is not None
         self._arrived_for = self._arrived_for + self._step_s if self._follower.arrived else 0.0
         if self._arrived_for >= patience.settle_s - 1e-9:
-            self._note(self._target).looks += 1
+            self._troubles.note(self._target).looks += 1
             self._chosen_at = -math.inf
             self._arrived_for = 0.0
             self._anchored_at = now
@@ -300,7 +278,7 @@ class Explorer(Agent):
             self._anchor, self._anchored_at = pose.copy(), now
         stuck = now - self._anchored_at > patience.stuck_s
         if (stuck or now > self._deadline) and now >= self._recover_until:
-            trouble = self._note(self._target)
+            trouble = self._troubles.note(self._target)
             trouble.avoid_until_s = now + patience.avoid_s * 2.0**trouble.failures
             trouble.failures += 1
             self._anchored_at = now

@@ -96,6 +96,7 @@ class EpisodeRecord:
             "time_to_50_s": metrics.time_to(coverage, times, level=0.5),
             "time_to_90_s": metrics.time_to(coverage, times, level=0.9),
             "time_to_95_s": metrics.time_to(coverage, times, level=0.95),
+            "time_to_99_s": metrics.time_to(coverage, times, level=0.99),
             "map_iou": score.iou,
             "map_precision": score.precision,
             "map_recall": score.recall,

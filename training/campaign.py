@@ -7,13 +7,14 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 
@@ -21,6 +22,9 @@ import slam
 from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.errors import BadInput, Interrupted, check_writable
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 __all__ = ["backend_names", "check_settings", "installed_version", "run_all", "write_settings"]
 
@@ -187,15 +191,24 @@ def _start_worker() -> None:
     # Ctrl-C reaches every process of the terminal's group; the parent alone decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that started it is gone: killed, it cannot tell its workers to stop."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 class _Progress:
-    """A count on standard error: in place on a terminal, else a line at the start and every half a minute."""
+    """How many are done, and how long the rest will take: a bar on a terminal, else a line now and then."""
 
     def __init__(self, total: int, what: str) -> None:
         self.total, self.what, self.done = total, what, 0
-        self._in_place = sys.stderr.isatty()
-        self._next = time.monotonic()
+        self._began = self._next = time.monotonic()
+        self._bar: Progress | None = _bar(total, what) if total and sys.stderr.isatty() else None
         if total:
             self._show()
 
@@ -204,13 +217,31 @@ class _Progress:
         self._show()
 
     def close(self) -> None:
-        if self.total and self._in_place:
-            print(file=sys.stderr)
+        if self._bar is not None:
+            self._bar.stop()
 
     def _show(self) -> None:
-        text = f"{self.done}/{self.total} {self.what}"
-        if self._in_place:
-            print(f"\r{text}", end="", file=sys.stderr, flush=True)
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=self.done)
         elif time.monotonic() >= self._next:
             self._next = time.monotonic() + _LOG_EVERY_S
-            print(text, file=sys.stderr, flush=True)
+            print(f"{self.done}/{self.total} {self.what}{self._left()}", file=sys.stderr, flush=True)
+
+    def _left(self) -> str:
+        if not 0 < self.done < self.total:
+            return ""
+        seconds = (time.monotonic() - self._began) / self.done * (self.total - self.done)
+        return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"
+
+
+def _bar(total: int, what: str) -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    bar = Progress(
+        BarColumn(), MofNCompleteColumn(), TextColumn(what), TimeRemainingColumn(), TextColumn("left"),
+        console=Console(stderr=True), speed_estimate_period=300.0,
+    )  # fmt: skip
+    bar.add_task(what, total=total)
+    bar.start()
+    return bar

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mecanum_env.canvas import put_text, text_width
 from mecanum_env.rooms.draw import FLOOR, INK, PAGE
 
-__all__ = ["Axis", "Line", "draw_chart", "png"]
+__all__ = ["Axis", "Line", "draw_chart", "png", "ticks"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -123,7 +123,8 @@ def _scale(axis: Axis, limits: tuple[float, float], first: int, last: int) -> Ca
     return lambda values: first + (transform(values) - low) / (high - low) * (last - first)
 
 
-def _ticks(axis: Axis, limits: tuple[float, float]) -> list[float]:
+def ticks(axis: Axis, limits: tuple[float, float]) -> list[float]:
+    """Return round values to mark on an axis between its limits."""
     low, high = limits
     if axis.log:
         powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
@@ -143,11 +144,11 @@ def _draw_grid(
     y_range: tuple[float, float], to_y: Callable[[Array], Array], box: tuple[int, int, int, int],
 ) -> None:  # fmt: skip
     left, right, top, bottom = box
-    for tick in _ticks(x, x_range):
+    for tick in ticks(x, x_range):
         at = round(float(to_x(np.array([tick]))[0]))
         cv2.line(image, (at, top), (at, bottom), _GRID, 1)
         _centred(image, f"{tick:g}", at, bottom + 20)
-    for tick in _ticks(y, y_range):
+    for tick in ticks(y, y_range):
         at = round(float(to_y(np.array([tick]))[0]))
         cv2.line(image, (left, at), (right, at), _GRID, 1)
         text = f"{tick:g}"

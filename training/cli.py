@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from training.cli_benchmark import benchmark
+from training.cli_options import Json
 from training.errors import BadInput, Interrupted, bad_input, one_line, suggestion
 
 if TYPE_CHECKING:
@@ -36,8 +38,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # plain help needs no rich, and shows the examples as they are typed
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
 
 
 def _show_version(wanted: bool) -> None:
@@ -132,7 +132,7 @@ def explore(
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:
-        print(_summary(metrics, out, task.FILES))
+        print(_summary(metrics, out, task.FILES, task.ENDINGS[metrics["end"]]))
     if episode.interrupted:
         raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
 
@@ -317,6 +317,9 @@ def replay(
         raise Interrupted(f"interrupted after {metrics['duration_s']:.1f} s of the log; what was done is in {out}")
 
 
+app.command()(benchmark)
+
+
 # ---- running it ------------------------------------------------------------------------------------------------
 
 
@@ -434,7 +437,7 @@ class _LogLines:
             print(f"exploring: step {steps} of at most {max_steps}, {done}", file=sys.stderr, flush=True)
 
 
-def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str]) -> str:
+def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: str) -> str:
     def shown(key: str, unit: str, digits: int, factor: float = 1.0) -> str:
         value = metrics[key]
         return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
@@ -445,7 +448,7 @@ def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str]) -> str:
     heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
     rows = (
         ("explored", f"{where} with {metrics['slam']} and {metrics['agent']}"),
-        ("ended", f"{metrics['end']} after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
+        ("ended", f"{metrics['end']} ({ending}) after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
         ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
         ("path", f"{shown('path_length_m', 'm', 1)}, {metrics['collisions']} collisions"),
         ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {corners} off on average"),

@@ -31,7 +31,7 @@ from slam.settings import unknown_name
 from training.errors import BadInput
 from training.rooms_command import parse_seeds
 
-__all__ = ["evaluate", "main", "summarise"]
+__all__ = ["consistency_figures", "evaluate", "main", "summarise"]
 
 Job = tuple[str, str, int]  # rooms, backend, seed
 Row = dict[str, Any]
@@ -128,15 +128,16 @@ def summarise(rows: list[Row]) -> list[Row]:
             "return_error_m_median": statistics.median(back) if back else None,
             "return_error_m_max": max(back) if back else None,
         }
-        summary |= _consistency([r["nees_each_s"] for r in group])
+        summary |= consistency_figures([r["nees_each_s"] for r in group])
         out.append(summary)
     return out
 
 
-def _consistency(profiles: list[list[float]]) -> Row:
-    """Average NEES / 3 over the runs, second by second, against the band of that many runs.
+def consistency_figures(profiles: list[list[float]]) -> Row:
+    """Return the average NEES / 3 over the runs, second by second, against the band of that many runs.
 
-    Counted as long as at least half the runs go on; the others' ends would leave the average to a few.
+    ``profiles`` are each run's pose NEES, once a second. Counted as long as at least half the runs go on; the
+    others' ends would leave the average to a few.
     """
     seconds = int(np.median([len(p) for p in profiles]))
     averages, inside = [], 0

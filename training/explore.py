@@ -20,6 +20,7 @@ import numpy as np
 import tomli_w
 
 import agents
+from agents.base import ENDINGS as AGENT_ENDINGS
 from agents.base import Agent
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import EnvConfig
@@ -30,9 +31,11 @@ from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
 from slam.settings import to_mapping, unknown_name
 from training.errors import BadInput, bad_input, check_writable
+from training.known_map import NAME as KNOWN_MAP
+from training.known_map import KnownMap
 from training.running import interrupt_flag, plain, versions
 
-__all__ = ["FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
+__all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
@@ -42,6 +45,14 @@ FILES = (
 
 LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
 """The step limit where none is given: so many, or so many a square metre of free space."""
+
+ENDINGS = {
+    **AGENT_ENDINGS,
+    "time": "the step limit was reached first",
+    "collision": "it touched a wall, and the configuration ends an episode there",
+    "interrupted": "broken off by Ctrl-C",
+}
+"""Why an episode ended: the word in ``metrics.json``, and what it means."""
 
 _DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
@@ -83,7 +94,7 @@ class Episode:
     config: EnvConfig  # with the coverage that counts as success
     run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
     out: Path
-    end: str = "step limit"
+    end: str = "time"  # a word of ENDINGS
     interrupted: bool = False
     wall_time_s: float = 0.0
     decisions_ms: list[float] = field(default_factory=list)
@@ -125,7 +136,7 @@ def prepare(options: ExploreOptions) -> Episode:
             # Other rooms: neither the start nor the step limit is meant for them.
             past = {name: value for name, value in past.items() if name in _DEFAULTS}
         run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
-        if run["agent"] not in agents.names():
+        if run["agent"] not in (*agents.names(), KNOWN_MAP):
             raise unknown_name("agent", run["agent"], agents.names())
         config = make_config(
             config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
@@ -150,10 +161,17 @@ def prepare(options: ExploreOptions) -> Episode:
         observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
         env = wrapped.unwrapped
         assert isinstance(env, ExploreEnv)
-        agent = agents.make(run["agent"], robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent = _make_agent(run["agent"], env)
         agent.reset(env.belief, run["seed"])
     run |= {"max_steps": limit}
     return Episode(env, wrapped, agent, observation, config, run, options.out)
+
+
+def _make_agent(name: str, env: ExploreEnv) -> Agent:
+    config = env.config
+    if name == KNOWN_MAP:
+        return KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    return agents.make(name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
 
 
 def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
@@ -209,7 +227,7 @@ def run(episode: Episode, progress: Progress) -> None:
             if interrupted.is_set():
                 episode.end, episode.interrupted = "interrupted", True
             elif terminated and not (info["is_success"] and agent.outlives_coverage):
-                episode.end = "all mapped" if info["is_success"] else "collision"
+                episode.end = "covered" if info["is_success"] else "collision"
             elif idle >= patience:
                 episode.end = agent.status
             elif not truncated:

@@ -20,14 +20,15 @@ MOST_SEEDS = 100
 _MOST_SEED = 2**31 - 1
 
 
-def parse_seeds(text: str) -> list[int]:
+def parse_seeds(text: str, *, most: int = MOST_SEEDS) -> list[int]:
     """Return the seeds of ``3``, ``0:9`` (both ends included), ``1,4,7`` or a mix, each once, in that order.
 
     Raises
     ------
     BadInput
-        If it is none of these, or more than 100 seeds.
+        If it is none of these, or more than ``most`` seeds.
     """
+    too_many = BadInput(f"--seeds {text!r} are more than {most}; give fewer, in several calls")
     seeds: dict[int, None] = {}
     for part in text.split(","):
         first, colon, last = (piece.strip() for piece in part.partition(":"))
@@ -36,11 +37,11 @@ def parse_seeds(text: str) -> list[int]:
         low, high = int(first), int(last) if colon else int(first)
         if low > high or high > _MOST_SEED:
             raise BadInput(f"--seeds {part.strip()!r} must run upwards from 0 to at most {_MOST_SEED}")
-        if high - low >= MOST_SEEDS or len(seeds) > MOST_SEEDS:
-            raise BadInput(f"--seeds {text!r} are more than {MOST_SEEDS}; draw them in several calls")
+        if high - low >= most or len(seeds) > most:
+            raise too_many
         seeds |= dict.fromkeys(range(low, high + 1))
-    if len(seeds) > MOST_SEEDS:
-        raise BadInput(f"--seeds {text!r} are more than {MOST_SEEDS}; draw them in several calls")
+    if len(seeds) > most:
+        raise too_many
     return list(seeds)
 
 

@@ -103,7 +103,7 @@ def _record(env: gymnasium.Env[Observation, Any], steps: int, seed: int) -> list
         while not done and total + len(actions) < steps:
             actions.append(agent.act(observation, inner.belief))
             observation, _, terminated, truncated, _ = env.step(actions[-1])
-            done = terminated or truncated or agent.status in ("covered", "stuck")
+            done = terminated or truncated or agent.ended
         episodes.append((seed, actions))
         total += len(actions)
         seed += 1

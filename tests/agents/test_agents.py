@@ -187,7 +187,7 @@ def test_nothing_left_to_explore():
     belief = belief_of(room(6.0, 4.0), (2.0, 2.0, 0.0))
     agent = ready("nearest-frontier", belief)
     assert agent.choose(belief) is None
-    assert agent.status == "covered"
+    assert agent.ended and agent.status == "covered"
     np.testing.assert_array_equal(agent.act(BLANK, belief), np.zeros(3, np.float32))
     assert agent.goal is None and len(agent.frontiers) == 0
 
@@ -200,6 +200,7 @@ def test_enclosed_robot_stays():
     agent = ready("nearest-frontier", belief)
     assert agent.choose(belief) is None
     assert len(agent.frontiers) > 0
+    assert agent.ended and agent.status == "unreachable"
     np.testing.assert_array_equal(agent.act(None, belief), np.zeros(3, np.float32))
     # One door, and it leaves.
     fill(classes, 4.8, 3.5, 5.1, 4.5, FREE)

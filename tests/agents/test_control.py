@@ -20,7 +20,7 @@ def follower(config: ControlConfig | None = None, lidar: LidarConfig = LIDAR) ->
     return PathFollower(config or ControlConfig(), robot=ROBOT, lidar=lidar, step_s=0.1)
 
 
-def follow(classes, pose, path, *, heading=None, steps=300, observation=None):
+def follow(classes, pose, path, *, heading=None, steps=300, observation=None, sigma=0.01):
     """Drive a kinematic robot along a path; return its poses and the twists."""
     pose = np.array(pose, dtype=np.float64)
     control = follower()
@@ -28,7 +28,7 @@ def follow(classes, pose, path, *, heading=None, steps=300, observation=None):
     limits = np.array([0.8, 0.8, 1.5])
     poses, twists = [pose], []
     for _ in range(steps):
-        twist = control.follow(observation, belief_of(classes, tuple(pose)))
+        twist = control.follow(observation, belief_of(classes, tuple(pose), sigma=sigma))
         twists.append(twist)
         pose = drive(pose, twist / limits, ROBOT)
         poses.append(pose)
@@ -69,6 +69,18 @@ def test_passes_a_door_without_touching(door_m, start):
     poses, _, control = follow(classes, (1.2, 2.0, start), [(1.2, 2.0), (6.0, 2.0)], steps=500)
     assert control.arrived
     assert min(body_gap(classes, p, ROBOT) for p in poses) > 0.02
+
+
+def test_keeps_the_farther_from_walls_the_less_sure_it_is():
+    classes = room(6.0, 6.0)
+    fill(classes, 3.0, 0.0, 3.2, 6.0)
+    gaps = []
+    for sigma in (0.0, 0.01, 0.02, 1.0):
+        poses, _, _ = follow(classes, (1.5, 3.0, 0.0), [(1.5, 3.0), (5.0, 3.0)], steps=150, sigma=sigma)
+        gaps.append(min(body_gap(classes, p, ROBOT) for p in poses))
+    # 2σ more each time, up to the cap; it stops where the next step would be too far, a step short at most.
+    assert np.array(gaps) == pytest.approx(gaps[0] + np.array([0.0, 0.02, 0.04, 0.05]), abs=0.012)
+    assert gaps[0] > 0.03
 
 
 def test_never_drives_into_a_wall_it_is_led_into():

@@ -152,7 +152,7 @@ def test_options_go_before_the_config(
     assert main(["explore", *config, *room, *who, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert (printed["rooms"], printed["floor_plan"], printed["seed"]) == ("rectangular", None, 3)
-    assert (printed["slam"], printed["agent"], printed["end"]) == ("odometry", "random", "step limit")
+    assert (printed["slam"], printed["agent"], printed["end"]) == ("odometry", "random", "time")
     assert printed["steps"] == 30 and printed["time_s"] == 3.0 and printed["success"] is False
     assert printed["time_to_95_s"] is None
     effective = from_toml(tmp_path / "out" / "config.toml")

@@ -1,0 +1,83 @@
+"""Information against the cost of the way there (Burgard et al., 2000 and 2005, for a single robot).
+
+Burgard, Moors, Stachniss and Schneider, "Coordinated multi-robot exploration", IEEE Transactions on Robotics 2005,
+algorithm 1: of all frontier targets t the one that maximises U(t) − β V(t) is gone to, V the cost of the way.
+Their utility U is a share that falls with what other robots see of t; for a single robot it is the same
+everywhere, which makes their rule that of the nearest frontier. Here U is the new area that may be expected to
+come into view, in square metres, and β says how many of those a metre of the way must bring.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.gain import expected_area
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["CostUtility", "CostUtilityConfig"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CostUtilityConfig(ExplorerConfig):
+    """The parts of the agent, what it expects to see, and what a metre of the way must bring."""
+
+    beta_m2_m: float = 1.0  # β [m² per weighted m]
+    range_m: float = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
+    depth_m: float = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
+    switch_m2: float = 0.5  # another target must be better by this …
+    switch_share: float = 0.2  # … and by this share of what the present one is worth, to be worth turning round
+
+    def __post_init__(self) -> None:
+        own = {f.name for f in fields(CostUtilityConfig)} - {f.name for f in fields(ExplorerConfig)}
+        for name in sorted(own):
+            value, zero = getattr(self, name), name not in ("range_m", "depth_m")
+            good = math.isfinite(value) and (value >= 0 if zero else value > 0)
+            require(good, f"CostUtilityConfig.{name} must be {'≥' if zero else '>'} 0, got {value}")
+
+
+class CostUtility(Explorer):
+    """Goes where the expected new area, less the price of the way, is largest."""
+
+    def __init__(
+        self,
+        config: CostUtilityConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        self._config = from_mapping(CostUtilityConfig, config)
+        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
+
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return the target with the best balance, unless the present one's is hardly worse."""
+        balance = self.balance(candidates)
+        best = int(np.argmax(balance))
+        if candidates.current is None:
+            return best
+        present = balance[candidates.current]
+        worth = max(self._config.switch_m2, self._config.switch_share * abs(present))
+        return best if balance[best] > present + worth else candidates.current
+
+    def balance(self, candidates: Candidates) -> Array:
+        """Return U − β V ``(m,)`` [m²] of each target; −inf where it is out of reach."""
+        config = self._config
+        reached = np.isfinite(candidates.costs)
+        utility = expected_area(
+            candidates.cost_map,
+            np.where(reached[:, None], candidates.cells, -1),
+            range_m=min(config.range_m, 0.8 * self._lidar.range_max_m),
+            depth_m=config.depth_m,
+        )
+        return np.asarray(utility - config.beta_m2_m * candidates.costs)

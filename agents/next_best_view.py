@@ -1,0 +1,154 @@
+"""Next best view: of many places in the known free space, the one that promises most for the way there.
+
+A place q that promises the new area A(q) and costs L(q) to reach is worth A(q) · exp(−λ L(q)), with A(q) by
+ray casting on the map (González-Baños and Latombe, "Navigation strategies for exploring indoor environments",
+IJRR 2002; the same trade-off, over the branches of a tree, in Bircher et al., ICRA 2016).
+
+Places are the points of a lattice over what can be reached, and each frontier's own view point. Only a place that
+has a piece of frontier in good sight counts: what promises area through a crack in a wall's drawing, looked at
+before, draws the robot nowhere. Where no sampled place does, the frontiers' own view points are what is left.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.cost_map import CostMap
+from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.gain import expected_area
+from agents.planning import TravelCosts
+from agents.sight import Watch, in_good_sight
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["NextBestView", "NextBestViewConfig"]
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int64]
+
+_SAMPLE_RAYS = 60  # enough to rank places by; six degrees apart
+_NEARER = 0.85  # share of the range of good sight that a place keeps to: the robot stops a little short
+
+
+@dataclass(frozen=True, kw_only=True)
+class NextBestViewConfig(ExplorerConfig):
+    """The parts of the agent, what it expects to see, and how it weighs that against the way."""
+
+    decay_1_m: float = 0.2  # λ: how fast the worth of a place falls with the cost of the way [1/weighted m]
+    range_m: float = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
+    depth_m: float = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
+    spacing_m: float = 0.4  # of the lattice of places
+    samples: int = 200  # places weighed in one choice; beyond that so many drawn from the lattice
+    switch_share: float = 0.2  # another place must be worth more by this share to be worth turning round
+
+    def __post_init__(self) -> None:
+        for name in ("range_m", "depth_m", "spacing_m"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, f"NextBestViewConfig.{name} must be > 0, got {value}")
+        for name in ("decay_1_m", "switch_share"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"NextBestViewConfig.{name} must be ≥ 0, got {value}")
+        require(self.samples >= 0, f"NextBestViewConfig.samples must be ≥ 0, got {self.samples}")
+
+
+class NextBestView(Explorer):
+    """Goes to where the most new area is in view, less what the way there costs."""
+
+    def __init__(
+        self,
+        config: NextBestViewConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        self._config = from_mapping(NextBestViewConfig, config)
+        self._rng = np.random.default_rng(0)
+        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
+        self._range_m = min(self._config.range_m, 0.8 * self._lidar.range_max_m)
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; ``seed`` draws the places where the lattice has more than are weighed."""
+        super().reset(belief, seed)
+        self._rng = np.random.default_rng(seed)
+
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return the candidate of the highest worth, unless the present one is worth hardly less."""
+        worth = self.worth(candidates.cost_map, candidates.cells, candidates.costs)
+        best = int(np.argmax(worth))
+        current = candidates.current
+        if current is None or worth[best] > (1.0 + self._config.switch_share) * worth[current]:
+            return best
+        return current
+
+    def worth(self, cost_map: CostMap, cells: Cells, costs: Array, *, rays: int = 120) -> Array:
+        """Return A · exp(−λ L) ``(m,)`` [m²] of places ``(m, 2)`` at travel costs ``(m,)``; −inf out of reach."""
+        reached = np.isfinite(costs)
+        config = self._config
+        area = expected_area(
+            cost_map,
+            np.where(reached[:, None], cells, -1),
+            range_m=self._range_m,
+            depth_m=config.depth_m,
+            rays=rays,
+        )
+        # The first term decides; the second keeps nearest first where nothing new is in view from anywhere.
+        discount = np.exp(-config.decay_1_m * np.where(reached, costs, 0.0))
+        return np.where(reached, (area + 1e-6) * discount, -np.inf)
+
+    def _candidates(self, belief: Belief) -> Candidates:
+        """Return the frontiers' candidates, each with the worthiest place that has it in good sight."""
+        own = super()._candidates(belief)
+        live = np.flatnonzero(np.isfinite(own.costs))
+        if not len(live) or self._config.samples == 0:
+            return own
+        targets = own.cost_map.to_cells(own.frontiers.targets)
+        reach = _NEARER * self._watch_kept().range_m
+        places = self._places(own.cost_map, own.travel, targets[live], reach)
+        cost = own.travel.cost[places[:, 0], places[:, 1]].astype(np.float64)
+        worth = self.worth(own.cost_map, places, cost, rays=_SAMPLE_RAYS)
+        if self._goal is not None and len(worth):
+            worth[0] *= 1.0 + self._config.switch_share  # the present goal: see _places
+        least = self.worth(own.cost_map, own.cells, own.costs, rays=_SAMPLE_RAYS)
+        cells, costs = own.cells.copy(), own.costs.copy()
+        points = own.cost_map.to_points(places)
+        for k in np.argsort(-worth, kind="stable"):
+            live = live[least[live] < worth[k]]  # places that are left make nothing better for the others
+            if not len(live):
+                break
+            watch = Watch(np.array([[*points[k], 0.0]]), reach, math.pi)
+            seen = live[in_good_sight(own.cost_map, targets[live], own.frontiers.normals[live], watch)]
+            cells[seen], costs[seen] = places[k], cost[k]
+            least[seen] = np.inf
+        return replace(own, cells=cells, costs=costs)
+
+    def _places(self, cost_map: CostMap, travel: TravelCosts, targets: Cells, reach_m: float) -> Cells:
+        """Return the places ``(k, 2)`` to weigh, the present goal first where there is one.
+
+        They are points of a lattice of the belief's frame, so that a growing map does not shift it: within
+        ``reach_m`` of one of the frontier cells ``targets`` ``(t, 2)``, and where the robot has room to turn.
+        """
+        config, resolution = self._config, cost_map.resolution
+        step = max(1, round(config.spacing_m / resolution))
+        first = [-round(cost_map.origin[axis] / resolution) % step for axis in (1, 0)]
+        rows, cols = slice(first[0], None, step), slice(first[1], None, step)
+        apart = np.ones(cost_map.classes.shape, dtype=np.uint8)
+        apart[targets[:, 0], targets[:, 1]] = 0
+        away = cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_5)[rows, cols]
+        roomy = cost_map.weight[rows, cols] <= 1.0 + config.planner.near_cost
+        near = np.isfinite(travel.cost[rows, cols]) & roomy & (away * resolution <= reach_m)
+        lattice = np.argwhere(near) * step + first
+        if len(lattice) > config.samples:
+            lattice = lattice[np.sort(self._rng.choice(len(lattice), config.samples, replace=False))]
+        if self._goal is None:
+            return lattice
+        goal = cost_map.to_cells(self._goal.pose[None, :2])
+        return np.vstack([goal, lattice])

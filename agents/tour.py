@@ -1,0 +1,185 @@
+"""All frontiers in one tour, planned anew whenever the map has changed.
+
+The lesson of TARE (Cao et al., 2021): going to what is nearest leaves small pockets behind, to be fetched at the
+end from far away; an order over everything that is left picks them up while they lie on the way. Of the tour, only
+the first leg is carried out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.cost_map import CostMap
+from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.gain import expected_area
+from agents.routing import best_tour
+from agents.stations import in_sight, join, ways
+from agents.travel import between
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.occupancy import FREE
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["StationsConfig", "Tour", "TourConfig"]
+
+Array = NDArray[np.float64]
+Cells = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationsConfig:
+    """The lattice that the robot hops on, where it is no robot that drives anywhere and looks all the while."""
+
+    spacing_m: float = 0.0  # between stations, through the start; 0: there are none
+    hop: int = 2  # stations a hop goes at most along each axis
+    reach_m: float = 12.0  # from which a piece of frontier is looked at
+
+    def __post_init__(self) -> None:
+        require(math.isfinite(self.spacing_m) and self.spacing_m >= 0, "StationsConfig.spacing_m must be ≥ 0")
+        require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
+        require(math.isfinite(self.reach_m) and self.reach_m > 0, "StationsConfig.reach_m must be > 0")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TourConfig(ExplorerConfig):
+    """The parts of the agent, and what makes a tour a good one."""
+
+    stations: StationsConfig = field(default_factory=StationsConfig)
+    places: int = 25  # nearest view points that the tour is over; those farther away can wait
+    tries: int = 6  # choices of view points that the best tour is taken from
+    hold_m: float = 1.0  # a tour that starts elsewhere must be shorter by this [weighted m] to turn round for
+    hurry: float = 0.5  # 0: the shortest tour; above: what shows much new area is reached early
+    depth_m: float = 3.0  # how far behind a frontier new area is expected
+
+    def __post_init__(self) -> None:
+        for name in ("hold_m", "hurry", "depth_m"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"TourConfig.{name} must be ≥ 0, got {value}")
+        for name in ("places", "tries"):
+            require(getattr(self, name) >= 1, f"TourConfig.{name} must be at least 1, got {getattr(self, name)}")
+
+
+class Tour(Explorer):
+    """Goes to the first place of the best tour over all that is left to look at."""
+
+    config: TourConfig
+
+    def __init__(
+        self,
+        config: TourConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        self._index = 0
+        super().__init__(from_mapping(TourConfig, config), robot=robot, lidar=lidar, step_s=step_s)
+
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return the piece of frontier that the tour begins with."""
+        return self._index
+
+    def _candidates(self, belief: Belief) -> Candidates:
+        """Return the candidates, the first place of the tour put in as the view point of what is picked."""
+        found = super()._candidates(belief)
+        open_ = np.flatnonzero(np.isfinite(found.costs))
+        if not len(open_):
+            return found
+        self._index = int(open_[np.argmin(found.costs[open_])])
+        if self.config.stations.spacing_m > 0:
+            return self._by_stations(found, open_)
+        self._index = self._by_views(found, open_)
+        return found
+
+    # ---- driving anywhere ----------------------------------------------------------------------------------
+
+    def _by_views(self, found: Candidates, pieces: Cells) -> int:
+        """Return the piece that the tour over the pieces' own view points begins with."""
+        near = pieces[np.argsort(found.costs[pieces], kind="stable")[: self.config.places]]
+        _, first = np.unique(found.cells[near], axis=0, return_index=True)
+        first.sort()  # the nearest first, still
+        owner = near[first]
+        cells = found.cells[owner]
+        places = np.vstack([np.asarray(found.cost_map.start)[None], cells])
+        distance = between(found.cost_map, found.travel, places)
+        sight = self._sight(found, places, near)
+        sight[1 + np.arange(len(owner)), first] = True
+        if found.current is not None:
+            self._hold(distance, sight[:, near == found.current].any(axis=1))
+        order, _ = best_tour(sight, distance, self._weights(found, places), self.config.tries, 0)
+        return int(owner[order[1] - 1])
+
+    def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> NDArray[np.bool_]:
+        """Return which pieces are in good sight from which places ``(n, m)``; none from the first, the robot's."""
+        reach = self._watch_kept().range_m / found.cost_map.resolution
+        targets = found.cost_map.to_cells(found.frontiers.targets[pieces])
+        sight = in_sight(found.cost_map.classes, places, targets, reach)
+        towards = (targets[None] - places[:, None])[..., ::-1]
+        ahead = (towards * found.frontiers.normals[pieces]).sum(axis=-1)
+        sight &= (towards**2).sum(axis=-1) <= reach * ahead
+        sight[0] = False
+        return np.asarray(sight)
+
+    def _weights(self, found: Candidates, places: Cells) -> Array:
+        """Return what a metre's delay costs at each place: its share of the area that all of them may show."""
+        if self.config.hurry == 0.0:
+            return np.zeros(len(places))
+        area = expected_area(
+            found.cost_map, places, range_m=self._lidar.range_max_m, depth_m=self.config.depth_m, rays=60
+        )
+        area[0] = 0.0
+        return np.asarray(self.config.hurry * area / max(float(area.mean()), 1e-9))
+
+    def _hold(self, distance: Array, kept: NDArray[np.bool_]) -> None:
+        """Shorten the first leg towards the places that the robot is on the way to."""
+        distance[0, kept] = np.maximum(distance[0, kept] - self.config.hold_m, 0.0)
+
+    # ---- hopping over stations -----------------------------------------------------------------------------
+
+    def _by_stations(self, found: Candidates, pieces: Cells) -> Candidates:
+        """Return the candidates with the tour's first station as the view point of a piece seen from there."""
+        config, cost_map = self.config.stations, found.cost_map
+        cells, joined, here = _stations(cost_map, config)
+        if here < 0:
+            return found
+        targets = cost_map.to_cells(found.frontiers.targets[pieces])
+        sight = in_sight(cost_map.classes, cells, targets, config.reach_m / cost_map.resolution)
+        lengths, _ = ways(cells, joined, here)
+        reached = np.isfinite(lengths) & np.isfinite(found.travel.cost[tuple(cells.T)])
+        reached[here] = False
+        useful = np.flatnonzero(reached & sight.any(axis=1))
+        if not len(useful):
+            return found
+        places = np.concatenate([[here], useful])
+        distance = np.array([ways(cells, joined, int(i))[0][places] for i in places]) * cost_map.resolution
+        seen = sight[places]
+        seen[0] = False
+        order, _ = best_tour(seen, distance, np.zeros(len(places)), self.config.tries, 0)
+        first = order[1]
+        away = np.hypot(*(targets - cells[places[first]]).T)
+        away[~seen[first]] = np.inf
+        self._index = int(pieces[np.argmin(away)])
+        views, costs = found.cells.copy(), found.costs.copy()
+        views[self._index] = cells[places[first]]
+        costs[self._index] = found.travel.cost[tuple(views[self._index])]
+        return replace(found, cells=views, costs=costs)
+
+
+def _stations(cost_map: CostMap, config: StationsConfig) -> tuple[Cells, Cells, int]:
+    """Return the stations known to be free ``(n, 2)``, which hops join them, and the robot's own, −1 off them."""
+    stride = max(1, round(config.spacing_m / cost_map.resolution))
+    corner = [round(v / cost_map.resolution) for v in cost_map.origin[::-1]]  # lattice row, column of cell (0, 0)
+    first = [-v % stride for v in corner]
+    picked = cost_map.classes[first[0] :: stride, first[1] :: stride] == FREE
+    places = np.argwhere(picked)
+    index = np.full(picked.shape, -1, dtype=np.int64)
+    index[picked] = np.arange(len(places))
+    cells = places * stride + np.array(first)
+    at = np.flatnonzero((cells == np.asarray(cost_map.start)).all(axis=1))
+    return cells, join(cost_map.classes, cells, places, index, config.hop), int(at[0]) if len(at) else -1

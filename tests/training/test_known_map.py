@@ -1,0 +1,70 @@
+"""The planner that knows the truth: what it takes for visible is so, and it covers what there is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import agents
+from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.ground_truth import GroundTruth
+from mecanum_env.rooms import make
+from training.explore import ExploreOptions, prepare, run
+from training.known_map import NAME, KnownMap, _greedy, _per_tile, _way_until
+
+
+def episode(tmp_path, agent, rooms="apartment", seed=5):
+    it = prepare(ExploreOptions(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth"))
+    run(it, lambda **_: None)
+    return it.metrics()
+
+
+def test_it_is_no_agent():
+    assert NAME not in agents.names()
+
+
+def test_it_covers_all_and_sooner_than_the_nearest_frontier(tmp_path):
+    known, nearest = episode(tmp_path, NAME), episode(tmp_path, "nearest-frontier")
+    assert known["end"] == "covered" and known["coverage"] > 0.99 and known["collisions"] == 0
+    assert known["time_to_95_s"] < nearest["time_to_95_s"]
+    again = episode(tmp_path, NAME)
+    assert (again["path_length_m"], again["time_s"]) == (known["path_length_m"], known["time_s"])
+
+
+def test_tiles_seen_are_in_the_line_of_sight():
+    plan = make("apartment", seed=3)
+    ground = GroundTruth(plan, plan.start, robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+    planner = KnownMap(ground)
+    whole = _per_tile(ground.mappable)
+    rng = np.random.default_rng(0)
+    checked = 0
+    for place in rng.choice(len(planner._places), 6, replace=False):
+        eye = planner._map.to_points(planner._places[[place]])[0] / ground.resolution
+        eye -= np.array(ground.lattice_origin[::-1])
+        tiles = np.argwhere(planner._sight[place].reshape(whole.shape))
+        for tile in tiles[rng.choice(len(tiles), min(10, len(tiles)), replace=False)]:
+            cells = np.argwhere(ground.mappable[6 * tile[0] : 6 * tile[0] + 6, 6 * tile[1] : 6 * tile[1] + 6])
+            clear = [is_clear(ground.walls, eye, 6 * tile[::-1] + cell[::-1] + 0.5) for cell in cells]
+            assert np.mean(clear) > 0.5
+            checked += 1
+    assert checked > 20
+
+
+def is_clear(walls, a, b):
+    line = a + np.linspace(0.0, 1.0, 200)[:, None] * (b - a)
+    cells = np.floor(line).astype(int)
+    return not walls[cells[:, 1], cells[:, 0]].any()
+
+
+def test_ways_and_greedy_tours_by_hand():
+    # On a line: robot at 0, places at 1, 2 and 10; the one at 2 sees what the one at 1 sees, and more.
+    at = np.array([0.0, 1.0, 2.0, 10.0])
+    distance = np.abs(at[:, None] - at)
+    seen = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 1]], dtype=bool)
+    cells = np.array([10.0, 5.0, 5.0])
+    np.testing.assert_array_equal(_greedy(seen, distance, cells, 0.5), [0, 1, 2, 3])
+    np.testing.assert_array_equal(_greedy(seen, distance, cells, 5.0), [0, 2, 3])
+    tour = np.array([0, 2, 3])
+    assert _way_until(seen, distance, cells, tour, 5.0) == pytest.approx(2.0)
+    assert _way_until(seen, distance, cells, tour, 0.0) == pytest.approx(10.0)
+    assert _way_until(seen, distance, cells, np.array([0, 2]), 0.0) == np.inf
