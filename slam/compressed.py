@@ -24,7 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.ekf import EkfConfig, EkfSlam
-from slam.joint_gaussian import symmetric_block
+from slam.joint_gaussian import read_block, symmetric_block
 from slam.landmarks import KIND
 from slam.lanes import aligned_zeros
 from slam.settings import require
@@ -233,7 +233,7 @@ class CompressedEkfSlam(EkfSlam):
         self._write_back()
         out = np.empty((self._n + 2 * len(self._far),) * 2)
         rows = np.concatenate([_state_rows(self._near, robot=True), _state_rows(self._far, robot=False)])
-        _read_block(self._map_p, rows, out)
+        read_block(self._map_p, rows, out)
         return out
 
     @property
@@ -255,8 +255,9 @@ class CompressedEkfSlam(EkfSlam):
         ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
         x = self._all_points()
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
-        keep = _state_rows(rows, robot=True)
-        joint = joint[np.ix_(keep, keep)]
+        order = _state_rows(np.concatenate([rows, lines]), robot=True)
+        whole = joint[np.ix_(order, order)]
+        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy()
         index = 3 + 2 * np.arange(len(rows))
         cov = np.array([[joint[index + a, index + b] for b in range(2)] for a in range(2)]).transpose(2, 0, 1)
         near = super().belief
@@ -269,6 +270,7 @@ class CompressedEkfSlam(EkfSlam):
             joint_cov=joint,
             lines=x[lines],
             line_ends=self._ends_of(x[lines], marks[lines, 6:8]),
+            whole_cov=whole,
         )
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
@@ -336,15 +338,6 @@ def _read_rows(p: Array, n: int, rows: NDArray[np.int64], out: Array) -> None:
             out[k, j] = p[j, i]
         for j in range(i, n):
             out[k, j] = p[i, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
-    """Write the block at these rows and columns of the symmetric matrix whose upper triangle is p."""
-    for a in range(rows.shape[0]):
-        for b in range(a, rows.shape[0]):
-            i, j = min(rows[a], rows[b]), max(rows[a], rows[b])
-            out[a, b] = out[b, a] = p[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

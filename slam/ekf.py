@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from slam.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
 from slam.backend import Backend, BackendConfig
 from slam.chi_square import chi2_quantile
-from slam.joint_gaussian import add_landmark, near_landmarks, symmetric_block
+from slam.joint_gaussian import add_landmark, near_landmarks, read_block, symmetric_block
 from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
 from slam.lanes import aligned_zeros
 from slam.metrics import nees_pose
@@ -325,11 +325,13 @@ class EkfSlam(Backend):
     @property
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
-        joint, rows = self.joint_cov, self._point_rows()
-        lines = np.setdiff1d(np.arange(self._book.count), rows)
-        if len(lines):
-            keep = np.concatenate([np.arange(3), np.column_stack([3 + 2 * rows, 4 + 2 * rows]).ravel()])
-            joint = joint[np.ix_(keep, keep)]
+        are_lines = self._book.marks[:, 0] == LINE
+        rows, lines = np.flatnonzero(~are_lines), np.flatnonzero(are_lines)
+        marks = np.concatenate([rows, lines])
+        order = np.concatenate([np.arange(3), np.column_stack([3 + 2 * marks, 4 + 2 * marks]).ravel()])
+        whole = np.empty((self._n, self._n))
+        read_block(self._p, order, whole)
+        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
         index = 3 + 2 * np.arange(len(rows))
         cov = np.empty((len(index), 2, 2))
         for a in range(2):
@@ -346,6 +348,7 @@ class EkfSlam(Backend):
             landmark_kinds=self._book.kinds()[rows],
             lines=self._points[lines],
             line_ends=self._ends_of(self._points[lines], self._book.marks[lines, 6:8]),
+            whole_cov=whole,
         )
 
     @staticmethod

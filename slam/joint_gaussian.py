@@ -19,6 +19,7 @@ __all__ = [
     "OBSERVED_LIMIT",
     "add_landmark",
     "near_landmarks",
+    "read_block",
     "symmetric_block",
 ]
 
@@ -86,6 +87,15 @@ def symmetric_block(p: Array, out: Array) -> None:
     for i in range(out.shape[0]):
         for j in range(i, out.shape[0]):
             out[i, j] = out[j, i] = p[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+    """Write the block at these rows and columns of the symmetric matrix whose upper triangle is p."""
+    for a in range(rows.shape[0]):
+        for b in range(a, rows.shape[0]):
+            i, j = min(rows[a], rows[b]), max(rows[a], rows[b])
+            out[a, b] = out[b, a] = p[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -140,6 +140,13 @@ def test_a_room_s_walls_are_mapped_and_hold_the_pose(name: str) -> None:
     points = len(belief.landmarks)
     assert len(belief.lines) == 4 and points <= 4
     assert belief.joint_cov is not None and belief.joint_cov.shape == (3 + 2 * points, 3 + 2 * points)
+    assert belief.whole_cov is not None and belief.whole_cov.shape == (11 + 2 * points, 11 + 2 * points)
+    np.testing.assert_array_equal(belief.whole_cov[: 3 + 2 * points, : 3 + 2 * points], belief.joint_cov)
+    # The walls' own part: their variances, in the order of ``lines``, from the filter's state.
+    wall_rows = 3 + 2 * np.flatnonzero(backend._book.marks[:, 0] == LINE)
+    joint = backend.joint_cov
+    np.testing.assert_array_equal(np.diag(belief.whole_cov)[3 + 2 * points :: 2], np.diag(joint)[wall_rows])
+    np.testing.assert_array_equal(belief.whole_cov[0, 3 + 2 * points :: 2], joint[0, wall_rows])
     error = compose(inverse(start), pose) - belief.pose
     assert np.hypot(*error[:2]) < 0.02
     assert abs(float(wrap(error[2]))) < 0.01

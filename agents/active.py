@@ -1,0 +1,285 @@
+"""Active SLAM: where to go, when to look first and how gently to drive, by the uncertainty it would leave.
+
+A frontier's price is the time to get there, less what is expected to be seen there, plus what the way would leave
+of the pose's uncertainty (:mod:`agents.foresight`; D-optimality, Carrillo et al., 2012). Where a detour past well
+known landmarks leaves so much less that it pays, the robot goes back there first.
+
+What a map gets wrong at its very beginning it never loses. The start pose is known by definition; a robot that
+drives off before its landmarks are settled has its wheels alone to tell where it was when it first saw them, and
+every later landmark inherits that. So it looks before it goes, for as long as looking pays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents import cost_map as cost_maps
+from agents.base import Goal
+from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
+from agents.gain import expected_area
+from agents.grip import GentleFollower, WheelWatch
+from agents.planning import shortest_path
+from agents.sightings import expected_sightings
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["ActiveConfig", "ActiveSlam", "LookConfig", "RevisitConfig"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LookConfig:
+    """How long to look before the first drive."""
+
+    at_most_s: float = 3.0
+    blind_s: float = 0.5  # … where nothing is seen that could be a landmark
+    step_s: float = 0.5  # what looking on for so long would bring is asked
+    most: int = 24  # landmarks that are counted
+
+    def __post_init__(self) -> None:
+        for name in ("at_most_s", "blind_s", "step_s", "most"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, f"LookConfig.{name} must be > 0, got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RevisitConfig:
+    """When going back is thought of at all."""
+
+    above_m: float = 0.01  # the pose's spread from which on it is …
+    times: float = 2.0  # … and how much better it must have been known at the place to go back to
+    again_s: float = 30.0  # between two such ways
+    spacing_m: float = 1.0  # between the places that are remembered
+
+    def __post_init__(self) -> None:
+        for name in ("above_m", "times", "again_s", "spacing_m"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, f"RevisitConfig.{name} must be > 0, got {value}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActiveConfig(ExplorerConfig):
+    """The parts of the agent, and what it weighs against time."""
+
+    foresight: ForesightConfig = field(default_factory=ForesightConfig)
+    look: LookConfig = field(default_factory=LookConfig)
+    revisit: RevisitConfig = field(default_factory=RevisitConfig)
+    worth_s_per_m: float = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
+    area_s: float = 1.0  # time that ln(1 + expected new area / 1 m²) is worth
+    switch_s: float = 1.5  # another frontier must be better by this …
+    switch_share: float = 0.15  # … and by this share of the way to the present one
+    most: int = 5  # candidates that are thought through: the cheapest to reach
+    gentle_m_s2: float = 0.6  # acceleration on a floor found slippery
+    firm_share: float = 0.02  # of the wheels' speed: no greater error of the odometry is taken for slip …
+    slippery_share: float = 0.04  # … from here on it is driven as gently as it can be
+
+    def __post_init__(self) -> None:
+        for name in ("worth_s_per_m", "area_s", "switch_s", "switch_share"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"ActiveConfig.{name} must be ≥ 0, got {value}")
+        require(self.most >= 1, f"ActiveConfig.most must be at least 1, got {self.most}")
+        require(self.gentle_m_s2 > 0, f"ActiveConfig.gentle_m_s2 must be > 0, got {self.gentle_m_s2}")
+        require(
+            0 < self.firm_share < self.slippery_share,
+            "ActiveConfig needs 0 < firm_share < slippery_share",
+        )
+
+
+class ActiveSlam(Explorer):
+    """Explores so that the map becomes good: every way is priced by the uncertainty that it would leave, too."""
+
+    def __init__(
+        self,
+        config: ActiveConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        self._config = from_mapping(ActiveConfig, config)
+        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
+
+    def _forget(self) -> None:
+        config = self._config
+        self._gentle = GentleFollower(
+            config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s,
+            gentle_m_s2=config.gentle_m_s2,
+        )  # fmt: skip
+        self._follower = self._gentle
+        self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * config.firm_share)
+        self._looked_s: float | None = 0.0  # at the start; None once it has driven off
+        self._places: list[Array] = []  # (3,) x, y [m] and the pose's spread [m] there
+        self._detour: Array | None = None  # (n, 2) [m] the way back to one of them, while it is taken
+        self._back_before_s = self._no_detour_before_s = 0.0
+        super()._forget()
+
+    # ---- choosing ------------------------------------------------------------------------------------------
+
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return the frontier of the least price; note down a detour to make first, if one pays."""
+        config = self._config
+        prices, paths, chosen = self._price(candidates, belief)
+        best = chosen[int(np.argmin(prices))]
+        current = candidates.current
+        if current is not None and current in chosen:
+            price = prices[chosen.index(current)]
+            way_s = float(candidates.costs[current]) / config.foresight.speed_m_s
+            worth = max(config.switch_s, config.switch_share * way_s)
+            best = best if prices[chosen.index(best)] < price - worth else current
+        index = chosen.index(best)
+        self._weigh_detour(candidates, belief, paths[index], prices[index])
+        return best
+
+    def _price(self, candidates: Candidates, belief: Belief) -> tuple[list[float], list[Array], list[int]]:
+        """Return prices [s] and paths of the candidates that are thought through, and which they are."""
+        config = self._config
+        order = np.argsort(candidates.costs, kind="stable")[: config.most]
+        chosen = [int(i) for i in order if np.isfinite(candidates.costs[i])]
+        current = candidates.current
+        if current is not None and current not in chosen and np.isfinite(candidates.costs[current]):
+            chosen.append(current)
+        areas = expected_area(
+            candidates.cost_map, candidates.cells[chosen], range_m=self._lidar.range_max_m, depth_m=2.0
+        )
+        foresight, marks = self._foresight(), marks_of(belief)
+        prices, paths = [], []
+        for i, area in zip(chosen, areas, strict=True):
+            path = self._path(candidates, belief, (int(candidates.cells[i, 0]), int(candidates.cells[i, 1])))
+            paths.append(path)
+            time_s = float(candidates.costs[i]) / config.foresight.speed_m_s
+            prices.append(
+                time_s - config.area_s * math.log1p(float(area))
+                + config.worth_s_per_m * self._spread_after(foresight, marks, candidates, path)
+            )  # fmt: skip
+        return prices, paths, chosen
+
+    def _path(self, candidates: Candidates, belief: Belief, cell: tuple[int, int]) -> Array:
+        spacing = self.config.planner.path_spacing_m
+        return shortest_path(candidates.cost_map, candidates.travel, cell, start=belief.pose, spacing_m=spacing)
+
+    def _foresight(self) -> Foresight:
+        return Foresight(
+            self._config.foresight, lidar=self._lidar, odometry=self._wheels.noise(), step_s=self._step_s
+        )
+
+    def _spread_after(self, foresight: Foresight, marks: Marks, candidates: Candidates, path: Array) -> float:
+        foreseen = foresight.along(marks, candidates.cost_map, path)
+        return spread_m(foreseen.pose_cov, self._config.foresight.lever_m)
+
+    def _weigh_detour(self, candidates: Candidates, belief: Belief, path: Array, price: float) -> None:
+        """Set the detour, if going back to where the pose was well known and then on to the goal costs less."""
+        config, revisit = self._config, self._config.revisit
+        self._detour = None
+        spread = self._spread(belief)
+        if spread < revisit.above_m or self._time < self._no_detour_before_s:
+            return
+        good = [place for place in self._places if place[2] * revisit.times < spread]
+        if not good:
+            return
+        cells = candidates.cost_map.to_cells(np.array([place[:2] for place in good]))
+        costs = candidates.travel.cost[tuple(cells.T)]
+        nearest = int(np.argmin(costs))
+        if not np.isfinite(costs[nearest]):
+            return
+        there = self._path(candidates, belief, (int(cells[nearest, 0]), int(cells[nearest, 1])))
+        foresight, marks = self._foresight(), marks_of(belief)
+        direct = self._spread_after(foresight, marks, candidates, path)
+        around = self._spread_after(foresight, marks, candidates, np.vstack([there, there[-2::-1], path[1:]]))
+        extra_s = 2.0 * float(costs[nearest]) / config.foresight.speed_m_s
+        if config.worth_s_per_m * (direct - around) > extra_s:
+            self._detour = there
+
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return the next view point, or the place to go back to first; ``None`` when no frontier is left."""
+        going_back = self._detour is not None
+        goal = super().choose(belief)  # which asks pick, and that notes down a detour
+        if goal is None:
+            self._detour = None
+        elif self._detour is not None and not going_back:
+            self._back_before_s = self._time + 10.0 + _length(self._detour) / self.config.patience.slowest_m_s
+        if self._detour is None or self._time > self._back_before_s:
+            self._detour = None
+            if going_back:
+                self._no_detour_before_s = self._time + self._config.revisit.again_s
+            return goal
+        self._target = self._detour[-1].copy()
+        self._status = "revisiting"
+        return Goal(pose=np.array([*self._target, float(belief.pose[2])]), path=self._detour)
+
+    # ---- driving -------------------------------------------------------------------------------------------
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action: looking first, then on the way to the goal, gently where the wheels slip."""
+        self._wheels.look(observation, belief)
+        if self._looked_s is not None:
+            if self._looks_on(belief):
+                return self._look(belief)
+            self._looked_s = None
+        config = self._config
+        self._gentle.go_gently(
+            float(np.interp(self._wheels.share, [config.firm_share, config.slippery_share], [0.0, 1.0]))
+        )
+        self._remember(belief)
+        action = super().act(observation, belief)
+        return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action
+
+    def _look(self, belief: Belief) -> NDArray[np.float32]:
+        """Stand for a step; a goal is there from the beginning, if there is one at all."""
+        assert self._looked_s is not None
+        self._keep_watch(belief)
+        if self._looked_s == 0.0:
+            self._goal = self.choose(belief)
+        self._looked_s += self._step_s
+        self._gentle.stand()
+        if self._goal is not None:
+            self._status = "looking"
+        return np.zeros(3, dtype=np.float32)
+
+    def _looks_on(self, belief: Belief) -> bool:
+        """Whether another look from the start, which is known, pays (:func:`agents.foresight.anchoring`).
+
+        The landmarks' error relative to the start falls with the root of the number of looks.
+        """
+        config, looked_s = self._config, self._looked_s
+        assert looked_s is not None
+        if looked_s < config.look.blind_s - 1e-9:
+            return True
+        if looked_s >= config.look.at_most_s - 1e-9:
+            return False
+        marks = marks_of(belief)
+        if not len(marks.kinds):
+            return False
+        cost_map = cost_maps.build(belief, config.planner, self._robot)
+        seen, _ = expected_sightings(
+            cost_map, marks.x[None, :3], marks.x[3:].reshape(-1, 2), marks.kinds, marks.ends,
+            lidar=self._lidar, model=config.foresight.sensor, most=config.look.most,
+        )  # fmt: skip
+        spread = spread_m(anchoring(marks, seen[0], self._lidar.offset_m), config.foresight.lever_m)
+        further = config.look.step_s
+        drop = spread * (1.0 - math.sqrt(looked_s / (looked_s + further)))
+        return not drop * config.worth_s_per_m < further
+
+    def _remember(self, belief: Belief) -> None:
+        """Note down every little way how well the pose is known there."""
+        here, spread = np.asarray(belief.pose)[:2], self._spread(belief)
+        if not self._places or np.hypot(*(here - self._places[-1][:2])) >= self._config.revisit.spacing_m:
+            self._places.append(np.array([*here, spread]))
+
+    def _spread(self, belief: Belief) -> float:
+        return spread_m(np.asarray(belief.pose_cov), self._config.foresight.lever_m)
+
+    def _is_frontier(self, belief: Belief, point: Array) -> bool:
+        return self._detour is not None or super()._is_frontier(belief, point)
+
+
+def _length(path: Array) -> float:
+    return float(np.hypot(*np.diff(path, axis=0).T).sum()) if len(path) > 1 else 0.0

@@ -1,0 +1,176 @@
+"""The active agent: looks first, prefers ways that are well marked, goes back where that pays, brakes gently."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+import agents
+from agents.active import ActiveSlam
+from agents.control import ControlConfig
+from agents.grip import GentleFollower, WheelWatch
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.occupancy import UNKNOWN
+from slam.types import Belief
+from tests.agents.grids import belief_of, drive, fill, half_known, room
+
+ROBOT, LIDAR = RobotConfig(), LidarConfig()
+SHORT = {"view_range_m": 0.8}
+GO = {"look": {"at_most_s": 0.1, "blind_s": 0.1}}  # hardly any looking before the first drive
+
+
+def ready(belief: Belief, **config) -> ActiveSlam:
+    agent = agents.make("active", config={"frontiers": SHORT} | config)
+    assert isinstance(agent, ActiveSlam)
+    agent.reset(belief)
+    return agent
+
+
+def marked(belief: Belief, points, *, sigma: float = 0.003) -> Belief:
+    """The belief with corners at these points, each known for itself."""
+    points = np.array(points, dtype=np.float64).reshape(-1, 2)
+    size = 3 + 2 * len(points)
+    joint = sigma**2 * np.eye(size)
+    joint[:3, :3] = belief.pose_cov
+    return replace(
+        belief, landmarks=points, landmark_cov=np.tile(sigma**2 * np.eye(2), (len(points), 1, 1)),
+        landmark_ids=np.arange(len(points)), joint_cov=joint,
+    )  # fmt: skip
+
+
+def two_ways(length_m: float = 17.0):
+    """A corridor with a frontier at either end, as far from its middle."""
+    classes = room(length_m, 3.0)
+    fill(classes, 0.0, 0.0, 1.0, 3.0, UNKNOWN)
+    fill(classes, length_m - 1.0, 0.0, length_m, 3.0, UNKNOWN)
+    return belief_of(classes, (0.5 * length_m, 1.5, 0.0), sigma=0.005)
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("joint", [True, False])
+def test_of_equal_gains_it_takes_the_well_marked_way(side, joint):
+    belief = two_ways()
+    at = 8.5 + side * np.arange(2.0, 7.1, 1.0)
+    posts = np.column_stack([np.repeat(at, 2), np.tile([0.6, 2.4], len(at))])
+    belief = marked(belief, posts)
+    if not joint:
+        belief = replace(belief, joint_cov=None)
+    assert np.sign(ready(belief).choose(belief).pose[0] - 8.5) == side
+    # Time alone does not tell them apart: the other way, marked, is taken as well.
+    assert np.sign(ready(belief, worth_s_per_m=0.0).choose(belief).pose[0] - 8.5) in (-1, 1)
+
+
+def test_it_looks_before_it_goes_and_the_better_the_landmarks_the_shorter():
+    belief = belief_of(half_known(), (1.5, 2.0, 0.4))
+    corners = [[0.1, 0.1], [0.1, 3.9], [3.5, 0.1], [3.5, 3.9]]
+    stood = []
+    for sigma in (0.0003, 0.001, 0.1):
+        now = replace(marked(belief, corners, sigma=sigma), pose_cov=1e-8 * np.eye(3))
+        now.joint_cov[:3, :3] = 1e-8 * np.eye(3)
+        agent = ready(now)
+        steps = 0
+        while not agent.act(None, now).any() and steps < 100:
+            steps += 1
+            assert agent.status == "looking" and agent.goal is not None
+        stood.append(0.1 * steps)
+    assert stood[0] < stood[1] < stood[2]
+    assert stood[0] == pytest.approx(0.5, abs=0.11) and stood[2] == pytest.approx(3.0, abs=0.11)
+
+
+def test_where_nothing_could_be_a_landmark_it_does_not_wait_for_one():
+    belief = belief_of(half_known(), (1.5, 2.0, 0.4))
+    agent = ready(belief)
+    stood = [not agent.act(None, belief).any() for _ in range(10)]
+    assert stood == [True] * 5 + [False] * 5
+
+
+def test_it_goes_back_to_what_is_well_known_when_that_pays():
+    """An unmarked way on, posts behind: a pose gone vague is made good there first."""
+    posts = [[2.0, 0.6], [2.0, 2.4], [3.5, 0.6], [3.5, 2.4]]
+    classes = room(24.0, 3.0)
+    fill(classes, 23.0, 0.0, 24.0, 3.0, UNKNOWN)
+
+    def at(x, sigma):
+        return marked(belief_of(classes, (x, 1.5, 0.0), sigma=sigma), posts, sigma=0.001)
+
+    def chosen(sigma):
+        agent = ready(at(3.0, 0.002), **GO)
+        for x in (3.0, 5.0, 7.0, 9.0):
+            agent.act(None, at(x, 0.002))
+        for _ in range(3):  # looked enough; then the pose goes vague
+            agent.act(None, at(13.0, sigma))
+        return agent, agent.choose(at(13.0, sigma))
+
+    agent, goal = chosen(0.1)
+    assert goal.pose[0] < 10.0 and agent.status == "revisiting"
+    np.testing.assert_allclose(goal.path[0], [13.0, 1.5])
+    agent, goal = chosen(0.002)
+    assert goal.pose[0] > 20.0 and agent.status == "driving"
+
+
+def test_it_rolls_out_when_all_is_explored():
+    """Wheels that stop at once slide on: speed is shed as on the way."""
+    half, done = belief_of(half_known(), (1.5, 2.0, 0.0)), belief_of(room(8.0, 4.0), (1.5, 2.0, 0.0))
+    agent = ready(half, **GO)
+    for _ in range(12):
+        action = agent.act(None, half)
+    speeds = [float(np.hypot(*action[:2])) * ROBOT.max_speed_m_s]
+    assert speeds[0] > 0.3
+    agent._chosen_at = -np.inf
+    for _ in range(12):
+        speeds.append(float(np.hypot(*agent.act(None, done)[:2])) * ROBOT.max_speed_m_s)
+    assert agent.goal is None and agent.status == "covered"
+    assert speeds[-1] == 0.0 and np.diff(speeds).min() > -1.3 * 0.1
+
+
+def test_wheels_that_slip_are_found_out_and_driven_gently():
+    rng = np.random.default_rng(1)
+    limits = np.array([ROBOT.max_speed_m_s, ROBOT.max_speed_m_s, ROBOT.max_turn_rate_rad_s])
+    for share in (0.01, 0.06):
+        watch = WheelWatch(ROBOT, step_s=0.1, share=0.01)
+        pose, belief = np.array([1.5, 2.0, 0.0]), belief_of(half_known(), (1.5, 2.0, 0.0))
+        for k in range(1500):
+            action = np.array([0.5, 0.1 * (-1) ** k, 0.3], np.float32)
+            pose = drive(pose, action, ROBOT)
+            wheels = np.linalg.norm(action * limits * [1, 1, ROBOT.lever_m])
+            noise = share * wheels * rng.standard_normal(3) / np.array([1.0, 1.0, ROBOT.lever_m])
+            watch.look({"twist": (action * limits + noise) / limits}, replace(belief, pose=pose))
+        assert watch.share == pytest.approx(share, rel=0.2)
+    watch.look(None, belief)
+    watch.look({}, belief)
+
+
+def test_a_gentle_follower_keeps_to_its_acceleration():
+    follower = GentleFollower(ControlConfig(), robot=ROBOT, lidar=LIDAR, step_s=0.1, gentle_m_s2=0.5)
+    belief = belief_of(room(20.0, 8.0), (4.0, 4.0, 0.0))
+    for share, limit in ((0.0, 1.2), (1.0, 0.5)):
+        follower.stand()
+        follower.go_gently(share)
+        speeds = [follower.drive(np.array([0.7, 0.0]), 0.0, None, belief)[0] for _ in range(20)]
+        assert max(np.diff(speeds)) == pytest.approx(0.1 * limit, rel=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    classes=arrays(
+        np.int8, st.tuples(st.integers(2, 40), st.integers(2, 40)), elements=st.sampled_from([-1, 0, 0, 100])
+    ),
+    points=st.lists(st.tuples(st.floats(-2.0, 4.0), st.floats(-2.0, 4.0)), max_size=6),
+    x=st.floats(-1.0, 3.0),
+    y=st.floats(-1.0, 3.0),
+    joint=st.booleans(),
+)
+def test_any_raster_and_any_landmarks(classes, points, x, y, joint):
+    belief = marked(belief_of(classes, (x, y, 0.3)), points)
+    belief = belief if joint else replace(belief, joint_cov=None)
+    agent = ready(belief, **GO)
+    goal = agent.choose(belief)
+    assert goal is None or np.isfinite(goal.path).all()
+    for _ in range(4):
+        action = agent.act(None, belief)
+        assert action.shape == (3,) and np.isfinite(action).all()
