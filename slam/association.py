@@ -142,6 +142,18 @@ def _beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _too_near(x: Array, i: int, offset: float, z: Array, mark: Array, near: float, dx: float, dy: float) -> bool:
+    """Tell whether what is seen lies too near to landmark ``i``, of a point ``dx`` and ``dy`` away, to be new.
+
+    How near that is [m] has nothing to do with how well the robot knows where it is: the longer the way from the
+    start, the more of the walls beside others would be taken for neither known nor new, and be of no use at all.
+    """
+    if z[5] == LINE:
+        return _beside(x, i, offset, z, mark, near)
+    return bool(dx * dx + dy * dy < near * near)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
     max_turn: float, only_sure: bool, match: NDArray[np.int64], distance: Array, h: Array,
@@ -186,8 +198,6 @@ def nearest_neighbour(
             if z[k, 5] == LINE:
                 if not _beside(x, i, offset, z[k], marks[i], window):
                     continue
-                dx = dy = 0.0  # as near as that, it is no new wall
-            if z[k, 5] == LINE:
                 rho, phi = line_blocks(x, i, offset, h)
             else:
                 rho, phi = _point_blocks(x, i, offset, c, s, h)
@@ -195,7 +205,7 @@ def nearest_neighbour(
             candidates += d2 < gate
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2
-            elif match[k] == UNMATCHED and dx * dx + dy * dy < near * near:
+            elif match[k] == UNMATCHED and _too_near(x, i, offset, z[k], marks[i], near, dx, dy):
                 match[k] = IGNORED
         if only_sure and candidates > 1:
             match[k] = IGNORED
@@ -271,7 +281,7 @@ def joint_compatibility(
             if z[k, 5] != LINE and np.any(landmark[:pairs] == i):
                 continue
             landmark[pairs] = i
-            _extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
+            extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
             more = nis[pairs] + y[2 * pairs] ** 2 + y[2 * pairs + 1] ** 2
             if more > gates[pairs + 1]:
                 continue
@@ -311,7 +321,7 @@ def _compatible(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _extend(
+def extend(
     x: Array, p: Array, offset: float, z: Array, landmark: NDArray[np.int64], pairs: int, h: Array, factor: Array,
     y: Array,
 ) -> None:  # fmt: skip
@@ -367,10 +377,5 @@ def _set_aside(
         for i in range(landmarks):
             if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
-            dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
-            if z[k, 5] == LINE:
-                too_near = _beside(x, i, offset, z[k], marks[i], near)
-            else:
-                too_near = dx * dx + dy * dy < near * near
-            if too_near:
+            if _too_near(x, i, offset, z[k], marks[i], near, x[3 + 2 * i] - px, x[4 + 2 * i] - py):
                 match[k] = IGNORED
