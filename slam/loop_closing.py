@@ -36,10 +36,10 @@ def _variance(z: Array, s00: float, s01: float, s11: float) -> float:
     """
     if z[5] == LINE:
         t = 0.5 * (z[8] + z[9])
-        return s00 - 2.0 * t * s01 + t * t * s11
+        return float(s00 - 2.0 * t * s01 + t * t * s11)
     across = z[0] * z[0] * s11
     half = 0.5 * (s00 - across)
-    return 0.5 * (s00 + across) + math.sqrt(half * half + z[0] * z[0] * s01 * s01)
+    return float(0.5 * (s00 + across) + math.sqrt(half * half + z[0] * z[0] * s01 * s01))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -87,6 +87,9 @@ def agreeing(
     them are taken for true. The other arguments are :func:`slam.association.joint_compatibility`'s.
     """
     m = z.shape[0]
+    match[:] = IGNORED
+    if m <= _LEAST:  # the first is never expected any better
+        return 0
     joint_compatibility(x, p, marks.shape[0], offset, z, marks, gates, near, max_turn, most_nodes, match)
     h = np.zeros((m, 2, 5))
     landmark = np.zeros(m, np.int64)
