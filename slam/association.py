@@ -167,7 +167,7 @@ def nearest_neighbour(
         of a LINE distance and bearing of its foot, and in columns 8 and 9 from where to where it was seen [m].
     marks : Array
         ``(n, ≥ 2)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
-        from where to where it goes [m].
+        from where to where it goes [m], and in column 5 when it was seen last.
     gate : float
         Largest squared Mahalanobis distance (chi-square with two degrees of freedom).
     near : float
@@ -175,7 +175,8 @@ def nearest_neighbour(
     max_turn : float
         Largest difference in direction [rad]. Kind 0 matches any kind and direction.
     only_sure : bool
-        Take no match where more than one landmark is within the gate (individual gating).
+        Take no match where more than one landmark is within the gate (individual gating), unless they are pieces
+        of wall on which the observed one lies: then the one seen last.
     match, distance : NDArray
         ``(m,)`` filled: landmark index, UNMATCHED or IGNORED; squared Mahalanobis distance.
     """
@@ -188,7 +189,7 @@ def nearest_neighbour(
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
-        candidates = 0
+        candidates, surface = 0, -1
         for i in range(landmarks):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if z[k, 5] != LINE and (abs(dx) > window or abs(dy) > window):
@@ -203,12 +204,16 @@ def nearest_neighbour(
                 rho, phi = _point_blocks(x, i, offset, c, s, h)
             d2 = _distance(p, i, rho, phi, z[k], h)
             candidates += d2 < gate
+            if d2 < gate and z[k, 5] == LINE and _beside(x, i, offset, z[k], marks[i], near):
+                surface = i if surface < 0 or marks[i, 5] > marks[surface, 5] else surface
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2
             elif match[k] == UNMATCHED and _too_near(x, i, offset, z[k], marks[i], near, dx, dy):
                 match[k] = IGNORED
         if only_sure and candidates > 1:
-            match[k] = IGNORED
+            # One straight surface that lies on two pieces of wall makes them one wall: either will do, best the
+            # one seen last. To leave it out would be to go blind in a corridor that shows nothing else.
+            match[k] = surface if surface >= 0 else IGNORED
     # Two observations cannot be one point: the farther gives way. Of a wall any number of pieces may be seen.
     for k in range(z.shape[0]):
         for j in range(k):

@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 _LAST_SEEN = 5  # column of marks
 _OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company
+_HOLD = 3  # other landmarks seen, that old ones can wait for company
 _LEAST = 3  # old landmarks that the others predict narrowly, for them all to be taken
 
 
@@ -65,14 +66,22 @@ def put_off(
 ) -> int:  # fmt: skip
     """Set to IGNORED the matches with old landmarks that are not expected to within ``sigma`` [m]; count them."""
     h = np.empty((2, 5))
-    count = 0
+    doubtful = np.zeros(z.shape[0], np.bool_)
+    count = held = 0
     for k in range(z.shape[0]):
         i = match[k]
-        if i < 0 or now - marks[i, _LAST_SEEN] <= _OLD:
+        if i < 0:
             continue
-        if _expected_variance(x, p, i, offset, z[k], h) > sigma * sigma:
+        old = now - marks[i, _LAST_SEEN] > _OLD
+        doubtful[k] = old and _expected_variance(x, p, i, offset, z[k], h) > sigma * sigma
+        count += doubtful[k]
+        held += not doubtful[k]
+    # They can wait while others hold the pose. Where nothing else is seen, leaving them out would be going blind.
+    if held < _HOLD:
+        return 0
+    for k in range(z.shape[0]):
+        if doubtful[k]:
             match[k] = IGNORED
-            count += 1
     return count
 
 

@@ -58,6 +58,20 @@ def test_what_may_be_a_known_wall_badly_seen_is_not_new() -> None:
     assert match.tolist() == [IGNORED]
 
 
+def test_a_surface_that_lies_on_two_pieces_of_wall_is_the_one_seen_last() -> None:
+    """In a corridor that shows one wall only, mapped in two pieces, a robot that takes neither goes blind."""
+    x, p, marks = lone_wall(0.3)
+    x, marks = np.append(x, x[3:5]), np.vstack([marks, marks])
+    p = np.pad(p, (0, 2))
+    p[5, 5], p[6, 6] = 1e-8, 1e-6
+    marks[1, 5:] = 90.0, 5.0, 9.0  # the other piece goes on farther along, and was seen lately
+    z = np.array([wall_row(2.0, math.pi / 2, start, end) for start, end in ((0.0, 7.0), (-3.0, 3.0))])
+    p[4, 4] = p[1, 1] = p[1, 4] = 1e-6  # so that both are within the gate
+    match = np.zeros(2, np.int64)
+    nearest_neighbour(x, p, 2, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(2), np.zeros((2, 5)))
+    assert match.tolist() == [1, 0]  # on both, and on the first alone
+
+
 def test_followed_and_well_known_landmarks_need_no_company() -> None:
     x, p, marks = lone_wall(0.3)
     z = np.array([wall_row(2.0, math.pi / 2, -1.0, 1.0)])
