@@ -72,15 +72,20 @@ def test_a_surface_that_lies_on_two_pieces_of_wall_is_the_one_seen_last() -> Non
     assert match.tolist() == [1, 0]  # on both, and on the first alone
 
 
-def test_followed_and_well_known_landmarks_need_no_company() -> None:
+def test_old_landmarks_that_are_not_expected_narrowly_wait_while_others_hold_the_pose() -> None:
     x, p, marks = lone_wall(0.3)
-    z = np.array([wall_row(2.0, math.pi / 2, -1.0, 1.0)])
-    match = np.array([0])
+    x, marks = np.append(x, [0.0, 4.0]), np.vstack([marks, marks])
+    p = np.pad(p, (0, 2))
+    p[5, 5], p[6, 6], marks[1, 5] = 1e-8, 1e-6, 990.0  # another wall, followed from scan to scan
+    z = np.array([wall_row(3.8, 0.0, start, start + 1.0) for start in (-4.0, -2.0, 1.0)])
+    z = np.vstack([z, wall_row(2.0, math.pi / 2, -1.0, 1.0)])
+    match = np.array([1, 1, 1, 0])
     assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == 0  # old, and known where it should be seen
     p[1, 1] += 0.2**2  # now the robot alone is uncertain
     assert put_off(x, p, OFFSET, z, marks, 40, SIGMA, match) == 0  # seen 40 updates ago
+    assert put_off(x, p, OFFSET, z[1:], marks, 1000, SIGMA, match[1:]) == 0  # there is too little else
     assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == 1
-    assert match.tolist() == [IGNORED]
+    assert match.tolist() == [1, 1, 1, IGNORED]
 
 
 def test_one_old_wall_closes_no_loop_and_four_that_agree_do() -> None:
@@ -99,7 +104,6 @@ def test_one_old_wall_closes_no_loop_and_four_that_agree_do() -> None:
     match = np.zeros(1, np.int64)
     nearest_neighbour(x, p, 5, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(1), np.zeros((2, 5)))
     assert match[0] == 0  # the only one within the gate, 8 cm from where it is expected: 28 cm wrong
-    assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == 1
     arguments = (marks, 1000, SIGMA, GATES, 0.2, 0.6, 4000)
     assert agreeing(x, p, OFFSET, z, *arguments, match) == 0
     assert match.tolist() == [IGNORED]
@@ -126,11 +130,15 @@ def test_a_lone_neighbour_does_not_pull_a_returning_robot_away() -> None:
     before = float(np.hypot(*backend.pose[:2]))
     assert before > 0.15
     assert backend.pose_nees(np.zeros(3)) < 8
-    # The sixth post, which is not in the map, half a metre beside the fourth and expected nearer to it.
-    alone = observe_landmarks(np.zeros(3), posts[5:], OFFSET, noise, rng)
+    fresh = np.array([[6.0, 5.0], [7.0, -5.0], [-3.0, 3.0]])  # seen here for the first time; they hold the pose
     for _ in range(5):
-        backend.observe(Observations(alone.range_bearing, alone.cov))
+        seen = observe_landmarks(np.zeros(3), fresh, OFFSET, noise, rng)
+        backend.observe(Observations(seen.range_bearing, seen.cov))
+    # The sixth post, which is not in the map, half a metre beside the fourth and expected nearer to it.
+    for _ in range(5):
+        seen = observe_landmarks(np.zeros(3), np.vstack([fresh, posts[5:]]), OFFSET, noise, rng)
+        backend.observe(Observations(seen.range_bearing, seen.cov))
     assert backend.pose_nees(np.zeros(3)) < 8
-    together = observe_landmarks(np.zeros(3), posts, OFFSET, noise, rng)
-    backend.observe(Observations(together.range_bearing, together.cov))
+    seen = observe_landmarks(np.zeros(3), np.vstack([fresh, posts]), OFFSET, noise, rng)
+    backend.observe(Observations(seen.range_bearing, seen.cov))
     assert float(np.hypot(*backend.pose[:2])) < 0.02
