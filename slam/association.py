@@ -142,6 +142,18 @@ def _beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _too_near(x: Array, i: int, offset: float, z: Array, mark: Array, near: float, dx: float, dy: float) -> bool:
+    """Tell whether what is seen lies too near to landmark ``i``, of a point ``dx`` and ``dy`` away, to be new.
+
+    How near that is [m] has nothing to do with how well the robot knows where it is: the longer the way from the
+    start, the more of the walls beside others would be taken for neither known nor new, and be of no use at all.
+    """
+    if z[5] == LINE:
+        return _beside(x, i, offset, z, mark, near)
+    return bool(dx * dx + dy * dy < near * near)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
     max_turn: float, only_sure: bool, match: NDArray[np.int64], distance: Array, h: Array,
@@ -155,7 +167,7 @@ def nearest_neighbour(
         of a LINE distance and bearing of its foot, and in columns 8 and 9 from where to where it was seen [m].
     marks : Array
         ``(n, ≥ 2)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
-        from where to where it goes [m].
+        from where to where it goes [m], and in column 5 when it was seen last.
     gate : float
         Largest squared Mahalanobis distance (chi-square with two degrees of freedom).
     near : float
@@ -163,7 +175,8 @@ def nearest_neighbour(
     max_turn : float
         Largest difference in direction [rad]. Kind 0 matches any kind and direction.
     only_sure : bool
-        Take no match where more than one landmark is within the gate (individual gating).
+        Take no match where more than one landmark is within the gate (individual gating), unless they are pieces
+        of wall on which the observed one lies: then the one seen last.
     match, distance : NDArray
         ``(m,)`` filled: landmark index, UNMATCHED or IGNORED; squared Mahalanobis distance.
     """
@@ -176,7 +189,7 @@ def nearest_neighbour(
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
-        candidates = 0
+        candidates, surface = 0, -1
         for i in range(landmarks):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if z[k, 5] != LINE and (abs(dx) > window or abs(dy) > window):
@@ -186,19 +199,21 @@ def nearest_neighbour(
             if z[k, 5] == LINE:
                 if not _beside(x, i, offset, z[k], marks[i], window):
                     continue
-                dx = dy = 0.0  # as near as that, it is no new wall
-            if z[k, 5] == LINE:
                 rho, phi = line_blocks(x, i, offset, h)
             else:
                 rho, phi = _point_blocks(x, i, offset, c, s, h)
             d2 = _distance(p, i, rho, phi, z[k], h)
             candidates += d2 < gate
+            if d2 < gate and z[k, 5] == LINE and _beside(x, i, offset, z[k], marks[i], near):
+                surface = i if surface < 0 or marks[i, 5] > marks[surface, 5] else surface
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2
-            elif match[k] == UNMATCHED and dx * dx + dy * dy < near * near:
+            elif match[k] == UNMATCHED and _too_near(x, i, offset, z[k], marks[i], near, dx, dy):
                 match[k] = IGNORED
         if only_sure and candidates > 1:
-            match[k] = IGNORED
+            # One straight surface that lies on two pieces of wall makes them one wall: either will do, best the
+            # one seen last. To leave it out would be to go blind in a corridor that shows nothing else.
+            match[k] = surface if surface >= 0 else IGNORED
     # Two observations cannot be one point: the farther gives way. Of a wall any number of pieces may be seen.
     for k in range(z.shape[0]):
         for j in range(k):
@@ -271,7 +286,7 @@ def joint_compatibility(
             if z[k, 5] != LINE and np.any(landmark[:pairs] == i):
                 continue
             landmark[pairs] = i
-            _extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
+            extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
             more = nis[pairs] + y[2 * pairs] ** 2 + y[2 * pairs + 1] ** 2
             if more > gates[pairs + 1]:
                 continue
@@ -311,7 +326,7 @@ def _compatible(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _extend(
+def extend(
     x: Array, p: Array, offset: float, z: Array, landmark: NDArray[np.int64], pairs: int, h: Array, factor: Array,
     y: Array,
 ) -> None:  # fmt: skip
@@ -367,10 +382,5 @@ def _set_aside(
         for i in range(landmarks):
             if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
-            dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
-            if z[k, 5] == LINE:
-                too_near = _beside(x, i, offset, z[k], marks[i], near)
-            else:
-                too_near = dx * dx + dy * dy < near * near
-            if too_near:
+            if _too_near(x, i, offset, z[k], marks[i], near, x[3 + 2 * i] - px, x[4 + 2 * i] - py):
                 match[k] = IGNORED

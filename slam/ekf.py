@@ -19,6 +19,7 @@ from slam.chi_square import chi2_quantile
 from slam.joint_gaussian import add_landmark, near_landmarks, read_block, symmetric_block
 from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
 from slam.lanes import aligned_zeros
+from slam.loop_closing import agreeing, put_off
 from slam.metrics import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
@@ -48,6 +49,7 @@ class EkfConfig(BackendConfig):
     gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
     max_turn_deg: float = 35.0  # difference in a corner's direction
+    loop_sigma_m: float = math.inf  # old landmarks expected no better than to this count only together
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
@@ -67,6 +69,7 @@ class EkfLinesConfig(EkfConfig):
     # another bends the map. Over apartments of the training seeds 100-149 at three times the noise, the average
     # pose NEES/3 was 1.15 with the nearest and 1.00 so; at nominal noise the error was the same.
     association: str = "individual"
+    loop_sigma_m: float = 0.1  # parallel walls stand apart by a few times that
 
 
 class EkfSlam(Backend):
@@ -118,9 +121,12 @@ class EkfSlam(Backend):
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self._observed(scan)
         match = self._associate(z)
+        loop = self._put_off(z, match)
         if self._out_of_sight(match):
             match = self._allow_for_spinning_wheels(z, match, scan)
         self._correct(z, match)
+        if loop:
+            self._close_loop(z, match)
         if self.nis_dof >= 2 * _FEWEST_BACK:
             self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
@@ -147,7 +153,10 @@ class EkfSlam(Backend):
             part = z[begin : begin + _MAX_OBSERVATIONS]
             if observations.ids is None:
                 match = self._associate(part)
+                loop = self._put_off(part, match)
                 self._correct(part, match)
+                if loop:
+                    self._close_loop(part, match)
                 self._manage(part, match, None)
                 continue
             ids = np.asarray(observations.ids)[begin : begin + _MAX_OBSERVATIONS]
@@ -182,6 +191,32 @@ class EkfSlam(Backend):
             config.landmarks.new_distance_m, self._max_turn, _MOST_NODES, match,
         )  # fmt: skip
         return match
+
+    def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
+        """Leave out old landmarks that one match alone does not make sure; tell whether there are any."""
+        sigma, book = self.config.loop_sigma_m, self._book
+        if sigma == math.inf:
+            return False
+        x, p, offset = self._x, self._p, self.config.lidar_offset_m
+        return put_off(x, p, offset, z, book.marks, book.now, sigma, match) > 0
+
+    def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
+        """Match and correct by old landmarks, after all the others, where several of them agree."""
+        config, book = self.config, self._book
+        rows = np.flatnonzero(match < 0)
+        more = np.empty(len(rows), np.int64)
+        old = agreeing(
+            self._x, self._p, config.lidar_offset_m, z[rows], book.marks, book.now, config.loop_sigma_m,
+            _JOINT_GATES, config.landmarks.new_distance_m, self._max_turn, _MOST_NODES, more,
+        )  # fmt: skip
+        if old == 0:
+            return
+        nis, dof = self.nis, self.nis_dof
+        closing = np.full(len(match), UNMATCHED)
+        closing[rows] = more
+        self._correct(z, closing)
+        self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
+        match[closing >= 0] = closing[closing >= 0]
 
     def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
         """Tell whether many of the landmarks that the last scans showed are missing all at once."""
