@@ -153,6 +153,10 @@ def _too_near(x: Array, i: int, offset: float, z: Array, mark: Array, near: floa
     return bool(dx * dx + dy * dy < near * near)
 
 
+_LIES_ON = -3  # less the wall's index: an observation that lies on more than one piece of wall
+_FEWEST_SURE = 2  # matches without which a scan takes those, too
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
@@ -176,7 +180,7 @@ def nearest_neighbour(
         Largest difference in direction [rad]. Kind 0 matches any kind and direction.
     only_sure : bool
         Take no match where more than one landmark is within the gate (individual gating), unless they are pieces
-        of wall on which the observed one lies: then the one seen last.
+        of wall on which the observed one lies, and little else is seen: then the one seen last.
     match, distance : NDArray
         ``(m,)`` filled: landmark index, UNMATCHED or IGNORED; squared Mahalanobis distance.
     """
@@ -211,9 +215,13 @@ def nearest_neighbour(
             elif match[k] == UNMATCHED and _too_near(x, i, offset, z[k], marks[i], near, dx, dy):
                 match[k] = IGNORED
         if only_sure and candidates > 1:
-            # One straight surface that lies on two pieces of wall makes them one wall: either will do, best the
-            # one seen last. To leave it out would be to go blind in a corridor that shows nothing else.
-            match[k] = surface if surface >= 0 else IGNORED
+            match[k] = _LIES_ON - surface if surface >= 0 else IGNORED
+    # One straight surface that lies on two pieces of wall is most likely of both. It is left out nevertheless,
+    # unless the scan shows next to nothing else, as in a corridor: that would be going blind.
+    blind = np.sum(match[: z.shape[0]] >= 0) < _FEWEST_SURE
+    for k in range(z.shape[0]):
+        if match[k] <= _LIES_ON:
+            match[k] = _LIES_ON - match[k] if blind else IGNORED
     # Two observations cannot be one point: the farther gives way. Of a wall any number of pieces may be seen.
     for k in range(z.shape[0]):
         for j in range(k):
