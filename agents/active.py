@@ -74,7 +74,7 @@ class ActiveConfig(ExplorerConfig):
     look: LookConfig = field(default_factory=LookConfig)
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
     worth_s_per_m: float = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
-    area_s: float = 1.0  # time that ln(1 + expected new area / 1 m²) is worth
+    area_s: float = 4.0  # time that ln(1 + expected new area / 1 m²) is worth
     switch_s: float = 1.5  # another frontier must be better by this …
     switch_share: float = 0.15  # … and by this share of the way to the present one
     most: int = 5  # candidates that are thought through: the cheapest to reach
