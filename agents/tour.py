@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.gain import expected_area
-from agents.routing import best_tour
+from agents.routing import best_tour, draw_luck
 from agents.stations import in_sight, join, ways
 from agents.travel import between
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -111,8 +111,10 @@ class Tour(Explorer):
         sight = self._sight(found, places, near)
         sight[1 + np.arange(len(owner)), first] = True
         if found.current is not None:
-            self._hold(distance, sight[:, near == found.current].any(axis=1))
-        order, _ = best_tour(sight, distance, self._weights(found, places), self.config.tries, 0)
+            self._hold(distance, np.asarray(sight[:, near == found.current].any(axis=1)))
+        order, _ = best_tour(
+            sight, distance, self._weights(found, places), draw_luck(self.config.tries, len(places))
+        )
         return int(owner[order[1] - 1])
 
     def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> NDArray[np.bool_]:
@@ -160,7 +162,7 @@ class Tour(Explorer):
         distance = np.array([ways(cells, joined, int(i))[0][places] for i in places]) * cost_map.resolution
         seen = sight[places]
         seen[0] = False
-        order, _ = best_tour(seen, distance, np.zeros(len(places)), self.config.tries, 0)
+        order, _ = best_tour(seen, distance, np.zeros(len(places)), draw_luck(self.config.tries, len(places)))
         first = order[1]
         away = np.hypot(*(targets - cells[places[first]]).T)
         away[~seen[first]] = np.inf

@@ -175,8 +175,8 @@ class _Run:
             self._goal, self._tried = point, set()
         cells = self.lattice.cells
         start = np.asarray(self._dungeon.start)
-        row, col = (math.floor(v / CELL_M) for v in point[::-1])
-        target = np.clip(start + (row, col), 0, np.array(self.known.shape) - 1)
+        ahead = np.floor(point[::-1] / CELL_M).astype(np.int64)
+        target = np.clip(start + ahead, 0, np.array(self.known.shape) - 1)
         away = np.hypot(*(cells - target).T) * CELL_M
         for i in np.argsort(away, kind="stable"):
             if not line_is_free(self.known, int(target[0]), int(target[1]), int(cells[i, 0]), int(cells[i, 1])):

@@ -1,8 +1,8 @@
 """The dungeons protocol: path length of exploration on generated indoor maps, beside the published table.
 
 ``python -m training.dungeons --maps DIR --agents nearest-frontier,tour --out DIR`` runs what is missing in
-``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and prints
-the table. What an episode is stands in :mod:`training.dungeon_episode`.
+``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and
+prints the table. What an episode is stands in :mod:`training.dungeon_episode`.
 """
 
 from __future__ import annotations
@@ -218,9 +218,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = run_dungeons(
-            options.maps, names, out=options.out, workers=options.workers, scan=options.scan
-        )
+        summary = run_dungeons(options.maps, names, out=options.out, workers=options.workers, scan=options.scan)
     except (BadInput, Interrupted) as error:
         print(f"training.dungeons: {error}", file=sys.stderr)
         return 2 if isinstance(error, BadInput) else 130
