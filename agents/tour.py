@@ -54,7 +54,7 @@ class TourConfig(ExplorerConfig):
     places: int = 25  # nearest view points that the tour is over; those farther away can wait
     tries: int = 6  # choices of view points that the best tour is taken from
     hold_m: float = 1.0  # a tour that starts elsewhere must be shorter by this [weighted m] to turn round for
-    hurry: float = 0.5  # 0: the shortest tour; above: what shows much new area is reached early
+    hurry: float = 2.0  # 0: the shortest tour; above: what shows much new area is reached early
     depth_m: float = 3.0  # how far behind a frontier new area is expected
 
     def __post_init__(self) -> None:

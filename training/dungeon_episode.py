@@ -90,8 +90,10 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         if not run.worth.any():
             end = "covered"
             break
+        belief = run.belief()
+        agent.looked(belief)
         asked = time.perf_counter()
-        goal = agent.choose(run.belief())
+        goal = agent.choose(belief)
         decisions.append(1e3 * (time.perf_counter() - asked))
         if goal is None:
             end = agent.status if agent.status != "covered" else "nothing left"
