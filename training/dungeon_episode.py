@@ -122,7 +122,7 @@ class _Run:
 
     def __init__(self, dungeon: Dungeon, *, continuous: bool) -> None:
         self._dungeon, self._continuous = dungeon, continuous
-        self.known = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
+        self.known: NDArray[np.int8] = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
         self._visited = np.zeros(dungeon.free.shape, dtype=np.bool_)
         self._cell = dungeon.start
         self._heading = 0.0
