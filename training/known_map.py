@@ -22,7 +22,7 @@ __all__ = ["known_map_path"]
 _SQUARE = 4  # cells: all of a square is taken for seen where its middle is
 
 
-def known_map_path(dungeon: Dungeon, *, tries: int = 20) -> float:
+def known_map_path(dungeon: Dungeon, *, tries: int = 5) -> float:
     """Return the length [m] of a tour that sees the whole map from its start, 0 where one look is enough.
 
     Parameters

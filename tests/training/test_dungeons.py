@@ -216,6 +216,8 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     assert run_dungeons(maps, ["nearest-frontier", "tour"], out=out)["agents"].keys() == summary["agents"].keys()
     assert ran == [(json.loads(rows[3])["agent"], json.loads(rows[3])["map"])]
     assert "published: DARE" in table(summary) and "`tour`" in table(summary)
+    bound = run_dungeons(maps, ["known-map", "nearest-frontier"], out=out)["agents"]["known-map"]
+    assert bound["path_m_mean"] <= summary["agents"]["nearest-frontier"]["path_m_mean"] and bound["ratio"] <= 1.0
     # The same folder for another protocol is refused.
     assert main([*arguments, "--scan", "continuous"]) == 2
     assert "scan" in capsys.readouterr().err
