@@ -178,7 +178,7 @@ class Stubborn(Agent):
 
 def test_an_agent_that_gets_nowhere_is_stuck(monkeypatch):
     monkeypatch.setattr(dungeon_episode, "make_agent", lambda name: Stubborn())
-    row = explore(corridor(55.6), "stubborn")
+    row = explore(corridor(95.6), "stubborn")
     assert row["end"] == "stuck" and 0 < row["hops"] < 20
 
 
