@@ -155,6 +155,7 @@ class Tour(Explorer):
         lengths, _ = ways(cells, joined, here)
         reached = np.isfinite(lengths) & np.isfinite(found.travel.cost[tuple(cells.T)])
         reached[here] = False
+        reached &= ~self._looked_from(cost_map, cells)
         useful = np.flatnonzero(reached & sight.any(axis=1))
         if not len(useful):
             return found
@@ -171,6 +172,13 @@ class Tour(Explorer):
         views[self._index] = cells[places[first]]
         costs[self._index] = found.travel.cost[tuple(views[self._index])]
         return replace(found, cells=views, costs=costs)
+
+    def _looked_from(self, cost_map: CostMap, cells: Cells) -> NDArray[np.bool_]:
+        """Return from which stations ``(n,)`` the sensor looked already: what is left was not seen from there."""
+        looked = np.zeros(cost_map.classes.shape, dtype=np.bool_)
+        if self._track:
+            looked[tuple(cost_map.to_cells(np.array(self._track)[:, :2]).T)] = True
+        return np.asarray(looked[tuple(cells.T)])
 
 
 def _stations(cost_map: CostMap, config: StationsConfig) -> tuple[Cells, Cells, int]:
