@@ -94,6 +94,12 @@ class Agent(ABC):
         self._frontiers = np.zeros((0, 2))
         self._status = "idle"
 
+    def looked(self, belief: Belief) -> None:  # noqa: B027 (most agents need not know)
+        """Take note that the sensor looked from the belief's pose, where it is driven by :meth:`choose` alone.
+
+        :meth:`act` takes note by itself.
+        """
+
     @abstractmethod
     def choose(self, belief: Belief) -> Goal | None:
         """Return where to go next, or ``None`` when nothing is left to explore."""

@@ -121,7 +121,6 @@ class Explorer(Agent):
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
-        self._keep_watch(belief)
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
         if not np.isfinite(candidates.costs).any():
@@ -190,6 +189,10 @@ class Explorer(Agent):
             range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, dense),
             half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
         )
+
+    def looked(self, belief: Belief) -> None:
+        """Take note that the sensor looked from the belief's pose."""
+        self._keep_watch(belief)
 
     def _keep_watch(self, belief: Belief) -> None:
         """Remember from where the sensor has looked, every little way and turn."""

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["best_tour", "cover", "improve", "nearest_order", "order_cost"]
+__all__ = ["best_tour", "cover", "draw_luck", "improve", "nearest_order", "order_cost"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -134,10 +134,15 @@ def cover(sight: Sight, rank: Array, luck: Array) -> Indices:
     return chosen[:count].copy()
 
 
+def draw_luck(tries: int, places: int, seed: int = 0) -> Array:
+    """Return ``(tries, places)``: ones for the greedy cover, then some that put places at a disadvantage."""
+    luck = np.random.default_rng(seed).uniform(0.4, 1.0, (tries, places))
+    luck[0] = 1.0
+    return luck
+
+
 @njit(cache=True, nogil=True)
-def best_tour(
-    sight: Sight, distance: Array, weight: Array, tries: int, seed: int
-) -> tuple[Indices, float]:
+def best_tour(sight: Sight, distance: Array, weight: Array, luck: Array) -> tuple[Indices, float]:
     """Return places in the order of the best tour found from place 0, and what it costs.
 
     Parameters
@@ -146,21 +151,13 @@ def best_tour(
         ``(n, m)`` what each place sees of the pieces; row 0 is the robot's place.
     distance, weight
         As in :func:`order_cost`.
-    tries
-        Covers tried: the greedy one, and some with places at a random disadvantage.
-    seed
-        Of the covers.
+    luck
+        ``(tries, n)`` from :func:`draw_luck`: the covers that are tried.
     """
-    np.random.seed(seed)
-    n = len(sight)
     best, lowest = np.zeros(1, dtype=np.int64), np.inf
-    for t in range(tries):
-        luck = np.ones(n)
-        if t > 0:
-            for i in range(n):
-                luck[i] = np.random.uniform(0.4, 1.0)
+    for t in range(len(luck)):
         places = np.zeros(1, dtype=np.int64)
-        places = np.concatenate((places, cover(sight, distance[0], luck)))
+        places = np.concatenate((places, cover(sight, distance[0], luck[t])))
         for rounds in range(4):
             own, own_weight = _among(distance, weight, places)
             order = nearest_order(own) if rounds == 0 else np.arange(len(places))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.gain import expected_area
-from agents.routing import best_tour
+from agents.routing import best_tour, draw_luck
 from agents.stations import in_sight, join, ways
 from agents.travel import between
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -54,7 +54,7 @@ class TourConfig(ExplorerConfig):
     places: int = 25  # nearest view points that the tour is over; those farther away can wait
     tries: int = 6  # choices of view points that the best tour is taken from
     hold_m: float = 1.0  # a tour that starts elsewhere must be shorter by this [weighted m] to turn round for
-    hurry: float = 0.5  # 0: the shortest tour; above: what shows much new area is reached early
+    hurry: float = 2.0  # 0: the shortest tour; above: what shows much new area is reached early
     depth_m: float = 3.0  # how far behind a frontier new area is expected
 
     def __post_init__(self) -> None:
@@ -111,8 +111,10 @@ class Tour(Explorer):
         sight = self._sight(found, places, near)
         sight[1 + np.arange(len(owner)), first] = True
         if found.current is not None:
-            self._hold(distance, sight[:, near == found.current].any(axis=1))
-        order, _ = best_tour(sight, distance, self._weights(found, places), self.config.tries, 0)
+            self._hold(distance, np.asarray(sight[:, near == found.current].any(axis=1)))
+        order, _ = best_tour(
+            sight, distance, self._weights(found, places), draw_luck(self.config.tries, len(places))
+        )
         return int(owner[order[1] - 1])
 
     def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> NDArray[np.bool_]:
@@ -153,6 +155,7 @@ class Tour(Explorer):
         lengths, _ = ways(cells, joined, here)
         reached = np.isfinite(lengths) & np.isfinite(found.travel.cost[tuple(cells.T)])
         reached[here] = False
+        reached &= ~self._looked_from(cost_map, cells)
         useful = np.flatnonzero(reached & sight.any(axis=1))
         if not len(useful):
             return found
@@ -160,7 +163,7 @@ class Tour(Explorer):
         distance = np.array([ways(cells, joined, int(i))[0][places] for i in places]) * cost_map.resolution
         seen = sight[places]
         seen[0] = False
-        order, _ = best_tour(seen, distance, np.zeros(len(places)), self.config.tries, 0)
+        order, _ = best_tour(seen, distance, np.zeros(len(places)), draw_luck(self.config.tries, len(places)))
         first = order[1]
         away = np.hypot(*(targets - cells[places[first]]).T)
         away[~seen[first]] = np.inf
@@ -169,6 +172,13 @@ class Tour(Explorer):
         views[self._index] = cells[places[first]]
         costs[self._index] = found.travel.cost[tuple(views[self._index])]
         return replace(found, cells=views, costs=costs)
+
+    def _looked_from(self, cost_map: CostMap, cells: Cells) -> NDArray[np.bool_]:
+        """Return from which stations ``(n,)`` the sensor looked already: what is left was not seen from there."""
+        looked = np.zeros(cost_map.classes.shape, dtype=np.bool_)
+        if self._track:
+            looked[tuple(cost_map.to_cells(np.array(self._track)[:, :2]).T)] = True
+        return np.asarray(looked[tuple(cells.T)])
 
 
 def _stations(cost_map: CostMap, config: StationsConfig) -> tuple[Cells, Cells, int]:

@@ -32,7 +32,7 @@ SCANS = ("way-points", "continuous")
 """Where the sensor is read: only where a hop ends, or in every cell on the way, too."""
 
 _MOST_HOPS = 1000
-_TRIES = 6  # way-points from which one goal is looked at before the agent counts as stuck
+_TRIES = 12  # nearest way-points from which a goal is looked at before the agent counts as stuck
 _AROUND_M = 8.0  # a way-point that does not see the goal counts as so much farther from it
 
 # A body that passes where one cell is free, and is as wide as a gap worth looking into: two cells.
@@ -90,8 +90,10 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         if not run.worth.any():
             end = "covered"
             break
+        belief = run.belief()
+        agent.looked(belief)
         asked = time.perf_counter()
-        goal = agent.choose(run.belief())
+        goal = agent.choose(belief)
         decisions.append(1e3 * (time.perf_counter() - asked))
         if goal is None:
             end = agent.status if agent.status != "covered" else "nothing left"
@@ -120,12 +122,10 @@ class _Run:
 
     def __init__(self, dungeon: Dungeon, *, continuous: bool) -> None:
         self._dungeon, self._continuous = dungeon, continuous
-        self.known = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
+        self.known: NDArray[np.int8] = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
         self._visited = np.zeros(dungeon.free.shape, dtype=np.bool_)
         self._cell = dungeon.start
         self._heading = 0.0
-        self._goal: Array | None = None
-        self._tried: set[int] = set()  # lattice cells from which the present goal was looked at, flat
         self.path_m, self.hops, self.unseen = 0.0, 0, int(dungeon.free.sum())
         self.path_to_250_m: float | None = None
         self._scan()
@@ -166,29 +166,22 @@ class _Run:
         return np.array([cell[1] - start[1] + 0.5, cell[0] - start[0] + 0.5]) * CELL_M
 
     def station_for(self, goal: Goal) -> int:
-        """Return the way-point that comes nearest to serving a goal, or −1 when all that could were tried.
+        """Return the way-point that comes nearest to serving a goal, or −1 when all that could were looked from.
 
-        Who still wants to go where it stands has not seen from there what it is after: then the next nearest.
+        A second look from one place shows nothing new: who still wants to go there has not seen from it what it
+        is after, and is given the next nearest.
         """
-        point = np.asarray(goal.pose[:2], dtype=np.float64)
-        if self._goal is None or float(np.hypot(*(point - self._goal))) > 1.5 * CELL_M:
-            self._goal, self._tried = point, set()
         cells = self.lattice.cells
-        start = np.asarray(self._dungeon.start)
-        row, col = (math.floor(v / CELL_M) for v in point[::-1])
-        target = np.clip(start + (row, col), 0, np.array(self.known.shape) - 1)
+        ahead = np.floor(np.asarray(goal.pose[1::-1], dtype=np.float64) / CELL_M).astype(np.int64)
+        target = np.clip(np.asarray(self._dungeon.start) + ahead, 0, np.array(self.known.shape) - 1)
         away = np.hypot(*(cells - target).T) * CELL_M
-        for i in np.argsort(away, kind="stable"):
+        for i in range(len(cells)):
             if not line_is_free(self.known, int(target[0]), int(target[1]), int(cells[i, 0]), int(cells[i, 1])):
                 away[i] += _AROUND_M
         away[~np.isfinite(self._length)] = math.inf
-        for i in np.argsort(away, kind="stable")[: _TRIES + 1]:
-            flat = int(cells[i, 0]) * self.known.shape[1] + int(cells[i, 1])
-            if i == self._here:
-                self._tried.add(flat)
-            elif flat not in self._tried and len(self._tried) < _TRIES and math.isfinite(away[i]):
-                return int(i)
-        return -1
+        nearest = np.argsort(away, kind="stable")[:_TRIES]
+        left = nearest[np.isfinite(away[nearest]) & ~self._visited[tuple(cells[nearest].T)]]
+        return int(left[0]) if len(left) else -1
 
     def hop_towards(self, station: int) -> None:
         """Make the first hop of the way to a way-point, and scan there."""

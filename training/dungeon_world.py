@@ -98,12 +98,13 @@ class Lattice:
         ``(n, 2)`` row, column of the way-points that are known to be free.
     points : NDArray[np.int64]
         ``(m, 2)`` row, column of the frontier's pieces.
+    joined : NDArray[np.int64]
+        ``(n, 25)`` the way-points that a hop may go to from each, −1 where there is none.
     sees : NDArray[np.int64]
         ``(n,)`` how many pieces are in sight of each way-point.
     """
 
     def __init__(self, known: NDArray[np.int8], start: tuple[int, int]) -> None:
-        rows, cols = known.shape
         self._known = known
         self._first = start[0] % STRIDE, start[1] % STRIDE
         picked = known[self._first[0] :: STRIDE, self._first[1] :: STRIDE] == FREE
@@ -111,7 +112,7 @@ class Lattice:
         self.cells: NDArray[np.int64] = own * STRIDE + np.array(self._first)
         self._index = np.full(picked.shape, -1, dtype=np.int64)
         self._index[tuple(own.T)] = np.arange(len(own))
-        self._joined = join(known, self.cells, own, self._index, HOP)
+        self.joined = join(known, self.cells, own, self._index, HOP)
         self.points = frontier_points(known)
         self.sees = count_in_sight(known, self.cells, self.points, _SEEN_FROM)
 
@@ -127,7 +128,7 @@ class Lattice:
 
         Of ways of one length, the one with more way-points: it looks more often.
         """
-        length, before = ways(self.cells, self._joined, start)
+        length, before = ways(self.cells, self.joined, start)
         return length * CELL_M, before
 
     def worth_a_visit(self, reachable: NDArray[np.bool_], visited: NDArray[np.bool_]) -> NDArray[np.bool_]:

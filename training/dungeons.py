@@ -1,8 +1,8 @@
 """The dungeons protocol: path length of exploration on generated indoor maps, beside the published table.
 
 ``python -m training.dungeons --maps DIR --agents nearest-frontier,tour --out DIR`` runs what is missing in
-``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and prints
-the table. What an episode is stands in :mod:`training.dungeon_episode`.
+``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and
+prints the table. What an episode is stands in :mod:`training.dungeon_episode`.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.campaign import check_settings, installed_version, run_all, write_settings
 from training.dungeon_episode import SCANS, explore
-from training.dungeon_world import load
+from training.dungeon_world import Dungeon, load
 from training.errors import BadInput, Interrupted
+from training.dungeon_bound import known_map_path
 
 __all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
 
@@ -46,6 +47,9 @@ PUBLISHED: dict[str, tuple[float, float]] = {
     "known map": (499.0, 61.0),
 }
 """Path length [m], mean and standard deviation, on that benchmark's 100 test maps (DARE, ICRA 2025)."""
+
+KNOWN_MAP = "known-map"
+"""Stands among the agents' names for the bound: a planner that knows the true map."""
 
 _STORE, _CSV, _SUMMARY = "rows.jsonl", "rows.csv", "summary.json"
 _COLUMNS = (
@@ -72,9 +76,10 @@ def run_dungeons(
     BadInput
         In one line: which option, file or name is wrong, and what to do.
     """
+    valid = (*agents.names(), KNOWN_MAP)
     for name in agent_names:
-        if name not in agents.names():
-            raise BadInput(str(unknown_name("agent", name, agents.names())))
+        if name not in valid:
+            raise BadInput(str(unknown_name("agent", name, valid)))
     if scan not in SCANS:
         raise BadInput(str(unknown_name("--scan", scan, SCANS)))
     if workers < 1:
@@ -121,7 +126,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Row]:
             "path_m_std": statistics.stdev(paths) if len(paths) > 1 else 0.0,
             "coverage_mean": statistics.fmean(row["coverage"] for row in own.values()),
             "coverage_least": min(row["coverage"] for row in own.values()),
-            "hops_mean": statistics.fmean(row["hops"] for row in own.values()),
+            "hops_mean": _mean([row["hops"] for row in own.values()]),
             "path_to_250_m_mean": _mean([row["path_to_250_m"] for row in own.values()]),
             "decision_ms_median": statistics.median(decisions) if decisions else None,
         }
@@ -181,7 +186,20 @@ def _maps(folder: Path) -> list[Path]:
 
 
 def _run(job: _Job) -> Row:
-    return explore(load(job.path), job.agent, scan=job.scan) | {"digest": job.digest}
+    dungeon = load(job.path)
+    row = _bound(dungeon) if job.agent == KNOWN_MAP else explore(dungeon, job.agent, scan=job.scan)
+    return row | {"digest": job.digest}
+
+
+def _bound(dungeon: Dungeon) -> Row:
+    return dict.fromkeys(_COLUMNS) | {
+        "agent": KNOWN_MAP,
+        "map": dungeon.name,
+        "path_m": known_map_path(dungeon),
+        "coverage": 1.0,
+        "unseen_cells": 0,
+        "end": "covered",
+    }
 
 
 def _read(store: Path) -> list[Row]:
@@ -208,7 +226,9 @@ def main(argv: list[str] | None = None) -> int:
     """Run the module's command line; return its exit code."""
     parser = argparse.ArgumentParser(prog="python -m training.dungeons", description=__doc__)
     parser.add_argument("--maps", type=Path, required=True, help="folder of PNG maps")
-    parser.add_argument("--agents", default="nearest-frontier,tour", help="names, separated by commas")
+    parser.add_argument(
+        "--agents", default="nearest-frontier,tour", help="names, separated by commas; known-map is the bound"
+    )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scan", default="way-points", help=" or ".join(SCANS))
@@ -218,9 +238,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = run_dungeons(
-            options.maps, names, out=options.out, workers=options.workers, scan=options.scan
-        )
+        summary = run_dungeons(options.maps, names, out=options.out, workers=options.workers, scan=options.scan)
     except (BadInput, Interrupted) as error:
         print(f"training.dungeons: {error}", file=sys.stderr)
         return 2 if isinstance(error, BadInput) else 130

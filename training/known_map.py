@@ -21,7 +21,7 @@ from agents.base import Goal
 from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer
 from agents.planning import shortest_path, travel_costs
-from agents.routing import best_tour
+from agents.routing import best_tour, draw_luck
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.types import Belief
@@ -139,7 +139,8 @@ class KnownMap(Explorer):
     def _tours(self, seen: NDArray[np.bool_], distance: Array, cells: Array) -> list[Cells]:
         """Return tours to choose from: short ones, greedy ones."""
         share = seen @ cells / cells.sum()
-        tours = [best_tour(seen, distance, soon * share, _TRIES, 0)[0] for soon in _SOON]
+        luck = draw_luck(_TRIES, len(seen))
+        tours = [best_tour(seen, distance, soon * share, luck)[0] for soon in _SOON]
         return tours + [_greedy(seen, distance, cells, offset) for offset in _OFFSETS_M]
 
     def _way(self, order: Cells, seen: NDArray[np.bool_], distance: Array, cells: Array) -> float:

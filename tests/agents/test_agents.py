@@ -41,7 +41,7 @@ def ready(name: str, belief: Belief, seed: int = 0, **kwargs) -> Agent:
 
 
 def test_registry():
-    assert set(NAMES) >= {"random", "nearest-frontier", "explore-and-return"}
+    assert set(NAMES) >= {"random", "nearest-frontier", "explore-and-return", "tour"}
     with pytest.raises(ValueError, match="nearest-frontier"):
         agents.make("nearest-frontierr")
     with pytest.raises(ValueError, match="switch_m"):
