@@ -25,10 +25,10 @@ import agents
 from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.campaign import check_settings, installed_version, run_all, write_settings
+from training.dungeon_bound import known_map_path
 from training.dungeon_episode import SCANS, explore
 from training.dungeon_world import Dungeon, load
 from training.errors import BadInput, Interrupted
-from training.dungeon_bound import known_map_path
 
 __all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
 

@@ -14,11 +14,11 @@ from agents.base import Agent, Goal
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.slam.logs_on_disk import data_folder
 from training import dungeon_episode
+from training.dungeon_bound import known_map_path
 from training.dungeon_episode import explore, make_agent
 from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, load, scan
 from training.dungeons import main, run_dungeons, summarise, table
 from training.errors import BadInput
-from training.dungeon_bound import known_map_path
 
 WALL, OPEN, START = 127, 195, 208
 
