@@ -19,8 +19,9 @@ from agents.base import Agent, Goal
 from agents.control import ControlConfig, PathFollower
 from agents.cost_map import CostMap, PlannerConfig
 from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask
+from agents.gain import expected_area
 from agents.planning import TravelCosts, shortest_path, travel_costs
-from agents.sight import Watch, view_points
+from agents.sight import ViewPoints, Watch, view_points
 from agents.troubles import Troubles
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
@@ -169,9 +170,11 @@ class Explorer(Agent):
         costs = views.costs.copy()
         # The farther the way, the more there must be to see.
         worth = frontiers.extents[frontiers.target_labels] >= self._frontier_config.wanted_extent(costs) - 1e-9
-        costs[~worth] = np.inf
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
         given_up = failures >= config.patience.attempts
+        if not (worth & np.isfinite(costs) & ~given_up & (looks < config.patience.looks)).any():
+            worth |= self._may_open(cost_map, views)
+        costs[~worth] = np.inf
         left = worth & (looks < config.patience.looks)
         self._ending = "stuck" if (left & given_up).any() else "unreachable" if left.any() else "covered"
         costs[(looks >= config.patience.looks) | given_up] = np.inf
@@ -180,6 +183,14 @@ class Explorer(Agent):
         if np.isfinite(costs[~avoided]).any():
             costs[avoided] = np.inf
         return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
+
+    def _may_open(self, cost_map: CostMap, views: ViewPoints) -> NDArray[np.bool_]:
+        """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""
+        config = self.config.frontiers
+        cells = np.where(np.isfinite(views.costs)[:, None], views.cells, -1)
+        depth = 0.5 * config.view_range_m
+        area = expected_area(cost_map, cells, range_m=config.view_range_m + depth, depth_m=depth)
+        return np.asarray(area >= config.opening_m2)
 
     def _watch_kept(self) -> Watch:
         # Beams fall no farther apart than a cell of the planning grid.

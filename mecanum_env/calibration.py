@@ -12,9 +12,9 @@ from slam.motion import OdometryNoise
 __all__ = ["backend_settings", "odometry_noise"]
 
 # A wheel's radius error stays for the whole episode, while the filter takes the odometry's error for white. Over
-# the half second or so that it takes the landmarks to correct a drift, six steps' errors add up instead of
+# the most of a second that it takes the landmarks to correct a drift, eight steps' errors add up instead of
 # averaging.
-_PERSISTENCE = 6.0
+_PERSISTENCE = 8.0
 
 # What is left of the wheels' creep when its mean is taken out (mecanum_env.sensors.creep), and some more: a robot
 # that stands must not become certain of where it is.

@@ -24,7 +24,7 @@ __all__ = ["Calibration", "Drives", "calibrate", "drift_ratios", "drive", "fit",
 
 Array = NDArray[np.float64]
 
-WINDOW_S = 0.6
+WINDOW_S = 0.8
 """Over which drift is measured: about as long as it takes the landmarks to correct the pose."""
 
 _SIDE_M = 16.0  # of the floor

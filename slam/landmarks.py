@@ -172,7 +172,7 @@ class LandmarkBook:
             self._new = np.zeros(len(z), np.int64)
         count, self._tentative_count = _review(
             x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count, self._limits,
-            self._new,
+            False, self._new,
         )  # fmt: skip
         return self._new[:count]
 
@@ -245,9 +245,12 @@ def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int,
 @njit(cache=True, nogil=True, error_model="numpy")
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
-    n: int, limits: Array, new: NDArray[np.int64],
+    n: int, limits: Array, at_once: bool, new: NDArray[np.int64],
 ) -> tuple[int, int]:  # fmt: skip
-    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are."""
+    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are.
+
+    With ``at_once``, what is seen where features meet is a landmark at its first sighting.
+    """
     gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
     forget_after = limits[4]
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -304,7 +307,7 @@ def _review(
         t[_AGE] = 0.0
         moved = (x[0] - t[_FROM_X]) ** 2 + (x[1] - t[_FROM_Y]) ** 2
         settled = t[_COUNT] >= edge_confirm_after and moved >= baseline * baseline
-        if settled or (z[k, EDGE] == 0.0 and t[_COUNT] >= confirm_after):
+        if settled or (z[k, EDGE] == 0.0 and (at_once or t[_COUNT] >= confirm_after)):
             new[found] = k
             found += 1
             t[_AGE] = np.inf
@@ -367,5 +370,8 @@ def _review_scan(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
     increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, new: NDArray[np.int64],
 ) -> tuple[int, int, bool]:  # fmt: skip
-    found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, new)
+    # The first scan is taken at the start, whose pose is known. Landmarks that had to wait for two more would be
+    # placed from where the wheels alone have the robot by then, and pass that on to all that is mapped later:
+    # over apartments with slippery floors it was four fifths of the whole.
+    found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, now == 1, new)
     return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)
