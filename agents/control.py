@@ -235,7 +235,7 @@ class PathFollower:
 
     def _within_wheel_limits(self, twist: Array) -> Array:
         demand = abs(twist[0]) + abs(twist[1]) + self._robot.lever_m * abs(twist[2])
-        return twist * min(1.0, self._robot.max_speed_m_s / demand) if demand > 0 else twist
+        return twist * (self._robot.max_speed_m_s / demand) if demand > self._robot.max_speed_m_s else twist
 
     def _safe(self, twist: Array, pose: Array, near: LocalMap, hits: Array) -> Array:
         """Return the first of the twist and its tamer kin whose braking distance is clear; zero if none."""

@@ -21,7 +21,7 @@ from agents.cost_map import CostMap, PlannerConfig
 from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask
 from agents.gain import expected_area
 from agents.planning import TravelCosts, shortest_path, travel_costs
-from agents.sight import ViewPoints, Watch, view_points
+from agents.sight import Watch, view_points
 from agents.troubles import Troubles
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
@@ -173,7 +173,7 @@ class Explorer(Agent):
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
         given_up = failures >= config.patience.attempts
         if not (worth & np.isfinite(costs) & ~given_up & (looks < config.patience.looks)).any():
-            worth |= self._may_open(cost_map, views)
+            worth |= self._may_open(cost_map, frontiers)
         costs[~worth] = np.inf
         left = worth & (looks < config.patience.looks)
         self._ending = "stuck" if (left & given_up).any() else "unreachable" if left.any() else "covered"
@@ -184,13 +184,11 @@ class Explorer(Agent):
             costs[avoided] = np.inf
         return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
 
-    def _may_open(self, cost_map: CostMap, views: ViewPoints) -> NDArray[np.bool_]:
+    def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> NDArray[np.bool_]:
         """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""
         config = self.config.frontiers
-        cells = np.where(np.isfinite(views.costs)[:, None], views.cells, -1)
-        depth = 0.5 * config.view_range_m
-        area = expected_area(cost_map, cells, range_m=config.view_range_m + depth, depth_m=depth)
-        return np.asarray(area >= config.opening_m2)
+        cells = cost_map.to_cells(frontiers.targets)
+        return expected_area(cost_map, cells, range_m=0.5 * config.view_range_m) >= config.opening_m2
 
     def _watch_kept(self) -> Watch:
         # Beams fall no farther apart than a cell of the planning grid.

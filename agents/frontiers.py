@@ -26,7 +26,7 @@ class FrontierConfig:
     min_extent_m: float = 0.4  # longer side of a cluster's bounding box; at most the body's width
     far_extent_m: float = 0.7  # the same at a travel cost of far_m and beyond; at most twice the body's width
     far_m: float = 6.0  # [weighted m]; up to there in proportion
-    opening_m2: float = 1.5  # expected to be seen through one that is smaller, for it to be gone to at last
+    opening_m2: float = 2.0  # unknown in view from one that is smaller, for it to be gone to at last
     min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
     min_unknown_width_m: float = 0.3  # thinner ones are the insides of walls
     min_clearance_m: float = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings

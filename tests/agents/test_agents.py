@@ -207,6 +207,21 @@ def test_enclosed_robot_stays():
     assert ready("nearest-frontier", belief).choose(belief_of(classes, (4.0, 4.0, 0.0))) is not None
 
 
+@pytest.mark.parametrize(("depth_m", "chosen"), [(4.0, True), (0.3, False)])
+def test_a_narrow_opening_far_away_is_gone_to_at_last(depth_m, chosen):
+    """0.7 m wide, less the walls' nearness, and 9 m away: too far for a niche, but there may be a room behind."""
+    classes = room(16.0, 4.0)
+    fill(classes, 11.0, 0.0, 16.0, 4.0)
+    fill(classes, 11.0, 1.65, 11.1, 2.35, FREE)
+    low, high = (0.5, 3.5) if depth_m > 1.0 else (1.65, 2.35)
+    fill(classes, 11.1, low, 11.1 + depth_m, high, UNKNOWN)
+    belief = belief_of(classes, (1.5, 2.0, 0.0))
+    agent = ready("nearest-frontier", belief)
+    goal = agent.choose(belief)
+    assert (goal is not None) == chosen
+    assert chosen or agent.status == "covered"
+
+
 def test_a_frontier_that_never_yields_is_let_be():
     """The map stands still whatever is looked at: the agent looks, from nearer, and ends."""
     classes = room(5.0, 4.0)

@@ -100,7 +100,7 @@ def test_the_command_prints_measured_beside_declared(capsys: pytest.CaptureFixtu
     assert main(["--noise", "nominal", "--episodes", "3", "--steps", "40", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["nominal"]
     assert {"white", "lasting", "lasting_without_gain", "declared", "gain", "bins", "steps"} <= result.keys()
-    assert result["declared"]["speed_share"] == pytest.approx(0.0087, abs=1e-4)
+    assert result["declared"]["speed_share"] == pytest.approx(0.0096, abs=1e-4)
     assert main(["--noise", "nominall"]) == 2
     assert "did you mean 'nominal'?" in capsys.readouterr().err
     assert main(["--episodes", "0"]) == 2

@@ -24,6 +24,16 @@ def test_a_meeting_of_two_surfaces_is_confirmed_after_three_sightings() -> None:
         assert book.review(POSE, 0.0, corner(2, 1, edge=False)[None], np.array([UNMATCHED])).tolist() == expected
 
 
+def test_what_the_first_scan_shows_is_a_landmark_at_once() -> None:
+    """The start pose is known, and only then: what had to wait would be placed from where the wheels say it is."""
+    book = LandmarkBook(LandmarkPolicy(confirm_after=3))
+    scan = Scan(np.full(360, 5.0), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=20.0)
+    rows = np.array([corner(2, 1, edge=False), corner(1, -2, edge=True), corner(-3, 1, edge=False)])
+    assert book.review_scan(POSE, 0.0, rows, np.full(3, UNMATCHED), scan)[0] == [0, 2]  # a visible end has to wait
+    later = corner(-2, -2, edge=False)[None]
+    assert book.review_scan(POSE, 0.0, later, np.array([UNMATCHED]), scan)[0] == []
+
+
 def test_the_end_of_a_surface_is_confirmed_after_three_sightings_from_two_places() -> None:
     book = LandmarkBook(LandmarkPolicy(edge_confirm_after=3, edge_baseline_m=0.2))
     new = np.array([UNMATCHED])

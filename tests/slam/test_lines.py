@@ -81,6 +81,21 @@ def test_adding_a_line_propagates_pose_and_noise(seed: int, landmarks: int) -> N
     np.testing.assert_allclose(np.triu(upper), np.triu(want), atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["ekf", "ekf-lines", "invariant-ekf"])
+def test_a_robot_that_drives_off_at_once_has_its_map_from_the_start_pose(name: str) -> None:
+    """The wheels claim a turn that is none, before a landmark could be seen three times."""
+    backend = slam.make(name, config={"odometry": {"turn_floor_rad_s": 0.5}, "lidar_offset_m": 0.0})
+    start = np.array([2.5, 2.0, 0.3])
+    rng = np.random.default_rng(4)
+    backend.reset(pose=start, seed=0)
+    backend.update(room_scan(start, rng))
+    for _ in range(8):
+        backend.predict(slam.Odometry(twist=(0.0, 0.0, 0.4), dt=0.1))
+        backend.update(room_scan(start, rng))
+    assert abs(float(wrap(backend.belief.pose[2] - start[2]))) < 0.01
+    np.testing.assert_allclose(backend.belief.pose[:2], start[:2], atol=0.02)
+
+
 def test_a_wall_s_covariance_is_the_noise_s() -> None:
     """Distance and bearing of the four walls over 400 noisy scans from one place, normalised."""
     rng = np.random.default_rng(1)
