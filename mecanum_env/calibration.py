@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
-from slam.motion import OdometryNoise
+from slam.motion import LastingErrors, OdometryNoise
+from slam.settings import to_mapping
 
 __all__ = ["backend_settings", "odometry_noise"]
 
@@ -33,29 +34,29 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     per_wheel = math.sqrt((white + lasting) / 4.0)
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
     base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
+    white_share = math.sqrt(white / 4.0)
     return OdometryNoise(
         lever_m=robot.lever_m,
         speed_floor_m_s=_FLOOR_M_S,
         turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
         speed_share=per_wheel,
         turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
+        lasting=LastingErrors(
+            radius_sigma=noise.radius_error / math.sqrt(3.0),
+            lever_sigma=noise.base_error / math.sqrt(3.0),
+            speed_share=white_share,
+            turn_share_rad_m=white_share / robot.lever_m,
+        ),
     )
 
 
 def backend_settings(config: EnvConfig) -> dict[str, Any]:
     """Return a backend's settings as the environment's parts imply them, ``slam_config`` laid over them."""
-    noise = odometry_noise(config.robot, config.noise)
     settings: dict[str, Any] = {
         "lidar_offset_m": config.lidar.offset_m,
         "body_radius_m": 0.5 * (config.robot.inscribed_radius_m + config.robot.circumscribed_radius_m),
         "grid_resolution_m": config.grid_resolution_m,
-        "odometry": {
-            "lever_m": noise.lever_m,
-            "speed_floor_m_s": noise.speed_floor_m_s,
-            "turn_floor_rad_s": noise.turn_floor_rad_s,
-            "speed_share": noise.speed_share,
-            "turn_share_rad_m": noise.turn_share_rad_m,
-        },
+        "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
         "features": {"range_sigma_m": config.noise.range_sigma_m},
     }
     return _overlay(settings, config.slam_config)

@@ -24,8 +24,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.ekf import EkfConfig, EkfSlam
-from slam.joint_gaussian import read_block, symmetric_block
-from slam.landmarks import KIND
+from slam.joint_gaussian import landmark_by_pose, read_block, symmetric_block
 from slam.lanes import aligned_zeros
 from slam.settings import require
 from slam.stacked_update import solve
@@ -130,20 +129,7 @@ class CompressedEkfSlam(EkfSlam):
         n = self._n
         if n + 2 > len(self._phi):
             self._phi = np.vstack([self._phi, np.zeros_like(self._phi)])
-        # G_r of the new landmark (slam.joint_gaussian.add_landmark) times Φ's three robot rows.
-        x, y, theta = self._x[:3].tolist()
-        offset, phi = self.config.lidar_offset_m, self._phi
-        away_x = offset * math.cos(theta) + (0.0 if z[KIND] == LINE else z[0] * math.cos(theta + z[1]))
-        away_y = offset * math.sin(theta) + (0.0 if z[KIND] == LINE else z[0] * math.sin(theta + z[1]))
-        if z[KIND] == LINE:
-            nx, ny = math.cos(theta + z[1]), math.sin(theta + z[1])
-            lever = nx * (y + away_y) - ny * (x + away_x)
-            turn = lever + ny * away_x - nx * away_y
-            phi[n] = phi[2]
-            phi[n + 1] = nx * phi[0] + ny * phi[1] + turn * phi[2]
-        else:
-            phi[n] = phi[0] - away_y * phi[2]
-            phi[n + 1] = phi[1] + away_x * phi[2]
+        self._phi[n : n + 2] = landmark_by_pose(self._x, z, self.config.lidar_offset_m) @ self._phi[:3]
         super()._add(z, known_id)
         if not self._free:
             self._free.append(len(self._near) + len(self._far))  # every place before it is taken

@@ -81,6 +81,7 @@ class EkfSlam(Backend):
         super().__init__(config or EkfConfig())
         c = self.config
         self._max_turn = math.radians(c.max_turn_deg)
+        self._noise = c.odometry
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
 
@@ -108,7 +109,7 @@ class EkfSlam(Backend):
         measured, dt = odometry
         vx, vy, omega = np.asarray(measured, dtype=np.float64).tolist()
         twist = vx, vy, omega
-        noise = self.config.odometry
+        noise = self._noise
         var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
         predict_robot(self._x, self._p, self._n, vx, vy, omega, dt, var_v, var_w)
         self._twist = twist

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from slam.ekf import EkfSlam
 from slam.geometry import wrap_scalar
+from slam.joint_gaussian import landmark_by_pose
 from slam.metrics import nees_pose_invariant
-from slam.stacked_update import whiten
+from slam.stacked_update import SPARE_ROWS, whiten
 from slam.tiles import add_combination, downdate
-from slam.types import LINE
+from slam.types import LINE, Odometry, Scan
+from slam.wheel_errors import WheelErrors
 
 __all__ = ["InvariantEkfSlam"]
 
@@ -29,21 +31,64 @@ _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since wall
 
 
 class InvariantEkfSlam(EkfSlam):
-    """The right-invariant EKF-SLAM backend, ``invariant-ekf``."""
+    """The right-invariant EKF-SLAM backend, ``invariant-ekf``.
 
-    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
-        self.nis_dof, self.nis = invariant_update(
-            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._book.marks, self._h, self._w,
-            self._s, self._delta,
-        )  # fmt: skip
+    Where the odometry's noise says what of it lasts, the wheels' errors are states, too (slam.wheel_errors).
+    """
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
+        noise = self.config.odometry
+        self._noise = noise.white()
+        self._wheels: WheelErrors | None = None
+        if noise.lasting is not None:
+            self._wheels = WheelErrors(noise.lasting, noise.lever_m, len(self._match), len(self._x))
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured, less what they are known to be off by."""
+        wheels = self._wheels
+        if wheels is None:
+            super().predict(odometry)
+            return
+        twist, before = wheels.corrected(np.asarray(odometry.twist, dtype=np.float64)), self._x[:3].copy()
+        super().predict(Odometry(twist, odometry.dt))
+        wheels.predict(self._p, self._n, before, self._x, float(twist[2]), odometry.dt)
+
+    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
+        n, w = self._n, self._w
+        rows, self.nis = invariant_update(
+            self._x, self._p, n, z, match, self.config.lidar_offset_m, self._book.marks, self._h, w, self._s,
+            self._delta,
+        )  # fmt: skip
+        self.nis_dof = rows
+        if self._wheels is not None and rows:
+            self._wheels.correct(n, match, self._h, w, self._s, rows)
+            self._wheels.reset(n, w[rows : rows + SPARE_ROWS : 2])
+
+    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
+        kept = None if self._wheels is None else self._wheels.copy()
+        value = super()._fit(z, match, scan)
+        if self._wheels is not None and kept is not None:  # this correction is only a trial
+            self._wheels.restore(kept)
+        return value
+
+    def _add(self, z: Array, known_id: int | None) -> None:
+        n = self._n
+        super()._add(z, known_id)
+        if self._wheels is not None:
+            self._wheels.add(n, landmark_by_pose(self._x, z, self.config.lidar_offset_m))
+
+    def _drop(self, row: int) -> None:
+        if self._wheels is not None:
+            self._wheels.drop(self._n, 3 + 2 * row)
+        super()._drop(row)
 
     def _enlarge(self) -> None:
         super()._enlarge()
         self._delta = np.zeros(len(self._x))
+        if self._wheels is not None:
+            self._wheels.enlarge(len(self._x))
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""

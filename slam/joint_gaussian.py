@@ -18,6 +18,7 @@ from slam.types import LINE
 __all__ = [
     "OBSERVED_LIMIT",
     "add_landmark",
+    "landmark_by_pose",
     "near_landmarks",
     "read_block",
     "symmetric_block",
@@ -79,6 +80,19 @@ def _add_line(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
         nx * p[0, n + 1] + ny * p[1, n + 1] + turn * p[2, n + 1]
         + z[2] + 2.0 * lever * z[3] + lever * lever * z[4]
     )  # fmt: skip
+
+
+def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:
+    """Return Gr ``(2, 3)``, the Jacobian by the pose of the landmark that :func:`add_landmark` appends."""
+    x, y, theta = pose[:3].tolist()
+    is_line = z[5] == LINE
+    away_x = offset * math.cos(theta) + (0.0 if is_line else z[0] * math.cos(theta + z[1]))
+    away_y = offset * math.sin(theta) + (0.0 if is_line else z[0] * math.sin(theta + z[1]))
+    if not is_line:
+        return np.array([[1.0, 0.0, -away_y], [0.0, 1.0, away_x]])
+    nx, ny = math.cos(theta + z[1]), math.sin(theta + z[1])
+    turn = nx * (y + away_y) - ny * (x + away_x) + ny * away_x - nx * away_y
+    return np.array([[0.0, 0.0, 1.0], [nx, ny, turn]])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

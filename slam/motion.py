@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -12,9 +12,24 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.settings import require
 
-__all__ = ["OdometryNoise", "jacobians", "move", "predict_robot", "twist_between"]
+__all__ = ["LastingErrors", "OdometryNoise", "jacobians", "move", "predict_robot", "twist_between"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class LastingErrors:
+    """How far off a wheel's radius and the lever may be, and the noise that is left of V when they are known."""
+
+    radius_sigma: float = 0.0  # relative
+    lever_sigma: float = 0.0  # relative
+    speed_share: float = 0.0  # as OdometryNoise has them, of the white part alone
+    turn_share_rad_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("radius_sigma", "lever_sigma", "speed_share", "turn_share_rad_m"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"LastingErrors.{name} must be ≥ 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,6 +49,7 @@ class OdometryNoise:
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: float = 0.6  # of the change beyond that
+    lasting: LastingErrors | None = None  # what of it a filter may take for states: see slam.wheel_errors
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
@@ -53,6 +69,13 @@ class OdometryNoise:
             (self.speed_floor_m_s + self.speed_share * speed) ** 2 + lost**2,
             (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2 + (lost / self.lever_m) ** 2,
         )
+
+    def white(self) -> OdometryNoise:
+        """Return V of a filter that has the lasting errors as states."""
+        if self.lasting is None:
+            return self
+        share, turn = self.lasting.speed_share, self.lasting.turn_share_rad_m
+        return replace(self, speed_share=share, turn_share_rad_m=turn, lasting=None)
 
     def slip(self, before: tuple[float, float, float], now: tuple[float, float, float], dt: float) -> float:
         """Return by how much [m/s] the wheels' speed changed beyond what the floor passes on in ``dt`` [s]."""

@@ -1,0 +1,190 @@
+"""The wheels' lasting errors as states: against one dense filter of everything, and whether they are found."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import slam
+from mecanum_env.config import RobotConfig
+from mecanum_env.robot import forward_matrix
+from slam import Observations, Odometry
+from slam.geometry import wrap
+from slam.motion import LastingErrors, OdometryNoise, jacobians, move
+from slam.wheel_errors import WheelErrors
+from tests.slam.numerics import numerical_jacobian
+from tests.slam.test_invariant import coordinates
+
+ROBOT = RobotConfig()
+NOISE = OdometryNoise(
+    lever_m=ROBOT.lever_m,
+    lasting=LastingErrors(radius_sigma=0.02, lever_sigma=0.03, speed_share=0.005, turn_share_rad_m=0.01),
+)
+OFFSET = 0.2
+R = np.diag([0.02**2, 0.01**2])
+
+
+def backend(noise: OdometryNoise = NOISE) -> slam.Backend:
+    return slam.make("invariant-ekf", config={"odometry": noise, "lidar_offset_m": OFFSET})
+
+
+def drives(rng: np.random.Generator, steps: int) -> np.ndarray:
+    """Twists ``(steps, 3)`` that change every second, in all directions."""
+    some = rng.uniform((-0.5, -0.5, -1.0), (0.5, 0.5, 1.0), (steps // 10 + 1, 3))
+    return np.repeat(some, 10, axis=0)[:steps]
+
+
+def rolled(twist: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The twist of a robot whose wheels claim ``twist``, radii and lever being off by ``errors`` ``(5,)``."""
+    forward = forward_matrix(ROBOT)  # (3, 4)
+    true = forward @ (np.linalg.pinv(forward) @ twist * (1.0 + errors[:4]))
+    true[2] += errors[4] * twist[2]
+    return true
+
+
+def seen(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Range and bearing of points, from the sensor."""
+    d = points - pose[:2] - OFFSET * np.array([math.cos(pose[2]), math.sin(pose[2])])
+    return np.column_stack([np.hypot(*d.T), wrap(np.arctan2(d[:, 1], d[:, 0]) - pose[2])])
+
+
+def test_twist_by_errors_is_that_of_the_wheels() -> None:
+    wheels = WheelErrors(LastingErrors(radius_sigma=0.01, lever_sigma=0.01), ROBOT.lever_m, 4, 8)
+    twist = np.array([0.4, -0.2, 0.7])
+    base = wheels.corrected(twist)
+    np.testing.assert_allclose(base, twist)
+    columns = []
+    for k in range(5):
+        wheels.mean[:] = np.eye(5)[k]
+        columns.append(wheels.corrected(twist) - twist)
+    # Which wheel is which does not matter: each combination of directions is on one.
+    want = [rolled(twist, e) - twist for e in np.eye(5)]
+    found = np.array(sorted(np.round(columns[:4], 12).tolist()))
+    np.testing.assert_allclose(found, np.array(sorted(np.round(want[:4], 12).tolist())), atol=1e-9)
+    np.testing.assert_allclose(columns[4], want[4], atol=1e-12)
+
+
+def test_equals_one_dense_filter_of_everything() -> None:
+    """State: pose, landmarks, errors. Jacobians by differences, the reset as invariant-ekf.md has it."""
+    rng = np.random.default_rng(4)
+    points = np.array([[2.0, 1.0], [-1.5, 2.0], [0.5, -2.5], [3.0, -1.0]])
+    filter_ = backend()
+    filter_.reset((0.3, -0.2, 0.4), pose_cov=np.diag([0.01, 0.02, 0.005]))
+    assert filter_._wheels is not None
+    x, e = np.array([0.3, -0.2, 0.4]), np.zeros(5)
+    p = np.zeros((8, 8))  # pose, errors, then landmarks
+    p[:3, :3] = np.diag([0.01, 0.02, 0.005])
+    p[3:, 3:] = filter_._wheels.cov
+    white = NOISE.white()
+    truth = x + np.array([0.05, -0.05, 0.03])
+    wheels = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8)
+
+    def claimed(twist: np.ndarray, errors: np.ndarray) -> np.ndarray:
+        wheels.mean[:] = errors
+        return wheels.corrected(twist)
+
+    known, last = np.zeros((0, 2)), (0.0, 0.0, 0.0)
+    for twist in drives(rng, 30):
+        truth = move(truth, claimed(twist, np.array([0.02, -0.01, 0.03, 0.0, -0.02])), 0.1)
+        filter_.predict(Odometry(twist, 0.1))
+        u = claimed(twist, e)
+        v, w = white.variances(*u, slip=white.slip(last, tuple(u), 0.1))
+        last = tuple(u)
+        fx, fu = jacobians(x, u, 0.1)
+        f = np.eye(len(p))
+        f[:3, :3], f[:3, 3:8] = (
+            fx,
+            numerical_jacobian(lambda a, x=x, twist=twist: move(x, claimed(twist, a), 0.1), e),
+        )
+        x = move(x, u, 0.1)
+        p = f @ p @ f.T
+        p[:3, :3] += fu @ np.diag([v, v, w]) @ fu.T
+        z = seen(truth, points) + rng.normal(0, [0.02, 0.01], (4, 2))
+        filter_.observe(Observations(z, np.tile(R, (4, 1, 1)), np.arange(4)))
+        if len(known) == 0:
+            for row in z:  # appended as the filter appends them, one by one
+
+                def placed(pose: np.ndarray, row: np.ndarray = row) -> np.ndarray:
+                    c, s = math.cos(pose[2]), math.sin(pose[2])
+                    b = pose[2] + row[1]
+                    return pose[:2] + OFFSET * np.array([c, s]) + row[0] * np.array([math.cos(b), math.sin(b)])
+
+                g = np.hstack([numerical_jacobian(placed, x), np.zeros((2, len(p) - 3))])
+                b = x[2] + row[1]
+                gz = np.array([[math.cos(b), -row[0] * math.sin(b)], [math.sin(b), row[0] * math.cos(b)]])
+                p = np.block([[p, p @ g.T], [g @ p, g @ p @ g.T + gz @ R @ gz.T]])
+                known = np.vstack([known, placed(x)])
+            continue
+        state = np.concatenate([x, e, known.ravel()])
+        h = numerical_jacobian(lambda a: seen(a[:3], a[8:].reshape(-1, 2)).ravel(), state)
+        s = h @ p @ h.T + np.kron(np.eye(4), R)
+        nu = (z - seen(x, known)).ravel()
+        nu[1::2] = wrap(nu[1::2])
+        gain = np.linalg.solve(s, h @ p).T
+        delta, p = gain @ nu, p - gain @ s @ gain.T
+        map_x = np.concatenate([x, known.ravel()])
+        map_delta = np.delete(delta, np.s_[3:8])
+        t = coordinates(map_x)
+        xi = np.linalg.solve(t, map_delta)  # the invariant error; then along the exponential
+        turned, after = float(xi[2]), map_x.copy()
+        c, sn = math.cos(turned), math.sin(turned)
+        rotation = np.array([[c, -sn], [sn, c]])
+        v_of = np.array([[sn, -(1 - c)], [1 - c, sn]]) / turned
+        for i in (0, *range(3, len(map_x), 2)):
+            after[i : i + 2] = rotation @ map_x[i : i + 2] + v_of @ xi[i : i + 2]
+        after[2] = wrap(map_x[2] + turned)
+        reset = np.eye(len(p))
+        rows = np.r_[0:3, 8 : len(p)]
+        reset[np.ix_(rows, rows)] = coordinates(after) @ np.linalg.inv(t)
+        p = reset @ p @ reset.T
+        x, known, e = after[:3], after[3:].reshape(-1, 2), e + delta[3:8]
+    np.testing.assert_allclose(filter_.pose, x, atol=1e-8)
+    np.testing.assert_allclose(filter_._wheels.mean, e, atol=1e-8)
+    np.testing.assert_allclose(filter_._wheels.cov, p[3:8, 3:8], atol=1e-9)
+    rows = np.r_[0:3, 8 : len(p)]
+    np.testing.assert_allclose(filter_.joint_cov, p[np.ix_(rows, rows)], atol=1e-8)
+    np.testing.assert_allclose(filter_._wheels.cross[:, : len(rows)], p[3:8][:, rows], atol=1e-8)
+    assert np.sqrt(np.diag(p)[3:8]).max() < 0.02  # and something was learnt
+
+
+def test_errors_are_found_and_their_covariance_is_right() -> None:
+    nees, learnt = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        errors = rng.normal(0, [0.02] * 4 + [0.03])
+        points = rng.uniform(-6, 6, (12, 2))
+        filter_ = backend()
+        filter_.reset((0.0, 0.0, 0.0))
+        assert filter_._wheels is not None
+        wheels = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8)
+        wheels.mean[:] = errors
+        truth, white = np.zeros(3), NOISE.white()
+        for twist in drives(rng, 300):
+            true = wheels.corrected(twist)
+            v, w = white.variances(*true)
+            truth = move(truth, true + rng.normal(0, np.sqrt([v, v, w])), 0.1)
+            filter_.predict(Odometry(twist, 0.1))
+            z = seen(truth, points) + rng.normal(0, [0.02, 0.01], (12, 2))
+            filter_.observe(Observations(z, np.tile(R, (12, 1, 1)), np.arange(12)))
+        off = filter_._wheels.mean - errors
+        nees.append(off @ np.linalg.solve(filter_._wheels.cov, off) / 5)
+        learnt.append(np.sqrt(np.diag(filter_._wheels.cov)))
+    assert np.mean(learnt, axis=0).max() < 0.006
+    assert np.mean(nees) == pytest.approx(1.0, abs=4 * math.sqrt(2 / 5 / 40))
+
+
+def test_landmarks_that_go_take_their_correlations_along() -> None:
+    wheels = WheelErrors(LastingErrors(radius_sigma=0.01), 0.4, 4, 16)
+    wheels.cross[:] = np.arange(wheels.cross.shape[1])
+    wheels.drop(11, 5)
+    np.testing.assert_array_equal(wheels.cross[0, :9], [0, 1, 2, 3, 4, 7, 8, 9, 10])
+    wheels.enlarge(40)
+    np.testing.assert_array_equal(wheels.cross[0, :9], [0, 1, 2, 3, 4, 7, 8, 9, 10])
+
+
+def test_without_lasting_errors_nothing_changes() -> None:
+    plain = slam.make("invariant-ekf")
+    plain.reset((0.0, 0.0, 0.0))
+    assert plain._wheels is None
