@@ -81,9 +81,9 @@ def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, i
     """Look at each row only outside the columns that are in the box already."""
     rows, cols = log_odds.shape
     row0, row1 = 0, rows
-    while row0 < rows and not (log_odds[row0].any() or visited[row0].any()):
+    while row0 < rows and _is_blank(log_odds[row0], visited[row0]):
         row0 += 1
-    while row1 > row0 and not (log_odds[row1 - 1].any() or visited[row1 - 1].any()):
+    while row1 > row0 and _is_blank(log_odds[row1 - 1], visited[row1 - 1]):
         row1 -= 1
     col0, col1 = cols, 0
     for row in range(row0, row1):
@@ -96,6 +96,14 @@ def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, i
                 col1 = col + 1
                 break
     return row0, col0, row1, col1
+
+
+@njit(cache=True, nogil=True)
+def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
+    found = np.uint8(0)
+    for col in range(log_odds.shape[0]):  # to the end: then it is many at a time
+        found |= np.uint8(log_odds[col]) | visited[col]
+    return found == 0
 
 
 @njit(cache=True, nogil=True)
