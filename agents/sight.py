@@ -52,6 +52,8 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
     seen = np.zeros(len(cells), dtype=np.bool_)
     poses = np.asarray(watch.poses, dtype=np.float64).reshape(-1, 3).copy()
     poses[:, :2] = (poses[:, :2] - np.asarray(cost_map.origin)) / cost_map.resolution
+    # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
+    poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
     reach = watch.range_m / cost_map.resolution
     _mark_seen(cost_map.classes, cells, normals, poses, reach, watch.half_view_rad, seen)
     return seen
@@ -87,7 +89,11 @@ def _mark_seen(
         x, y = cells[i, 1] + 0.5, cells[i, 0] + 0.5
         nx, ny = normals[i, 0], normals[i, 1]
         flat = nx == 0.0 and ny == 0.0
-        for k in range(poses.shape[0] - 1, -1, -1):  # the latest are the likeliest
+        # A cell to spare: what rounding puts just within reach below is not left out here.
+        first = np.searchsorted(poses[:, 0], x - reach - 1.0)
+        for k in range(first, poses.shape[0]):
+            if poses[k, 0] > x + reach + 1.0:
+                break
             dx, dy = x - poses[k, 0], y - poses[k, 1]
             square = dx * dx + dy * dy
             # distance ≤ reach · cos(incidence), times distance
