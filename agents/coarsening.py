@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -54,7 +53,7 @@ def coarsen(
     factor: int,
     pads: tuple[int, int],
 ) -> Blocks:
-    """Return blocks of ``factor`` × ``factor`` cells of a grid, its corner ``pads`` (row, column) into the first."""
+    """Return blocks of ``factor`` × ``factor`` cells; the grid's corner lies ``pads`` (row, column) into the first."""
     rows = -(-(log_odds.shape[0] + pads[0]) // factor) + 2
     cols = -(-(log_odds.shape[1] + pads[1]) // factor) + 2
     classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
@@ -68,7 +67,7 @@ def coarsen(
 
 
 def _to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
-    """Return each cell's distance to the nearest occupied cell's centre, in cells, infinite where there is none."""
+    """Return each cell's distance to the nearest occupied cell's centre, in cells, infinite without any."""
     free_of_wall = cv2.LUT(log_odds.view(np.uint8), _NO_WALL)
     if cv2.countNonZero(free_of_wall) == free_of_wall.size:
         return np.full(log_odds.shape, np.inf, dtype=np.float32)
@@ -178,7 +177,7 @@ def _add(
     totals: NDArray[np.float64],
     counts: NDArray[np.int64],
 ) -> None:
-    """Add to each block its cell in a row that lies ``shift`` cells from the block's beginning, if there is one."""
+    """Add to each block the cell of a row that lies ``shift`` cells from the block's beginning, if any."""
     first, beyond = 1 if shift < 0 else 0, (metres.shape[0] - 1 - shift) // factor + 1
     if factor == 2:  # the usual one: the compiler makes more of a number that it knows
         for block in range(first, beyond):

@@ -132,10 +132,10 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
 
 
 def clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return each cell's 8-connected cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)`` in cells.
+    """Return each cell's 8-connected cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
 
-    Clusters are numbered in the order in which blocks of 2 × 2 cells meet them, row by row: OpenCV's order. The few
-    cells of a frontier are joined in a fraction of the time that OpenCV takes to look all over a large grid.
+    Clusters are numbered in the order in which blocks of 2 × 2 cells meet them, row by row: OpenCV's order. The
+    few cells of a frontier are joined in a fraction of the time that OpenCV takes to look all over a large grid.
     """
     labels = np.empty(len(cells), dtype=np.int64)
     boxes = np.empty((len(cells), 2), dtype=np.int64)

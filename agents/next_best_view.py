@@ -24,7 +24,7 @@ from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.gain import expected_area
 from agents.planning import TravelCosts
-from agents.sight import Watch, in_good_sight
+from agents.sight import first_in_good_sight
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief
@@ -118,16 +118,14 @@ class NextBestView(Explorer):
         if self._goal is not None and len(worth):
             worth[0] *= 1.0 + self._config.switch_share  # the present goal: see _places
         least = self.worth(own.cost_map, own.cells, own.costs, rays=_SAMPLE_RAYS)
+        order = np.argsort(-worth, kind="stable")
+        found = first_in_good_sight(
+            own.cost_map, targets[live], own.frontiers.normals[live], own.cost_map.to_points(places[order]),
+            worth[order], least[live], reach,
+        )  # fmt: skip
+        better, chosen = live[found >= 0], order[found[found >= 0]]
         cells, costs = own.cells.copy(), own.costs.copy()
-        points = own.cost_map.to_points(places)
-        for k in np.argsort(-worth, kind="stable"):
-            live = live[least[live] < worth[k]]  # places that are left make nothing better for the others
-            if not len(live):
-                break
-            watch = Watch(np.array([[*points[k], 0.0]]), reach, math.pi)
-            seen = live[in_good_sight(own.cost_map, targets[live], own.frontiers.normals[live], watch)]
-            cells[seen], costs[seen] = places[k], cost[k]
-            least[seen] = np.inf
+        cells[better], costs[better] = places[chosen], cost[chosen]
         return replace(own, cells=cells, costs=costs)
 
     def _places(self, cost_map: CostMap, travel: TravelCosts, targets: Cells, reach_m: float) -> Cells:

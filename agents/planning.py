@@ -101,9 +101,9 @@ def _dial(
 ) -> None:
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
 
-    Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack again and
-    left in the old one, where it is found to be done. Entries taken off are used again, so that the lists stay as
-    short as the front is long, and in the processor's cache.
+    Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack again
+    and left in the old one, where it is found to be done. Entries taken off are used again, so that the lists stay
+    as short as the front is long, and in the processor's cache.
     """
     cols = weight.shape[1]
     weights, costs, steps = weight.ravel(), cost.ravel(), step.ravel()
@@ -146,7 +146,9 @@ def _dial(
                 total = here + np.float32((diagonal if k & 1 else 0.5) * (own + price))
                 if total >= before or total > max_cost:
                     continue
-                if k & 1 and (weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0):
+                if k & 1 and (
+                    weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0
+                ):
                     continue
                 costs[other] = total
                 steps[other] = k
@@ -169,11 +171,11 @@ def _dial(
 
 @njit(cache=True, nogil=True)
 def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; the last row is the start's.
+    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last those of the start.
 
-    Where a step has come from needs no look: the cell itself, and the two next to it, which are its neighbours, too,
-    and cheaper to reach from there, whatever the weights: a straight edge a–c is cheaper than a–b–c with one of the
-    two diagonal.
+    Where a step has come from needs no look: the cell itself, and the two on either side of it, which are its
+    neighbours, too, and cheaper to reach from there: for all weights, the direct edge costs less than the step and
+    a second one, of which one is straight and the other diagonal.
     """
     ahead = np.zeros((9, 8), dtype=np.int64)
     count = np.zeros(9, dtype=np.int64)
