@@ -53,7 +53,7 @@ def coarsen(
     factor: int,
     pads: tuple[int, int],
 ) -> Blocks:
-    """Return blocks of ``factor`` × ``factor`` cells; the grid's corner lies ``pads`` (row, column) into the first."""
+    """Return blocks of ``factor`` × ``factor`` cells; the corner lies ``pads`` (row, column) into the first."""
     rows = -(-(log_odds.shape[0] + pads[0]) // factor) + 2
     cols = -(-(log_odds.shape[1] + pads[1]) // factor) + 2
     classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
@@ -179,11 +179,14 @@ def _add(
 ) -> None:
     """Add to each block the cell of a row that lies ``shift`` cells from the block's beginning, if any."""
     first, beyond = 1 if shift < 0 else 0, (metres.shape[0] - 1 - shift) // factor + 1
+    start = factor * first + shift
+    # Views that begin where the work does: their indices are seen to be in order, and many are taken at a time.
+    totals, counts, metres, marks = totals[first:beyond], counts[first:beyond], metres[start:], marks[start:]
     if factor == 2:  # the usual one: the compiler makes more of a number that it knows
-        for block in range(first, beyond):
-            totals[block] += metres[2 * block + shift]
-            counts[block] += marks[2 * block + shift]
+        for j in range(totals.shape[0]):
+            totals[j] += metres[2 * j]
+            counts[j] += marks[2 * j]
     else:
-        for block in range(first, beyond):
-            totals[block] += metres[factor * block + shift]
-            counts[block] += marks[factor * block + shift]
+        for j in range(totals.shape[0]):
+            totals[j] += metres[factor * j]
+            counts[j] += marks[factor * j]

@@ -171,7 +171,7 @@ def _dial(
 
 @njit(cache=True, nogil=True)
 def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last those of the start.
+    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last the start's.
 
     Where a step has come from needs no look: the cell itself, and the two on either side of it, which are its
     neighbours, too, and cheaper to reach from there: for all weights, the direct edge costs less than the step and
