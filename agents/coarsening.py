@@ -82,7 +82,7 @@ def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, i
     row0, row1 = 0, rows
     while row0 < rows and _is_blank(log_odds[row0], visited[row0]):
         row0 += 1
-    while row1 > row0 and _is_blank(log_odds[row1 - 1], visited[row1 - 1]):
+    while row1 > 0 and _is_blank(log_odds[row1 - 1], visited[row1 - 1]):
         row1 -= 1
     col0, col1 = cols, 0
     for row in range(row0, row1):
