@@ -71,8 +71,7 @@ def _to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
     free_of_wall = cv2.LUT(log_odds.view(np.uint8), _NO_WALL)
     if cv2.countNonZero(free_of_wall) == free_of_wall.size:
         return np.full(log_odds.shape, np.inf, dtype=np.float32)
-    distance: NDArray[np.float32] = cv2.distanceTransform(free_of_wall, cv2.DIST_L2, cv2.DIST_MASK_5)
-    return distance
+    return np.asarray(cv2.distanceTransform(free_of_wall, cv2.DIST_L2, cv2.DIST_MASK_5), dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)
@@ -102,7 +101,7 @@ def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
     found = np.uint8(0)
     for col in range(log_odds.shape[0]):  # to the end: then it is many at a time
         found |= np.uint8(log_odds[col]) | visited[col]
-    return found == 0
+    return bool(found == 0)
 
 
 @njit(cache=True, nogil=True)
@@ -110,8 +109,8 @@ def _fill(
     log_odds: NDArray[np.int8],
     visited: NDArray[np.uint8],
     distance: NDArray[np.float32],
-    resolution: float,
-    far: float,
+    resolution: np.float32,
+    far: np.float32,
     factor: int,
     row_pad: int,
     col_pad: int,
@@ -151,8 +150,8 @@ def _read(
     log_odds: NDArray[np.int8],
     visited: NDArray[np.uint8],
     distance: NDArray[np.float32],
-    resolution: float,
-    far: float,
+    resolution: np.float32,
+    far: np.float32,
     metres: NDArray[np.float32],
     marks: NDArray[np.int64],
 ) -> None:

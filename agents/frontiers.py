@@ -93,7 +93,8 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     """
     classes, resolution = cost_map.classes, cost_map.resolution
     near = _borders_a_large_pocket(cost_map, config)
-    cells = _bordering(classes, cost_map.clearance, cost_map.suspect, near, np.float32(config.min_clearance_m))
+    least = float(np.float32(config.min_clearance_m))
+    cells = _bordering(classes, cost_map.clearance, cost_map.suspect, near, least)
     normals = _normals(classes, cells)
     if watch is not None:
         seen = in_good_sight(cost_map, cells, normals, watch)
@@ -127,7 +128,7 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
         large = stats[:, cv2.CC_STAT_AREA] * cost_map.resolution**2 >= config.min_unknown_m2
         large[0] = False
         pockets = large[labels].astype(np.uint8)
-    near: NDArray[np.uint8] = cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8))
+    near = np.asarray(cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8)), dtype=np.uint8)
     return near[span:-span, span:-span]
 
 
