@@ -178,22 +178,30 @@ def _weigh(
     robot: RobotConfig,
     sigma_m: float,
 ) -> NDArray[np.float32]:
-    known = (classes != UNKNOWN).view(np.uint8)
-    unknown = cv2.distanceTransform(known, cv2.DIST_L2, cv2.DIST_MASK_3)
     tight = tight_clearance(config, robot, sigma_m)
     comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
-    need_unknown = (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5
+    unknown = _near_unknown(classes, (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5)
     weight = np.zeros(classes.shape, dtype=np.float32)
     _weigh_cells(
         classes,
         wall,
         unknown,
-        np.array([tight, comfortable, comfortable + config.preferred_m, need_unknown]),
+        np.array([tight, comfortable, comfortable + config.preferred_m]),
         config.near_cost,
         config.tight_cost,
         weight,
     )
     return weight
+
+
+def _near_unknown(classes: NDArray[np.int8], reach: float) -> NDArray[np.uint8]:
+    """Return, not 0, the cells nearer than ``reach`` cells to an unknown one."""
+    side = 2 * math.ceil(reach) + 1
+    apart = np.ones((side, side), dtype=np.uint8)
+    apart[side // 2, side // 2] = 0
+    # A disc laid over each unknown cell: cheaper than the distance of every cell, of which none but this is asked.
+    disc = (cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_3) < np.float64(reach)).astype(np.uint8)
+    return np.asarray(cv2.dilate((classes == UNKNOWN).view(np.uint8), disc), dtype=np.uint8)
 
 
 @njit(cache=True, nogil=True)
@@ -210,17 +218,17 @@ def _classify(
 def _weigh_cells(
     classes: NDArray[np.int8],
     wall: NDArray[np.float32],
-    unknown: NDArray[np.float32],
+    unknown: NDArray[np.uint8],
     levels: Array,
     near_cost: float,
     tight_cost: float,
     weight: NDArray[np.float32],
 ) -> None:
-    tight, comfortable, preferred, need_unknown = levels
+    tight, comfortable, preferred = levels
     for row in range(1, classes.shape[0] - 1):
         for col in range(1, classes.shape[1] - 1):
             distance = wall[row, col]
-            if classes[row, col] != FREE or distance < tight or unknown[row, col] < need_unknown:
+            if classes[row, col] != FREE or distance < tight or unknown[row, col] != 0:
                 continue
             if distance >= preferred:
                 weight[row, col] = 1.0
