@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.coarsening import FAR_M, coarsen, known_extent
 from mecanum_env.config import RobotConfig
 from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import require
@@ -25,7 +26,6 @@ __all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "
 Array = NDArray[np.float64]
 
 _ALL = slice(None)
-_FAR_M = 10.0  # clearances beyond this say nothing more
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,13 +98,13 @@ def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> ND
 def clearance(classes: NDArray[np.int8], resolution: float) -> NDArray[np.float32]:
     """Return each cell's distance [m] ``(rows, cols)`` from its centre to the nearest occupied cell's edge."""
     if not (classes == OCCUPIED).any():
-        return np.full(classes.shape, _FAR_M, dtype=np.float32)
+        return np.full(classes.shape, FAR_M, dtype=np.float32)
     walls = (classes != OCCUPIED).view(np.uint8)
     distance: NDArray[np.float32] = cv2.distanceTransform(walls, cv2.DIST_L2, cv2.DIST_MASK_5)
     # Half a cell: from the occupied cell's centre to its edge. In place: these maps may be a million cells.
     distance -= np.float32(0.5)
     distance *= np.float32(resolution)
-    return np.minimum(distance, np.float32(_FAR_M), out=distance)
+    return np.minimum(distance, np.float32(FAR_M), out=distance)
 
 
 def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
@@ -113,34 +113,34 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
     wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
     factor = max(1, round(wanted / fine_resolution))
     resolution = factor * fine_resolution
-    row_slice, col_slice = _extent(belief)
-    fine = belief_classes(belief, row_slice, col_slice)
+    rows, cols = _extent(belief)
     # Blocks lie on the lattice of the frame, not of the grid's present corner.
     corner = [
-        belief.grid.origin[0] + col_slice.start * fine_resolution,
-        belief.grid.origin[1] + row_slice.start * fine_resolution,
+        belief.grid.origin[0] + cols.start * fine_resolution,
+        belief.grid.origin[1] + rows.start * fine_resolution,
     ]
     col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
-    rows = -(-(fine.shape[0] + row_pad) // factor) + 2
-    cols = -(-(fine.shape[1] + col_pad) // factor) + 2
     origin = (
         corner[0] - (col_pad + factor) * fine_resolution,
         corner[1] - (row_pad + factor) * fine_resolution,
     )
-    classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
-    wall = np.full((rows, cols), _FAR_M, dtype=np.float32)
-    suspect = np.zeros((rows, cols), dtype=np.bool_)
-    log_odds = belief.grid.log_odds[row_slice, col_slice]
-    _coarsen(fine, log_odds, clearance(fine, fine_resolution), factor, row_pad, col_pad, classes, wall, suspect)
+    blocks = coarsen(
+        belief.grid.log_odds[rows, cols],
+        belief.grid.visited[rows, cols],
+        resolution=fine_resolution,
+        factor=factor,
+        pads=(row_pad, col_pad),
+    )
+    classes, wall = blocks.classes, blocks.clearance
     x, y = float(belief.pose[0]), float(belief.pose[1])
-    row = min(max(int((y - origin[1]) // resolution), 1), rows - 2)
-    col = min(max(int((x - origin[0]) // resolution), 1), cols - 2)
+    row = min(max(int((y - origin[1]) // resolution), 1), classes.shape[0] - 2)
+    col = min(max(int((x - origin[0]) // resolution), 1), classes.shape[1] - 2)
     weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
     # Wherever the robot stands, it is allowed to stand, and to leave.
     reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
     highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
     _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
-    return CostMap(classes, wall, weight, resolution, origin, (row, col), suspect)
+    return CostMap(classes, wall, weight, resolution, origin, (row, col), blocks.suspect)
 
 
 def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
@@ -157,12 +157,9 @@ def _extent(belief: Belief) -> tuple[slice, slice]:
     """Rows and columns of the grid that hold anything known, and the robot: its spare rim costs time."""
     grid = belief.grid
     here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
-    spans = []
-    for axis in (0, 1):
-        used = grid.log_odds.any(axis=1 - axis) | grid.visited.any(axis=1 - axis)
-        indices = np.append(np.flatnonzero(used), here[axis])
-        spans.append(slice(int(indices.min()), int(indices.max()) + 1))
-    return spans[0], spans[1]
+    row0, col0, row1, col1 = known_extent(grid.log_odds, grid.visited)
+    row, col = int(here[0]), int(here[1])
+    return slice(min(row0, row), max(row1, row + 1)), slice(min(col0, col), max(col1, col + 1))
 
 
 def position_sigma(pose_cov: Array) -> float:
@@ -181,22 +178,30 @@ def _weigh(
     robot: RobotConfig,
     sigma_m: float,
 ) -> NDArray[np.float32]:
-    known = (classes != UNKNOWN).view(np.uint8)
-    unknown = cv2.distanceTransform(known, cv2.DIST_L2, cv2.DIST_MASK_3)
     tight = tight_clearance(config, robot, sigma_m)
     comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
-    need_unknown = (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5
+    unknown = _near_unknown(classes, (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5)
     weight = np.zeros(classes.shape, dtype=np.float32)
     _weigh_cells(
         classes,
         wall,
         unknown,
-        np.array([tight, comfortable, comfortable + config.preferred_m, need_unknown]),
+        np.array([tight, comfortable, comfortable + config.preferred_m]),
         config.near_cost,
         config.tight_cost,
         weight,
     )
     return weight
+
+
+def _near_unknown(classes: NDArray[np.int8], reach: float) -> NDArray[np.uint8]:
+    """Return, not 0, the cells nearer than ``reach`` cells to an unknown one."""
+    side = 2 * math.ceil(reach) + 1
+    apart = np.ones((side, side), dtype=np.uint8)
+    apart[side // 2, side // 2] = 0
+    # A disc laid over each unknown cell: cheaper than the distance of every cell, of which none but this is asked.
+    disc = (cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_3) < np.float64(reach)).astype(np.uint8)
+    return np.asarray(cv2.dilate((classes == UNKNOWN).view(np.uint8), disc), dtype=np.uint8)
 
 
 @njit(cache=True, nogil=True)
@@ -210,57 +215,20 @@ def _classify(
 
 
 @njit(cache=True, nogil=True)
-def _coarsen(
-    fine: NDArray[np.int8],
-    log_odds: NDArray[np.int8],
-    distance: NDArray[np.float32],
-    factor: int,
-    row_pad: int,
-    col_pad: int,
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    suspect: NDArray[np.bool_],
-) -> None:
-    rows, cols = fine.shape
-    for row in range(1, classes.shape[0] - 1):
-        for col in range(1, classes.shape[1] - 1):
-            low_r, low_c = (row - 1) * factor - row_pad, (col - 1) * factor - col_pad
-            free = occupied = inside = 0
-            total = 0.0
-            for r in range(max(low_r, 0), min(low_r + factor, rows)):
-                for c in range(max(low_c, 0), min(low_c + factor, cols)):
-                    inside += 1
-                    total += distance[r, c]
-                    if fine[r, c] == OCCUPIED:
-                        occupied += 1
-                    elif fine[r, c] == FREE:
-                        free += 1
-                    elif log_odds[r, c] > 0:
-                        suspect[row, col] = True
-            if occupied > 0:
-                classes[row, col] = OCCUPIED
-            elif 2 * free > factor * factor:
-                classes[row, col] = FREE
-            if inside > 0:
-                # The mean over a block is the distance at its centre, to second order.
-                wall[row, col] = total / inside
-
-
-@njit(cache=True, nogil=True)
 def _weigh_cells(
     classes: NDArray[np.int8],
     wall: NDArray[np.float32],
-    unknown: NDArray[np.float32],
+    unknown: NDArray[np.uint8],
     levels: Array,
     near_cost: float,
     tight_cost: float,
     weight: NDArray[np.float32],
 ) -> None:
-    tight, comfortable, preferred, need_unknown = levels
+    tight, comfortable, preferred = levels
     for row in range(1, classes.shape[0] - 1):
         for col in range(1, classes.shape[1] - 1):
             distance = wall[row, col]
-            if classes[row, col] != FREE or distance < tight or unknown[row, col] < need_unknown:
+            if classes[row, col] != FREE or distance < tight or unknown[row, col] != 0:
                 continue
             if distance >= preferred:
                 weight[row, col] = 1.0

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from agents.cost_map import CostMap
@@ -14,7 +15,7 @@ from agents.sight import Watch, in_good_sight
 from slam.occupancy import FREE, UNKNOWN
 from slam.settings import require
 
-__all__ = ["FrontierConfig", "Frontiers", "find", "frontier_mask"]
+__all__ = ["FrontierConfig", "Frontiers", "clusters", "find", "frontier_mask"]
 
 Array = NDArray[np.float64]
 
@@ -91,21 +92,18 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     With a ``watch``, so are the cells that were in good sight already and did not yield.
     """
     classes, resolution = cost_map.classes, cost_map.resolution
-    mask = (classes == FREE) & (cost_map.clearance >= np.float32(config.min_clearance_m))
-    mask &= ~cost_map.suspect & _borders_a_large_pocket(cost_map, config)
-    cells = np.argwhere(mask)
+    near = _borders_a_large_pocket(cost_map, config)
+    least = float(np.float32(config.min_clearance_m))
+    cells = _bordering(classes, cost_map.clearance, cost_map.suspect, near, least)
     normals = _normals(classes, cells)
     if watch is not None:
         seen = in_good_sight(cost_map, cells, normals, watch)
-        mask[tuple(cells[seen].T)] = False
         cells, normals = cells[~seen], normals[~seen]
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
-    extent = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) * resolution
+    own, boxes = clusters(cells, classes.shape)
+    extent = boxes.max(axis=1, initial=0) * resolution
     large = extent >= config.min_extent_m - 1e-9
-    large[0] = False
-    renumber = np.full(count, -1, dtype=np.int64)
-    renumber[large] = np.arange(int(large.sum()))
-    own = renumber[labels[cells[:, 0], cells[:, 1]]]
+    renumber = np.where(large, np.cumsum(large) - 1, -1)
+    own = renumber[own]
     kept = own >= 0
     cells, own, normals = cells[kept], own[kept], normals[kept]
     chosen, sizes = _pieces(cells, own, max(1, round(config.spacing_m / resolution)))
@@ -113,8 +111,8 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     return Frontiers(points, own, extent[large], points[chosen], own[chosen], sizes, normals[chosen])
 
 
-def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArray[np.bool_]:
-    """Return the cells beside unknown regions that are neither thin (inside a wall) nor small."""
+def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArray[np.uint8]:
+    """Return, not 0, the cells beside unknown regions that are neither thin (inside a wall) nor small."""
     unknown = ((cost_map.classes == UNKNOWN) & ~cost_map.suspect).view(np.uint8)
     # Odd, or the opening would shift what it opens.
     span = max(1, (round(config.min_unknown_width_m / cost_map.resolution) - 1) | 1)
@@ -122,12 +120,29 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     padded = cv2.copyMakeBorder(unknown, span, span, span, span, cv2.BORDER_CONSTANT, value=1)
     opening = np.ones((span, span), dtype=np.uint8)
     thick = cv2.morphologyEx(padded, cv2.MORPH_OPEN, opening)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
-    large = stats[:, cv2.CC_STAT_AREA] * cost_map.resolution**2 >= config.min_unknown_m2
-    large[0] = False
-    pockets = large[labels].astype(np.uint8)
-    near: NDArray[np.bool_] = cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8)) != 0
+    # What is left holds a whole square of the opening each.
+    if span**2 * cost_map.resolution**2 >= config.min_unknown_m2:
+        pockets = thick
+    else:
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(thick, connectivity=4)
+        large = stats[:, cv2.CC_STAT_AREA] * cost_map.resolution**2 >= config.min_unknown_m2
+        large[0] = False
+        pockets = large[labels].astype(np.uint8)
+    near = np.asarray(cv2.dilate(pockets, np.ones((3, 3), dtype=np.uint8)), dtype=np.uint8)
     return near[span:-span, span:-span]
+
+
+def clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return each cell's 8-connected cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
+
+    Clusters are numbered in the order in which blocks of 2 × 2 cells meet them, row by row: OpenCV's order. The
+    few cells of a frontier are joined in a fraction of the time that OpenCV takes to look all over a large grid.
+    """
+    labels = np.empty(len(cells), dtype=np.int64)
+    boxes = np.empty((len(cells), 2), dtype=np.int64)
+    order = np.lexsort((cells[:, 1] // 2, cells[:, 0] // 2))
+    count = _join(cells, order, np.full(shape, -1, dtype=np.int32), labels, boxes)
+    return labels, boxes[:count]
 
 
 def _pieces(
@@ -159,3 +174,66 @@ def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
     vector = np.stack([unknown @ shift_c, unknown @ shift_r], axis=1).astype(np.float64)
     norm = np.hypot(vector[:, 0], vector[:, 1])
     return vector / np.where(norm > 0, norm, 1.0)[:, None]
+
+
+@njit(cache=True, nogil=True)
+def _bordering(
+    classes: NDArray[np.int8],
+    clearance: NDArray[np.float32],
+    suspect: NDArray[np.bool_],
+    near: NDArray[np.uint8],
+    min_clearance: float,
+) -> NDArray[np.int64]:
+    """Return the FREE, unsuspected cells ``(n, 2)`` near the unknown that are no gaps in a wall, row by row."""
+    cells = np.empty((1024, 2), dtype=np.int64)
+    count = 0
+    for row in range(classes.shape[0]):
+        for col in range(classes.shape[1]):
+            if near[row, col] == 0 or classes[row, col] != FREE or suspect[row, col]:
+                continue
+            if clearance[row, col] >= min_clearance:
+                if count == len(cells):
+                    cells = np.concatenate((cells, np.empty_like(cells)))
+                cells[count] = row, col
+                count += 1
+    return cells[:count]
+
+
+@njit(cache=True, nogil=True)
+def _join(
+    cells: NDArray[np.int64],
+    order: NDArray[np.int64],
+    index: NDArray[np.int32],
+    labels: NDArray[np.int64],
+    boxes: NDArray[np.int64],
+) -> int:
+    """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is −1 all over."""
+    rows, cols = index.shape
+    for i in range(len(cells)):
+        index[cells[i, 0], cells[i, 1]] = i
+    labels[:] = -1
+    stack = np.empty(len(cells), dtype=np.int64)
+    count = 0
+    for first in order:
+        if labels[first] >= 0:
+            continue
+        labels[first] = count
+        stack[0] = first
+        height = 1
+        low_r = high_r = cells[first, 0]
+        low_c = high_c = cells[first, 1]
+        while height > 0:
+            height -= 1
+            row, col = cells[stack[height]]
+            low_r, high_r = min(low_r, row), max(high_r, row)
+            low_c, high_c = min(low_c, col), max(high_c, col)
+            for r in range(max(row - 1, 0), min(row + 2, rows)):
+                for c in range(max(col - 1, 0), min(col + 2, cols)):
+                    other = index[r, c]
+                    if other >= 0 and labels[other] < 0:
+                        labels[other] = count
+                        stack[height] = other
+                        height += 1
+        boxes[count] = high_r - low_r + 1, high_c - low_c + 1
+        count += 1
+    return count

@@ -24,7 +24,7 @@ from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.gain import expected_area
 from agents.planning import TravelCosts
-from agents.sight import Watch, in_good_sight
+from agents.sight import first_in_good_sight
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief
@@ -118,16 +118,14 @@ class NextBestView(Explorer):
         if self._goal is not None and len(worth):
             worth[0] *= 1.0 + self._config.switch_share  # the present goal: see _places
         least = self.worth(own.cost_map, own.cells, own.costs, rays=_SAMPLE_RAYS)
+        order = np.argsort(-worth, kind="stable")
+        found = first_in_good_sight(
+            own.cost_map, targets[live], own.frontiers.normals[live], own.cost_map.to_points(places[order]),
+            worth[order], least[live], reach,
+        )  # fmt: skip
+        better, chosen = live[found >= 0], order[found[found >= 0]]
         cells, costs = own.cells.copy(), own.costs.copy()
-        points = own.cost_map.to_points(places)
-        for k in np.argsort(-worth, kind="stable"):
-            live = live[least[live] < worth[k]]  # places that are left make nothing better for the others
-            if not len(live):
-                break
-            watch = Watch(np.array([[*points[k], 0.0]]), reach, math.pi)
-            seen = live[in_good_sight(own.cost_map, targets[live], own.frontiers.normals[live], watch)]
-            cells[seen], costs[seen] = places[k], cost[k]
-            least[seen] = np.inf
+        cells[better], costs[better] = places[chosen], cost[chosen]
         return replace(own, cells=cells, costs=costs)
 
     def _places(self, cost_map: CostMap, travel: TravelCosts, targets: Cells, reach_m: float) -> Cells:
@@ -140,11 +138,9 @@ class NextBestView(Explorer):
         step = max(1, round(config.spacing_m / resolution))
         first = [-round(cost_map.origin[axis] / resolution) % step for axis in (1, 0)]
         rows, cols = slice(first[0], None, step), slice(first[1], None, step)
-        apart = np.ones(cost_map.classes.shape, dtype=np.uint8)
-        apart[targets[:, 0], targets[:, 1]] = 0
-        away = cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_5)[rows, cols]
         roomy = cost_map.weight[rows, cols] <= 1.0 + config.planner.near_cost
-        near = np.isfinite(travel.cost[rows, cols]) & roomy & (away * resolution <= reach_m)
+        near = np.isfinite(travel.cost[rows, cols]) & roomy
+        near &= _within(cost_map, targets, reach_m)[rows, cols]
         lattice = np.argwhere(near) * step + first
         if len(lattice) > config.samples:
             lattice = lattice[np.sort(self._rng.choice(len(lattice), config.samples, replace=False))]
@@ -152,3 +148,16 @@ class NextBestView(Explorer):
             return lattice
         goal = cost_map.to_cells(self._goal.pose[None, :2])
         return np.vstack([goal, lattice])
+
+
+def _within(cost_map: CostMap, targets: Cells, reach_m: float) -> NDArray[np.bool_]:
+    """Return the cells within ``reach_m`` of one of the ``targets``: a disc laid over each of these few."""
+    span = math.ceil(reach_m / cost_map.resolution)
+    apart = np.ones((2 * span + 1, 2 * span + 1), dtype=np.uint8)
+    apart[span, span] = 0
+    disc = cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_5) * cost_map.resolution <= reach_m
+    rows, cols = cost_map.classes.shape
+    within = np.zeros((rows + 2 * span, cols + 2 * span), dtype=np.bool_)
+    for row, col in targets.tolist():
+        within[row : row + 2 * span + 1, col : col + 2 * span + 1] |= disc
+    return within[span : span + rows, span : span + cols]

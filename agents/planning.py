@@ -99,59 +99,93 @@ def _dial(
     cost: NDArray[np.float32],
     step: NDArray[np.int8],
 ) -> None:
-    """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket."""
-    rows, cols = weight.shape
-    diagonal = math.sqrt(2.0)
-    head = np.full(buckets, -1, dtype=np.int32)
-    # Each bucket is a doubly linked list through these two: a node is in one bucket at most.
-    following = np.full(rows * cols, -1, dtype=np.int32)
-    previous = np.full(rows * cols, -1, dtype=np.int32)
-    done = np.zeros(rows * cols, dtype=np.bool_)
-    node = start_row * cols + start_col
-    cost[start_row, start_col] = 0.0
-    head[0] = node
+    """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
+
+    Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack again
+    and left in the old one, where it is found to be done. Entries taken off are used again, so that the lists stay
+    as short as the front is long, and in the processor's cache.
+    """
+    cols = weight.shape[1]
+    weights, costs, steps = weight.ravel(), cost.ravel(), step.ravel()
+    offsets = _D_ROW * cols + _D_COL
+    diagonal = 0.5 * math.sqrt(2.0)
+    ahead, ahead_count = _ahead()
+    # Each of its eight edges makes a node cheaper once at most. What is never written takes no memory.
+    node_of = np.empty(8 * weights.shape[0], dtype=np.int32)
+    below = np.empty(8 * weights.shape[0], dtype=np.int32)
+    top = np.full(buckets, -1, dtype=np.int32)
+    used, spare = 1, np.int32(-1)
+    start = start_row * cols + start_col
+    costs[start] = 0.0
+    node_of[0], below[0], top[0] = start, -1, 0
     waiting = 1
-    bucket = 0
+    bucket = place = 0  # place is bucket modulo buckets
     while waiting > 0:
-        while head[bucket % buckets] >= 0:
-            node = head[bucket % buckets]
-            head[bucket % buckets] = following[node]
-            if following[node] >= 0:
-                previous[following[node]] = -1
+        while top[place] >= 0:
+            entry = top[place]
+            node = np.int64(node_of[entry])
+            top[place] = below[entry]
+            below[entry] = spare
+            spare = entry
             waiting -= 1
-            done[node] = True
-            row, col = node // cols, node % cols
-            for k in range(8):
-                r, c = row + _D_ROW[k], col + _D_COL[k]
-                other = r * cols + c
-                if weight[r, c] <= 0.0 or done[other]:
+            here = costs[node]
+            if int(here) != bucket:  # done, from a lower bucket
+                continue
+            own = weights[node]
+            least = here + np.float32(1.0)
+            way = np.int64(steps[node])  # −1, at the start, is the last row
+            for i in range(ahead_count[way]):
+                k = ahead[way, i]
+                other = node + offsets[k]
+                before = costs[other]
+                if before <= least:  # most neighbours: settled, at no more than the cheapest edge would make
                     continue
-                length = 1.0
-                if k % 2 == 1:
-                    if weight[r, col] <= 0.0 or weight[row, c] <= 0.0:
-                        continue
-                    length = diagonal
-                total = cost[row, col] + np.float32(length * 0.5 * (weight[row, col] + weight[r, c]))
-                if total >= cost[r, c] or total > max_cost:
+                price = weights[other]
+                if price <= 0.0:
                     continue
-                if cost[r, c] < np.inf:  # take it out of the bucket it waits in
-                    if previous[other] >= 0:
-                        following[previous[other]] = following[other]
-                    else:
-                        head[int(cost[r, c]) % buckets] = following[other]
-                    if following[other] >= 0:
-                        previous[following[other]] = previous[other]
-                    waiting -= 1
-                cost[r, c] = total
-                step[r, c] = k
-                place = int(total) % buckets
-                following[other] = head[place]
-                previous[other] = -1
-                if head[place] >= 0:
-                    previous[head[place]] = other
-                head[place] = other
+                total = here + np.float32((diagonal if k & 1 else 0.5) * (own + price))
+                if total >= before or total > max_cost:
+                    continue
+                if k & 1 and (
+                    weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0
+                ):
+                    continue
+                costs[other] = total
+                steps[other] = k
+                to = place + int(total) - bucket
+                if to >= buckets:
+                    to -= buckets
+                if spare >= 0:
+                    entry = spare
+                    spare = below[entry]
+                else:
+                    entry = np.int32(used)
+                    used += 1
+                node_of[entry] = other
+                below[entry] = top[to]
+                top[to] = entry
                 waiting += 1
         bucket += 1
+        place = place + 1 if place + 1 < buckets else 0
+
+
+@njit(cache=True, nogil=True)
+def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last the start's.
+
+    Where a step has come from needs no look: the cell itself, and the two on either side of it, which are its
+    neighbours, too, and cheaper to reach from there: for all weights, the direct edge costs less than the step and
+    a second one, of which one is straight and the other diagonal.
+    """
+    ahead = np.zeros((9, 8), dtype=np.int64)
+    count = np.zeros(9, dtype=np.int64)
+    for way in range(9):
+        for k in range(8):
+            turn = (k - way) % 8
+            if way == 8 or turn <= 2 or turn >= 6:
+                ahead[way, count[way]] = k
+                count[way] += 1
+    return ahead, count
 
 
 @njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from agents.cost_map import CostMap
 from agents.planning import TravelCosts
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["ViewPoints", "Watch", "in_good_sight", "view_points"]
+__all__ = ["ViewPoints", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
 
 Array = NDArray[np.float64]
 
@@ -50,11 +50,51 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
     ``normals`` ``(n, 2)`` point from free to unknown; where one is zero, every direction is as good.
     """
     seen = np.zeros(len(cells), dtype=np.bool_)
-    poses = np.asarray(watch.poses, dtype=np.float64).reshape(-1, 3).copy()
-    poses[:, :2] = (poses[:, :2] - np.asarray(cost_map.origin)) / cost_map.resolution
+    poses = _in_cells(cost_map, np.asarray(watch.poses, dtype=np.float64).reshape(-1, 3))
+    # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
+    poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
     reach = watch.range_m / cost_map.resolution
     _mark_seen(cost_map.classes, cells, normals, poses, reach, watch.half_view_rad, seen)
     return seen
+
+
+def first_in_good_sight(
+    cost_map: CostMap,
+    cells: NDArray[np.int64],
+    normals: Array,
+    places: Array,
+    worth: Array,
+    least: Array,
+    range_m: float,
+) -> NDArray[np.int64]:
+    """Return, for each frontier cell ``(n, 2)``, the first place that has it in good sight, −1 where none has.
+
+    Parameters
+    ----------
+    cost_map : CostMap
+        The planning grid.
+    cells, normals : NDArray
+        Frontier cells (row, column) and their normals ``(n, 2)``, as for :func:`in_good_sight`.
+    places : Array
+        Places ``(k, 2)`` [m] of a sensor that sees all round, worthiest first.
+    worth : Array
+        What each place is worth ``(k,)``.
+    least : Array
+        What a place must be worth more than, for each cell ``(n,)``.
+    range_m : float
+        Diameter of the circle of good sight.
+    """
+    found = np.full(len(cells), -1, dtype=np.int64)
+    poses = _in_cells(cost_map, np.column_stack([places, np.zeros(len(places))]))
+    _first_seen(cost_map.classes, cells, normals, poses, worth, least, range_m / cost_map.resolution, found)
+    return found
+
+
+def _in_cells(cost_map: CostMap, poses: Array) -> Array:
+    """Return poses ``(k, 3)`` with their positions in cells from the grid's corner."""
+    poses = poses.copy()
+    poses[:, :2] = (poses[:, :2] - np.asarray(cost_map.origin)) / cost_map.resolution
+    return poses
 
 
 def view_points(
@@ -86,20 +126,65 @@ def _mark_seen(
     for i in range(cells.shape[0]):
         x, y = cells[i, 1] + 0.5, cells[i, 0] + 0.5
         nx, ny = normals[i, 0], normals[i, 1]
-        flat = nx == 0.0 and ny == 0.0
-        for k in range(poses.shape[0] - 1, -1, -1):  # the latest are the likeliest
-            dx, dy = x - poses[k, 0], y - poses[k, 1]
-            square = dx * dx + dy * dy
-            # distance ≤ reach · cos(incidence), times distance
-            if square > (reach * math.sqrt(square) if flat else reach * (dx * nx + dy * ny)):
-                continue
-            if half_view < math.pi:
-                off = math.atan2(dy, dx) - poses[k, 2]
-                if abs(math.atan2(math.sin(off), math.cos(off))) > half_view:
-                    continue
-            if _is_free_line(classes, x, y, poses[k, 0], poses[k, 1]):
+        # A cell to spare: what rounding puts just within reach below is not left out here.
+        first = np.searchsorted(poses[:, 0], x - reach - 1.0)
+        for k in range(first, poses.shape[0]):
+            if poses[k, 0] > x + reach + 1.0:
+                break
+            if _is_good(classes, x, y, nx, ny, poses[k, 0], poses[k, 1], poses[k, 2], reach, half_view):
                 seen[i] = True
                 break
+
+
+@njit(cache=True, nogil=True)
+def _first_seen(
+    classes: NDArray[np.int8],
+    cells: NDArray[np.int64],
+    normals: Array,
+    poses: Array,
+    worth: Array,
+    least: Array,
+    reach: float,
+    found: NDArray[np.int64],
+) -> None:
+    """Note for each cell the first pose that has it in good sight, of those worth more than its least."""
+    for i in range(cells.shape[0]):
+        x, y = cells[i, 1] + 0.5, cells[i, 0] + 0.5
+        for k in range(poses.shape[0]):
+            if worth[k] <= least[i]:
+                break
+            if _is_good(
+                classes, x, y, normals[i, 0], normals[i, 1], poses[k, 0], poses[k, 1], poses[k, 2], reach, math.pi
+            ):
+                found[i] = k
+                break
+
+
+@njit(cache=True, nogil=True)
+def _is_good(
+    classes: NDArray[np.int8],
+    x: float,
+    y: float,
+    nx: float,
+    ny: float,
+    px: float,
+    py: float,
+    heading: float,
+    reach: float,
+    half_view: float,
+) -> bool:
+    """Tell whether a sensor at px, py has the point x, y with its normal in good sight; positions in cells."""
+    dx, dy = x - px, y - py
+    square = dx * dx + dy * dy
+    flat = nx == 0.0 and ny == 0.0
+    # distance ≤ reach · cos(incidence), times distance
+    if square > (reach * math.sqrt(square) if flat else reach * (dx * nx + dy * ny)):
+        return False
+    if half_view < math.pi:
+        off = math.atan2(dy, dx) - heading
+        if abs(math.atan2(math.sin(off), math.cos(off))) > half_view:
+            return False
+    return _is_free_line(classes, x, y, px, py)
 
 
 @njit(cache=True, nogil=True)
