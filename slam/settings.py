@@ -67,6 +67,8 @@ def to_mapping(config: Any) -> dict[str, Any]:
 
 def _coerce(cls: type[Any], key: str, hint: Any, value: Any, base: Any) -> Any:
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    if value is None and type(None) in options:
+        return None
     for option in options:
         if dataclasses.is_dataclass(option) and isinstance(option, type):
             return from_mapping(option, value, base=base)

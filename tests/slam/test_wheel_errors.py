@@ -188,3 +188,8 @@ def test_without_lasting_errors_nothing_changes() -> None:
     plain = slam.make("invariant-ekf")
     plain.reset((0.0, 0.0, 0.0))
     assert plain._wheels is None
+
+
+def test_none_given_in_a_mapping_is_none() -> None:
+    made = slam.make("invariant-ekf", config={"odometry": {"lasting": None}})
+    assert made.config.odometry.lasting is None
