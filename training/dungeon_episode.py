@@ -24,12 +24,19 @@ from slam.occupancy import FREE, UNKNOWN, OccupancyGrid
 from slam.types import Belief
 from training.dungeon_world import CELL_M, HOP, RANGE_M, STRIDE, Dungeon, Lattice, scan
 
-__all__ = ["SCANS", "explore", "make_agent"]
+__all__ = ["NEAREST", "SCANS", "explore", "make_agent"]
 
 Array = NDArray[np.float64]
 
 SCANS = ("way-points", "continuous")
 """Where the sensor is read: only where a hop ends, or in every cell on the way, too."""
+
+NEAREST = "nearest-way-point"
+"""Stands among the agents' names for a rule that belongs to the protocol: to the nearest way-point worth a visit.
+
+Chosen anew at each way-point. It is what planners of the benchmark's family fall back on, and the simplest
+reading of its "nearest frontier"; our agent of that name goes to the nearest *view* of a frontier instead.
+"""
 
 _MOST_HOPS = 1000
 _TRIES = 12  # nearest way-points from which a goal is looked at before the agent counts as stuck
@@ -80,9 +87,10 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         off before, ``stuck`` (a goal that no way-point serves) or ``hop limit``; ``path_to_250_m`` the path until
         at most 250 free cells were unseen, ``None`` where it never came to that.
     """
-    agent = make_agent(name)
     run = _Run(dungeon, continuous=scan == "continuous")
-    agent.reset(run.belief(), seed)
+    agent = None if name == NEAREST else make_agent(name)
+    if agent is not None:
+        agent.reset(run.belief(), seed)
     decisions: list[float] = []
     end = "hop limit"
     for _ in range(_MOST_HOPS):
@@ -90,6 +98,9 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         if not run.worth.any():
             end = "covered"
             break
+        if agent is None:
+            run.hop_towards(run.nearest())
+            continue
         belief = run.belief()
         agent.looked(belief)
         asked = time.perf_counter()
@@ -182,6 +193,10 @@ class _Run:
         nearest = np.argsort(away, kind="stable")[:_TRIES]
         left = nearest[np.isfinite(away[nearest]) & ~self._visited[tuple(cells[nearest].T)]]
         return int(left[0]) if len(left) else -1
+
+    def nearest(self) -> int:
+        """Return the nearest way-point that is worth a visit; one is."""
+        return int(np.argmin(np.where(self.worth, self._length, math.inf)))
 
     def hop_towards(self, station: int) -> None:
         """Make the first hop of the way to a way-point, and scan there."""

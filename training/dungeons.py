@@ -26,7 +26,7 @@ from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.campaign import check_settings, installed_version, run_all, write_settings
 from training.dungeon_bound import known_map_path
-from training.dungeon_episode import SCANS, explore
+from training.dungeon_episode import NEAREST, SCANS, explore
 from training.dungeon_world import Dungeon, load
 from training.errors import BadInput, Interrupted
 
@@ -76,7 +76,7 @@ def run_dungeons(
     BadInput
         In one line: which option, file or name is wrong, and what to do.
     """
-    valid = (*agents.names(), KNOWN_MAP)
+    valid = (*agents.names(), KNOWN_MAP, NEAREST)
     for name in agent_names:
         if name not in valid:
             raise BadInput(str(unknown_name("agent", name, valid)))
@@ -227,7 +227,9 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m training.dungeons", description=__doc__)
     parser.add_argument("--maps", type=Path, required=True, help="folder of PNG maps")
     parser.add_argument(
-        "--agents", default="nearest-frontier,tour", help="names, separated by commas; known-map is the bound"
+        "--agents",
+        default="nearest-frontier,tour",
+        help=f"names, separated by commas; {KNOWN_MAP} is the bound, {NEAREST} the simplest rule",
     )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

@@ -15,7 +15,7 @@ from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.slam.logs_on_disk import data_folder
 from training import dungeon_episode
 from training.dungeon_bound import known_map_path
-from training.dungeon_episode import explore, make_agent
+from training.dungeon_episode import NEAREST, explore, make_agent
 from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, load, scan
 from training.dungeons import main, run_dungeons, summarise, table
 from training.errors import BadInput
@@ -148,6 +148,23 @@ def test_a_corridor_is_as_long_as_it_is(name):
     row.pop("decision_ms_median")
     again.pop("decision_ms_median")
     assert row == again
+
+
+def test_the_simplest_rule_goes_to_the_nearest_way_point_worth_a_visit(monkeypatch):
+    """Every hop leads on the shortest way to a way-point that no other one worth a visit is nearer than."""
+    hops = []
+    hop_towards = dungeon_episode._Run.hop_towards
+
+    def spy(run, station):
+        hops.append((run._length[station], run._length[run.worth].min(), bool(run.worth[station])))
+        hop_towards(run, station)
+
+    monkeypatch.setattr(dungeon_episode._Run, "hop_towards", spy)
+    dungeon = dungeon_of(pixels((20, 20, 30, 150), (20, 140, 150, 30), start=(22, 24)), "corner")
+    row = explore(dungeon, NEAREST)
+    assert row["end"] == "covered" and row["unseen_cells"] <= 3 and row["decision_ms_median"] is None
+    assert len(hops) == row["hops"] > 3
+    assert all(length == nearest and worth for length, nearest, worth in hops)
 
 
 def test_one_look_is_enough():
