@@ -288,7 +288,7 @@ def _distance(x: Array, marks: Array, px: float, py: float) -> Array:
     return np.asarray(out)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _postpone(
     phi: Array, minus_psi: Array, theta: Array, u: Array, n: int, n0: int, match: NDArray[np.int64], h: Array,
     w: Array, s: Array,

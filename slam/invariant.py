@@ -95,7 +95,7 @@ class InvariantEkfSlam(EkfSlam):
         return float(nees_pose_invariant(self.pose, self.pose_cov, np.asarray(true_pose, dtype=np.float64)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def invariant_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array,
     w: Array, s: Array, delta: Array,
@@ -165,7 +165,7 @@ def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array) -> bool:
     return walls
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_half(a: Array, v: Array, n: int, walls: bool) -> None:
     """Turn ±P_:r in the rows of ``v`` into ±(P_:r + ½ A P_rr); without walls A has its column by θ only."""
     if not walls:

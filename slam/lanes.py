@@ -25,18 +25,31 @@ if TYPE_CHECKING:
 else:
     from numba.extending import intrinsic
 
-__all__ = ["LANES", "add_product", "aligned_zeros", "first", "load", "store", "subtract_product", "times"]
+__all__ = [
+    "LANES",
+    "add_product",
+    "aligned_zeros",
+    "first",
+    "load",
+    "store",
+    "subtract_number",
+    "subtract_product",
+    "times",
+]
 
 try:
-    LANES = 8 if llvm.get_host_cpu_features().get("avx512f", False) else 4
+    _FEATURES = dict(llvm.get_host_cpu_features())
 except RuntimeError:  # LLVM cannot tell on every kind of machine
-    LANES = 4
+    _FEATURES = {}
+LANES = 8 if _FEATURES.get("avx512f", False) else 4
+# Fused where the machine can, and always there. Left to the compiler ("contract"), which products and sums are
+# rounded once depends on what it inlines, and that on which kernels come from the cache.
+_FUSED = bool(_FEATURES.get("fma", False))
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 _MASK = ir.VectorType(ir.IntType(1), LANES)
 _INDEX = ir.VectorType(ir.IntType(64), LANES)
 _I32 = ir.IntType(32)
-_CONTRACT = ("contract",)  # a product and a sum may be rounded once
 
 
 class _Vector(types.Type):
@@ -123,10 +136,20 @@ def subtract_product(typing: Any, total: Any, factor: Any, vector: Any) -> Any:
     """Return ``total − factor · vector`` of a vector, a number and a vector."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        product = builder.fmul(_splat(builder, args[1], _VECTOR), args[2], flags=_CONTRACT)
-        return builder.fsub(args[0], product, flags=_CONTRACT)
+        minus = builder.fneg(_splat(builder, args[1], _VECTOR))
+        return _multiply_add(builder, minus, args[2], args[0])
 
     return _vector(_vector, types.float64, _vector), generate
+
+
+@intrinsic
+def subtract_number(typing: Any, total: Any, factor: Any, value: Any) -> Any:
+    """Return ``total − factor · value`` of three numbers, rounded as :func:`subtract_product` rounds a lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return _multiply_add(builder, builder.fneg(args[1]), args[2], args[0])
+
+    return types.float64(types.float64, types.float64, types.float64), generate
 
 
 @intrinsic
@@ -134,8 +157,7 @@ def add_product(typing: Any, total: Any, factor: Any, vector: Any) -> Any:
     """Return ``total + factor · vector`` of a vector, a number and a vector."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        product = builder.fmul(_splat(builder, args[1], _VECTOR), args[2], flags=_CONTRACT)
-        return builder.fadd(args[0], product, flags=_CONTRACT)
+        return _multiply_add(builder, _splat(builder, args[1], _VECTOR), args[2], args[0])
 
     return _vector(_vector, types.float64, _vector), generate
 
@@ -145,7 +167,7 @@ def times(typing: Any, factor: Any, vector: Any) -> Any:
     """Return ``factor · vector`` of a number and a vector."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.fmul(_splat(builder, args[0], _VECTOR), args[1], flags=_CONTRACT)
+        return builder.fmul(_splat(builder, args[0], _VECTOR), args[1])
 
     return _vector(types.float64, _vector), generate
 
@@ -167,6 +189,15 @@ def _splat(builder: Any, value: Any, vector: Any) -> Any:
     undefined = ir.Constant(vector, ir.Undefined)
     one = builder.insert_element(undefined, value, _I32(0))
     return builder.shuffle_vector(one, undefined, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
+
+
+def _multiply_add(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return a b + c of vectors or of numbers."""
+    if not _FUSED:
+        return builder.fadd(builder.fmul(a, b), c)
+    name = f"llvm.fma.v{LANES}f64" if a.type == _VECTOR else "llvm.fma.f64"
+    kind = ir.FunctionType(a.type, [a.type] * 3)
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [a, b, c])
 
 
 def _declared(builder: Any, what: str, result: Any, args: Any) -> Any:

@@ -37,7 +37,7 @@ def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
     return h, w, s
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def stacked_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
 ) -> tuple[int, float]:
@@ -56,7 +56,7 @@ def stacked_update(
     return rows, nis
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def whiten(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
 ) -> int:
@@ -104,7 +104,7 @@ def _landmark_rows(p: Array, n: int, m: int, out0: Array, out1: Array) -> None:
         out1[j] = p[m + 1, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _h_times_rows(h: Array, p: Array, n: int, w: Array, rows: int) -> None:
     """Turn the observed landmarks' rows of P in ``w`` into H P, with the robot's rows of ``p``."""
     for j in range(0, n, LANES):
@@ -121,7 +121,7 @@ def _h_times_rows(h: Array, p: Array, n: int, w: Array, rows: int) -> None:
                 store(w, (k + e, j), mask, row)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _innovation_columns(w: Array, m: int, h: Array, a: int, s: Array) -> None:
     """Write the columns a and a + 1 of H P Hᵀ down to the diagonal, H P standing in ``w``."""
     for b in range(a + 2):
@@ -132,7 +132,7 @@ def _innovation_columns(w: Array, m: int, h: Array, a: int, s: Array) -> None:
             )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cholesky(s: Array, rows: int) -> None:
     """Factor the upper triangle S = L Lᵀ in place, and multiply the column right of it, ν, by L⁻¹."""
     for k in range(rows):
@@ -147,7 +147,7 @@ def _cholesky(s: Array, rows: int) -> None:
                 store(s, (i, j), None, subtract_product(load(s, (i, j), None), factor, load(s, (k, j), None)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(s: Array, w: Array, n: int, rows: int) -> None:
     """Multiply W by L⁻¹ in place, a few columns at a time from top to bottom."""
     j = 0
@@ -158,7 +158,7 @@ def solve(s: Array, w: Array, n: int, rows: int) -> None:
         _solve_tile(s, w, j, rows, first(n - j), first(n - j - LANES))
 
 
-@njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def _solve_tile(s: Array, w: Array, j: int, rows: int, mask0: Any, mask1: Any) -> None:
     for i in range(rows):
         v0, v1 = load(w, (i, j), mask0), load(w, (i, j + LANES), mask1)

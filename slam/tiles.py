@@ -12,7 +12,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product
+from slam.lanes import (
+    LANES,
+    add_product,
+    aligned_zeros,
+    first,
+    load,
+    store,
+    subtract_number,
+    subtract_product,
+)
 
 __all__ = ["add_combination", "downdate", "product", "subtract"]
 
@@ -29,7 +38,7 @@ def product(a: Array, b: Array, n: int) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_combination(out: Array, n: int, factors: Array, w: Array) -> None:
     """Add to ``out`` ``(≥ n,)`` the first rows of ``w``, each times its factor."""
     for j in range(0, n, LANES):
@@ -40,7 +49,7 @@ def add_combination(out: Array, n: int, factors: Array, w: Array) -> None:
         store(out, j, mask, v)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def downdate(p: Array, n: int, left: Array, right: Array, rows: int, pairs: int) -> None:
     """Subtract a symmetric product Lᵀ R of two arrays' first ``rows`` from the upper triangle of p.
 
@@ -62,12 +71,12 @@ def downdate(p: Array, n: int, left: Array, right: Array, rows: int, pairs: int)
     for i in range(whole, n):
         for j in range(i, n):
             for k in range(rows):
-                p[i, j] -= left[k, i] * right[k, j]
+                p[i, j] = subtract_number(p[i, j], left[k, i], right[k, j])
             for k in range(rows, rows + 2 * pairs):
-                p[i, j] -= left[k ^ 1, i] * right[k, j]
+                p[i, j] = subtract_number(p[i, j], left[k ^ 1, i], right[k, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: int) -> None:
     """Subtract the product Lᵀ R of two arrays' first ``rows`` from ``out[:height, :n]``."""
     whole = height - height % _HEIGHT
@@ -90,7 +99,7 @@ def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: i
             store(out, (i, j), mask, v)
 
 
-@njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def _tile(
     p: Array, i: int, j: int, left: Array, right: Array, rows: int, pairs: int, mask0: Any, mask1: Any, mask2: Any
 ) -> None:

@@ -118,7 +118,11 @@ def _predict(
         for i in range(_STATES):
             for j in range(3, n):
                 p[q, j] += d[q, i] * cross[i, j]
-    ed = cov @ d.T  # (5, 3)
+    ed = np.zeros((_STATES, 3))  # E Dᵀ
+    for i in range(_STATES):
+        for q in range(3):
+            for j in range(_STATES):
+                ed[i, q] += cov[i, j] * d[q, j]
     for q in range(3):
         for r in range(q, 3):
             for i in range(_STATES):
@@ -126,7 +130,7 @@ def _predict(
     cross[:, :3] += ed
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, nogil=True, error_model="numpy")
 def _correct(
     mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
     we: Array, rows: int,
