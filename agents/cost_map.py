@@ -218,7 +218,7 @@ def _classify(
 def _weigh_cells(
     classes: NDArray[np.int8],
     wall: NDArray[np.float32],
-    unknown: NDArray[np.uint8],
+    near_unknown: NDArray[np.uint8],
     levels: Array,
     near_cost: float,
     tight_cost: float,
@@ -228,7 +228,7 @@ def _weigh_cells(
     for row in range(1, classes.shape[0] - 1):
         for col in range(1, classes.shape[1] - 1):
             distance = wall[row, col]
-            if classes[row, col] != FREE or distance < tight or unknown[row, col] != 0:
+            if classes[row, col] != FREE or distance < tight or near_unknown[row, col] != 0:
                 continue
             if distance >= preferred:
                 weight[row, col] = 1.0

@@ -15,7 +15,7 @@ from agents.sight import Watch, in_good_sight
 from slam.occupancy import FREE, UNKNOWN
 from slam.settings import require
 
-__all__ = ["FrontierConfig", "Frontiers", "clusters", "find", "frontier_mask"]
+__all__ = ["FrontierConfig", "Frontiers", "find", "frontier_mask"]
 
 Array = NDArray[np.float64]
 
@@ -99,7 +99,7 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     if watch is not None:
         seen = in_good_sight(cost_map, cells, normals, watch)
         cells, normals = cells[~seen], normals[~seen]
-    own, boxes = clusters(cells, classes.shape)
+    own, boxes = _clusters(cells, classes.shape)
     extent = boxes.max(axis=1, initial=0) * resolution
     large = extent >= config.min_extent_m - 1e-9
     renumber = np.where(large, np.cumsum(large) - 1, -1)
@@ -132,7 +132,7 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     return near[span:-span, span:-span]
 
 
-def clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return each cell's 8-connected cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
 
     Clusters are numbered in the order in which blocks of 2 × 2 cells meet them, row by row: OpenCV's order. The

@@ -101,9 +101,11 @@ def _dial(
 ) -> None:
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
 
-    Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack again
-    and left in the old one, where it is found to be done. Entries taken off are used again, so that the lists stay
-    as short as the front is long, and in the processor's cache.
+    Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
+    before. Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack
+    again and left in the old one, where it is found to be done (or, in the same bucket, done over to no effect).
+    Entries taken off are used again, so that the lists stay as short as the front is long, and in the processor's
+    cache.
     """
     cols = weight.shape[1]
     weights, costs, steps = weight.ravel(), cost.ravel(), step.ravel()

@@ -78,7 +78,7 @@ def first_in_good_sight(
     places : Array
         Places ``(k, 2)`` [m] of a sensor that sees all round, worthiest first.
     worth : Array
-        What each place is worth ``(k,)``.
+        What each place is worth ``(k,)``, never rising: the search of a cell ends where it falls to ``least``.
     least : Array
         What a place must be worth more than, for each cell ``(n,)``.
     range_m : float

@@ -12,7 +12,7 @@ from slam.settings import to_mapping
 
 __all__ = ["backend_settings", "odometry_noise"]
 
-# A wheel's radius error stays for the whole episode, while the filter takes the odometry's error for white. Over
+# A wheel's radius error stays for the whole episode, while a filter without it as a state takes it for white. Over
 # the most of a second that it takes the landmarks to correct a drift, eight steps' errors add up instead of
 # averaging.
 _PERSISTENCE = 8.0
@@ -27,11 +27,12 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
 
     Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
     within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
-    weight 1/4 each, and into ω with 1/(4l). ``python -m training.calibrate`` measures V on the simulated robot.
+    weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
+    ``python -m training.calibrate`` measures V on the simulated robot.
     """
     white = noise.encoder**2 + noise.slip**2 / 3.0
-    lasting = _PERSISTENCE * (noise.radius_error**2 / 3.0)
-    per_wheel = math.sqrt((white + lasting) / 4.0)
+    as_white = _PERSISTENCE * (noise.radius_error**2 / 3.0)
+    per_wheel = math.sqrt((white + as_white) / 4.0)
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
     base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
     white_share = math.sqrt(white / 4.0)
@@ -44,8 +45,8 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
         lasting=LastingErrors(
             radius_sigma=noise.radius_error / math.sqrt(3.0),
             lever_sigma=noise.base_error / math.sqrt(3.0),
-            speed_share=white_share,
-            turn_share_rad_m=white_share / robot.lever_m,
+            white_speed_share=white_share,
+            white_turn_share_rad_m=white_share / robot.lever_m,
         ),
     )
 
@@ -59,6 +60,9 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
         "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
         "features": {"range_sigma_m": config.noise.range_sigma_m},
     }
+    given = config.slam_config.get("odometry", {})
+    if "lasting" not in given and given.keys() & {"speed_share", "turn_share_rad_m"}:
+        del settings["odometry"]["lasting"]  # these speak of V as a whole
     return _overlay(settings, config.slam_config)
 
 

@@ -81,12 +81,12 @@ class EkfSlam(Backend):
         super().__init__(config or EkfConfig())
         c = self.config
         self._max_turn = math.radians(c.max_turn_deg)
-        self._noise = c.odometry
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         del seed  # nothing here is drawn
+        self._noise = self.config.odometry
         self._n = 3
         self._x = np.zeros(3 + 2 * 32)
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle

@@ -9,12 +9,13 @@ robot's heading, and with a change of the covariance's coordinates to the new es
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfSlam
+from slam.ekf import EkfLinesConfig, EkfSlam
 from slam.geometry import wrap_scalar
 from slam.joint_gaussian import landmark_by_pose
 from slam.metrics import nees_pose_invariant
@@ -23,11 +24,18 @@ from slam.tiles import add_combination, downdate
 from slam.types import LINE, Odometry, Scan
 from slam.wheel_errors import WheelErrors
 
-__all__ = ["InvariantEkfSlam"]
+__all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
 Array = NDArray[np.float64]
 
 _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since walls alone need the others
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvariantEkfConfig(EkfLinesConfig):
+    """Right-invariant EKF-SLAM over walls and corners."""
+
+    wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
 
 
 class InvariantEkfSlam(EkfSlam):
@@ -36,13 +44,18 @@ class InvariantEkfSlam(EkfSlam):
     Where the odometry's noise says what of it lasts, the wheels' errors are states, too (slam.wheel_errors).
     """
 
+    config: InvariantEkfConfig
+
+    def __init__(self, config: InvariantEkfConfig | None = None) -> None:
+        super().__init__(config or InvariantEkfConfig())
+
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
         noise = self.config.odometry
-        self._noise = noise.white()
         self._wheels: WheelErrors | None = None
-        if noise.lasting is not None:
+        if noise.lasting is not None and self.config.wheel_states:
+            self._noise = noise.white()
             self._wheels = WheelErrors(noise.lasting, noise.lever_m, len(self._match), len(self._x))
 
     def predict(self, odometry: Odometry) -> None:
@@ -67,7 +80,7 @@ class InvariantEkfSlam(EkfSlam):
             self._wheels.reset(n, w[rows : rows + SPARE_ROWS : 2])
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
-        kept = None if self._wheels is None else self._wheels.copy()
+        kept = None if self._wheels is None else self._wheels.snapshot()
         value = super()._fit(z, match, scan)
         if self._wheels is not None and kept is not None:  # this correction is only a trial
             self._wheels.restore(kept)
@@ -89,6 +102,11 @@ class InvariantEkfSlam(EkfSlam):
         self._delta = np.zeros(len(self._x))
         if self._wheels is not None:
             self._wheels.enlarge(len(self._x))
+
+    @property
+    def wheel_errors(self) -> tuple[Array, Array] | None:
+        """Relative errors of the four radii and the lever ``(5,)`` and their covariance; ``None`` if no states."""
+        return None if self._wheels is None else (self._wheels.mean.copy(), self._wheels.cov.copy())
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""

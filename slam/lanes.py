@@ -42,8 +42,9 @@ try:
 except RuntimeError:  # LLVM cannot tell on every kind of machine
     _FEATURES = {}
 LANES = 8 if _FEATURES.get("avx512f", False) else 4
-# Fused where the machine can, and always there. Left to the compiler ("contract"), which products and sums are
-# rounded once depends on what it inlines, and that on which kernels come from the cache.
+# Fused where an x86 machine can, and always there (elsewhere never: other last bits). Left to the compiler
+# ("contract"), which products and sums are rounded once depends on what it inlines, and that on which kernels come
+# from the cache.
 _FUSED = bool(_FEATURES.get("fma", False))
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)

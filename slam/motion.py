@@ -23,13 +23,13 @@ class LastingErrors:
 
     radius_sigma: float = 0.0  # relative
     lever_sigma: float = 0.0  # relative
-    speed_share: float = 0.0  # as OdometryNoise has them, of the white part alone
-    turn_share_rad_m: float = 0.0
+    white_speed_share: float | None = None  # OdometryNoise's shares without what lasts; None: all of them
+    white_turn_share_rad_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("radius_sigma", "lever_sigma", "speed_share", "turn_share_rad_m"):
+        for name in ("radius_sigma", "lever_sigma", "white_speed_share", "white_turn_share_rad_m"):
             value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"LastingErrors.{name} must be ≥ 0")
+            require(value is None or (math.isfinite(value) and value >= 0), f"LastingErrors.{name} must be ≥ 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ class OdometryNoise:
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: float = 0.6  # of the change beyond that
-    lasting: LastingErrors | None = None  # what of it a filter may take for states: see slam.wheel_errors
+    lasting: LastingErrors | None = None  # what of it invariant-ekf takes for states: see slam.wheel_errors
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
@@ -74,8 +74,13 @@ class OdometryNoise:
         """Return V of a filter that has the lasting errors as states."""
         if self.lasting is None:
             return self
-        share, turn = self.lasting.speed_share, self.lasting.turn_share_rad_m
-        return replace(self, speed_share=share, turn_share_rad_m=turn, lasting=None)
+        share, turn = self.lasting.white_speed_share, self.lasting.white_turn_share_rad_m
+        return replace(
+            self,
+            speed_share=self.speed_share if share is None else share,
+            turn_share_rad_m=self.turn_share_rad_m if turn is None else turn,
+            lasting=None,
+        )
 
     def slip(self, before: tuple[float, float, float], now: tuple[float, float, float], dt: float) -> float:
         """Return by how much [m/s] the wheels' speed changed beyond what the floor passes on in ``dt`` [s]."""

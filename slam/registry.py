@@ -11,7 +11,7 @@ from slam.dead_reckoning import OdometrySlam, TruthSlam
 from slam.dp_slam import DpSlam, DpSlamConfig
 from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
 from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
-from slam.invariant import InvariantEkfSlam
+from slam.invariant import InvariantEkfConfig, InvariantEkfSlam
 from slam.settings import from_mapping, unknown_name
 
 __all__ = ["config_type", "make", "names"]
@@ -21,7 +21,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "truth": (TruthSlam, EkfConfig),
     "ekf": (EkfSlam, EkfConfig),
     "ekf-lines": (EkfSlam, EkfLinesConfig),
-    "invariant-ekf": (InvariantEkfSlam, EkfLinesConfig),
+    "invariant-ekf": (InvariantEkfSlam, InvariantEkfConfig),
     "compressed-ekf": (CompressedEkfSlam, CompressedEkfConfig),
     "fastslam1": (FastSlam1, FastSlamConfig),
     "fastslam2": (FastSlam2, FastSlamConfig),

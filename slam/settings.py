@@ -30,8 +30,9 @@ def require(condition: bool, message: str) -> None:
 def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T | None = None) -> T:
     """Build a config dataclass from a mapping, laid over ``base`` (or over the defaults).
 
-    An instance passes through, ``None`` gives the base. Nested dataclasses take nested mappings; lists become
-    tuples and integers floats where the field says so. Unknown keys raise ``ValueError``.
+    An instance passes through, ``None`` gives the base; of a field that may be None it is None. Nested dataclasses
+    take nested mappings; lists become tuples and integers floats where the field says so. Unknown keys raise
+    ``ValueError``.
     """
     if isinstance(values, cls):
         return values

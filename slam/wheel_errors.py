@@ -4,16 +4,16 @@ A wheel a hundredth too large claims a hundredth too little in every step. A fil
 is too unsure at first, when little has added up, and too sure in the end. With the errors e as states, which stay
 as they are, the twist is
 
-    u = ũ + B(ũ) e,   B's column of wheel i: uᵢ/4 (1, yᵢ, wᵢ/l),  of the lever: (0, 0, ω)
+    u = ũ + B(ũ) e,   B's column of wheel i: uᵢ/4 (1, yᵢ, tᵢ/l),  of the lever: (0, 0, ω)
 
-ũ being the twist that the wheels claim and uᵢ = vx + yᵢ vy + wᵢ l ω how fast wheel i rolls. e is correlated with
+ũ being the twist that the wheels claim and uᵢ = vx + yᵢ vy + tᵢ l ω how fast wheel i rolls. e is correlated with
 the robot and every landmark. Its own covariance E and the cross-covariance C stand beside P:
 
     predict   C_r ← C_r Fxᵀ + E Dᵀ,   P_rm += D C_m,   P_rr += D C_r Fxᵀ + (D C_r Fxᵀ)ᵀ + D E Dᵀ,   D = Fu B
     update    W_e = L⁻¹ H Cᵀ,   e += W_eᵀ L⁻¹ ν,   C −= W_eᵀ W,   E −= W_eᵀ W_e
 
-(theory.md A with the state enlarged; W and L are :mod:`slam.stacked_update`'s). Only sums of the four radii that
-the rollers leave visible matter: with all three components of the twist, all five errors show.
+(theory.md A with the state enlarged; W and L are :mod:`slam.stacked_update`'s). Driving one way
+shows one combination of the four radii; twists in all three components show all five errors.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ class WheelErrors:
         self.mean = np.zeros(_STATES)
         self.cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
         self.cross = aligned_zeros(_STATES, size)  # C: of each error with the robot and the landmarks
-        self._w = aligned_zeros(2 * observations, 2 * LANES)
+        self._w = aligned_zeros(2 * observations, 2 * LANES)  # W_e; solve takes two vectors of a row at a time
         self._b = np.zeros((3, _STATES))
 
-    def copy(self) -> tuple[Array, Array, Array]:
+    def snapshot(self) -> tuple[Array, Array, Array]:
         """Return what :meth:`restore` takes."""
         return self.mean.copy(), self.cov.copy(), self.cross.copy()
 
@@ -103,6 +103,7 @@ def _twist_by_errors(twist: Array, lever: float, b: Array) -> None:
 def _predict(
     p: Array, n: int, cross: Array, cov: Array, b: Array, before: Array, after: Array, omega: float, dt: float
 ) -> None:
+    """C_r ← C_r Fxᵀ + E Dᵀ, and what the errors add to the robot's rows of P."""
     # Fx's entries by θ are J times the step, Fu's a rotation by the heading half way and half of Fx's.
     fx, fy = -(after[1] - before[1]), after[0] - before[0]
     middle = before[2] + 0.5 * omega * dt
@@ -135,6 +136,7 @@ def _correct(
     mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
     we: Array, rows: int,
 ) -> None:  # fmt: skip
+    """W_e = L⁻¹ H Cᵀ, e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
     a = 0
     for k in range(match.shape[0]):
         if match[k] < 0:
@@ -157,6 +159,7 @@ def _correct(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reset(cross: Array, n: int, a: Array) -> None:
+    """C ← C (I + A S)ᵀ, S taking θ, x and y (invariant-ekf.md, Reset)."""
     for i in range(_STATES):
         theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
         for j in range(n):

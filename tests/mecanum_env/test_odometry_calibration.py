@@ -8,9 +8,10 @@ import math
 import numpy as np
 import pytest
 
-from mecanum_env.calibration import odometry_noise
-from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig, RobotConfig
+from mecanum_env.calibration import backend_settings, odometry_noise
+from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, EnvConfig, NoiseConfig, RobotConfig
 from mecanum_env.odometry_calibration import Drives, drift_ratios, drive, fit, open_floor
+from mecanum_env.sensors import WheelEncoders
 from slam.geometry import wrap
 from slam.motion import OdometryNoise
 from training.calibrate import main
@@ -95,6 +96,25 @@ def test_the_declared_v_is_the_measured_one(preset: str) -> None:
         assert told.speed_share == pytest.approx(found.speed_share, rel=0.2)
         assert told.turn_share_rad_m == pytest.approx(found.turn_share_rad_m, rel=0.2)
     assert all(0.7 < ratio < 1.2 for ratio in drift_ratios(drives, declared))
+
+
+def test_the_lasting_errors_declared_are_those_that_are_drawn() -> None:
+    noise = NOISE_PRESETS["slippery"]
+    drawn = [WheelEncoders(ROBOT, noise, np.random.default_rng(seed)) for seed in range(1000)]
+    told = odometry_noise(ROBOT, noise).lasting
+    assert told is not None
+    radii = np.array([e.true_radii for e in drawn]) / ROBOT.wheel_radius_m - 1.0
+    levers = np.array([e.true_lever for e in drawn]) / ROBOT.lever_m - 1.0
+    assert np.std(radii) == pytest.approx(told.radius_sigma, rel=0.05)
+    assert np.std(levers) == pytest.approx(told.lever_sigma, rel=0.05)
+
+
+def test_a_v_of_one_s_own_is_the_whole_of_it() -> None:
+    """Shares given for the odometry replace what follows from the noise, the filter's states for it included."""
+    whole = backend_settings(EnvConfig(slam_config={"odometry": {"speed_share": 0.5}}))["odometry"]
+    assert whole["speed_share"] == 0.5 and "lasting" not in whole
+    other = backend_settings(EnvConfig(slam_config={"odometry": {"grip_m_s2": 1.0}}))["odometry"]
+    assert other["lasting"]["radius_sigma"] > 0.0
 
 
 def test_the_command_prints_measured_beside_declared(capsys: pytest.CaptureFixture[str]) -> None:

@@ -100,15 +100,31 @@ def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None
     assert abs(direction - math.atan2(-1, -1)) < 0.1
 
 
+@pytest.mark.parametrize("thick", [0.1, 0.3])
+def test_an_end_face_that_noise_hides_is_in_the_covariance(thick: float) -> None:
+    """From the sides a wall's end face is seen, and its first points pass for the wall's: no heavy tail."""
+    nees = np.array(ends_of_a_wall(0.03, thick=thick, from_x=(1.0, 5.0))[1])
+    assert 0.4 < np.mean(nees) / 2 < 0.7
+    assert np.quantile(nees, 0.99) < 13.0  # of χ² with two degrees of freedom 9.2
+
+
 @pytest.mark.parametrize("sigma", [0.01, 0.03])
 def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from(sigma: float) -> None:
     """The two ends of a free-standing wall, their bias and spread against the declared covariance."""
-    wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.3], [2.0, 3.3]])
+    errors, nees = ends_of_a_wall(sigma, thick=0.3, from_x=(2.2, 3.8))
+    assert len(errors) > 300
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.004
+    assert 0.7 < np.mean(nees) < 2.2
+
+
+def ends_of_a_wall(sigma: float, *, thick: float, from_x: tuple[float, float]) -> tuple[list, list]:
+    """Errors (range, bearing) and NEES of both ends of a wall, seen from its south."""
+    wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.0 + thick], [2.0, 3.0 + thick]])
     rng = np.random.default_rng(0)
     extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
     errors, nees = [], []
     for _ in range(200):
-        pose = np.array([rng.uniform(2.2, 3.8), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
+        pose = np.array([rng.uniform(*from_x), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
         scan = polygon_scan(pose, [ROOM, wall])
         scan.ranges[:] += sigma * rng.standard_normal(BEAMS)
         extractor.extract(scan)
@@ -121,9 +137,7 @@ def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from(sigma: float) ->
             e = error[np.argmin(np.abs(error).sum(1))]
             errors.append(e)
             nees.append(e @ np.linalg.solve(cov, e))
-    assert len(errors) > 300
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.004
-    assert 0.7 < np.mean(nees) < 2.2
+    return errors, nees
 
 
 def test_noise_neither_turns_nor_moves_the_walls_of_a_closet() -> None:
