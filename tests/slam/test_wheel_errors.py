@@ -253,7 +253,7 @@ def test_landmarks_come_and_go_with_their_correlations() -> None:
         Observations(many, np.tile(R, (40, 1, 1)), np.arange(1000, 1040))
     )  # more than there was room for
     n, pose_rows = filter_._n, filter_._wheels.cross[:, :3].copy()
-    x, y, theta = filter_.pose
+    theta = float(filter_.pose[2])
     last = many[-1, 1] + theta
     rx, ry = np.array([math.cos(theta), math.sin(theta)]) * OFFSET + many[-1, 0] * np.array(
         [math.cos(last), math.sin(last)]
