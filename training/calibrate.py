@@ -43,6 +43,7 @@ def compare(preset: str, *, episodes: int, steps: int, seed: int) -> dict[str, A
         "lasting": _terms(found.lasting),
         "lasting_without_gain": _terms(fit(corrected, robot.lever_m).lasting),
         "declared": _terms(declared),
+        "declared_white": _terms(declared.white()),
         "drift_ratio_declared": drift_ratios(drives, declared),
         "drift_ratio_lasting": drift_ratios(drives, found.lasting),
         "gain": found.gain.tolist(),
@@ -60,7 +61,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     head = f"{'':<30}{'v floor':>9}{'v share':>9}{'ω floor':>9}{'ω share':>9}{'drift² v':>10}{'drift² ω':>10}"
     lines = [head]
     for preset, result in results.items():
-        for kind in ("white", "lasting", "lasting_without_gain", "declared"):
+        for kind in ("white", "declared_white", "lasting", "lasting_without_gain", "declared"):
             row = "".join(f"{result[kind][name]:>9.4f}" for name in _TERMS)
             ratios = result.get(f"drift_ratio_{kind}")
             row += "" if ratios is None else "".join(f"{ratio:>10.2f}" for ratio in ratios)
