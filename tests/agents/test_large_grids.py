@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from agents import cost_map as cost_maps
 from agents.coarsening import FAR_M, coarsen, known_extent
 from agents.cost_map import CostMap, PlannerConfig
-from agents.frontiers import FrontierConfig, _borders_a_large_pocket, clusters, find
+from agents.frontiers import FrontierConfig, _borders_a_large_pocket, _clusters, find
 from agents.planning import travel_costs
 from agents.sight import Watch, first_in_good_sight, in_good_sight
 from mecanum_env.config import RobotConfig
@@ -122,7 +122,7 @@ def test_clusters_against_opencv(seed):
     rng = np.random.default_rng(seed)
     mask = rng.random(rng.integers(1, 60, 2)) < rng.random() ** 2
     cells = np.argwhere(mask)
-    labels, boxes = clusters(cells, mask.shape)
+    labels, boxes = _clusters(cells, mask.shape)
     count, expected, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     np.testing.assert_array_equal(labels, expected[mask] - 1)
     np.testing.assert_array_equal(boxes, stats[1:, [cv2.CC_STAT_HEIGHT, cv2.CC_STAT_WIDTH]])
