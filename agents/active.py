@@ -1,8 +1,9 @@
 """Active SLAM: where to go, when to look first and how gently to drive, by the uncertainty it would leave.
 
-A frontier's price is the time to get there, less what is expected to be seen there, plus what the way would leave
-of the pose's uncertainty (:mod:`agents.foresight`; D-optimality, Carrillo et al., 2012). Where a detour past well
-known landmarks leaves so much less that it pays, the robot goes back there first.
+A frontier's price is how late all that is left would be seen, on the best tour that begins with it
+(:mod:`agents.tour`), plus what the way there would leave of the pose's uncertainty (:mod:`agents.foresight`;
+D-optimality, Carrillo et al., 2012). Where a detour past well known landmarks leaves so much less that it pays,
+the robot goes back there first.
 
 What a map gets wrong at its very beginning it never loses. The start pose is known by definition; a robot that
 drives off before its landmarks are settled has its wheels alone to tell where it was when it first saw them, and
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 
 from agents import cost_map as cost_maps
 from agents.base import Goal
-from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.explorer import Candidates
 from agents.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
-from agents.gain import expected_area
 from agents.grip import GentleFollower, WheelWatch
 from agents.planning import shortest_path
 from agents.sightings import expected_sightings
+from agents.tour import Outlook, Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief
@@ -40,13 +41,14 @@ Array = NDArray[np.float64]
 class LookConfig:
     """How long to look before the first drive."""
 
-    at_most_s: float = 3.0
+    at_most_s: float = 6.0
     blind_s: float = 0.5  # … where nothing is seen that could be a landmark
     step_s: float = 0.5  # what looking on for so long would bring is asked
     most: int = 24  # landmarks that are counted
+    worth: float = 4.0  # times what the spread is worth on the way: this error is that of everything seen later
 
     def __post_init__(self) -> None:
-        for name in ("at_most_s", "blind_s", "step_s", "most"):
+        for name in ("at_most_s", "blind_s", "step_s", "most", "worth"):
             value = getattr(self, name)
             require(math.isfinite(value) and value > 0, f"LookConfig.{name} must be > 0, got {value}")
 
@@ -67,34 +69,42 @@ class RevisitConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ActiveConfig(ExplorerConfig):
+class ActiveConfig(TourConfig):
     """The parts of the agent, and what it weighs against time."""
 
     foresight: ForesightConfig = field(default_factory=ForesightConfig)
     look: LookConfig = field(default_factory=LookConfig)
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
     worth_s_per_m: float = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
-    area_s: float = 4.0  # time that ln(1 + expected new area / 1 m²) is worth
+    delay: float = 3.0  # what a second's delay of what is left to see costs [s]
     switch_s: float = 1.5  # another frontier must be better by this …
     switch_share: float = 0.15  # … and by this share of the way to the present one
-    most: int = 5  # candidates that are thought through: the cheapest to reach
-    gentle_m_s2: float = 0.6  # acceleration on a floor found slippery
+    most: int = 5  # candidates that are thought through: the cheapest to reach, and where the best tour begins
+    thought_tries: int = 2  # choices of view points that the best tour from each is taken from
+    gentle_m_s2: float = 0.6  # acceleration on a floor found slippery …
+    gentle_speed_share: float = 0.8  # … and speed, as a share of the robot's limit: more looks at what it passes
     firm_share: float = 0.02  # of the wheels' speed: no greater error of the odometry is taken for slip …
     slippery_share: float = 0.04  # … from here on it is driven as gently as it can be
 
     def __post_init__(self) -> None:
-        for name in ("worth_s_per_m", "area_s", "switch_s", "switch_share"):
+        super().__post_init__()
+        for name in ("worth_s_per_m", "delay", "switch_s", "switch_share"):
             value = getattr(self, name)
             require(math.isfinite(value) and value >= 0, f"ActiveConfig.{name} must be ≥ 0, got {value}")
-        require(self.most >= 1, f"ActiveConfig.most must be at least 1, got {self.most}")
+        for name in ("most", "thought_tries"):
+            require(getattr(self, name) >= 1, f"ActiveConfig.{name} must be at least 1, got {getattr(self, name)}")
         require(self.gentle_m_s2 > 0, f"ActiveConfig.gentle_m_s2 must be > 0, got {self.gentle_m_s2}")
+        require(
+            0 < self.gentle_speed_share <= 1,
+            f"ActiveConfig.gentle_speed_share must be above 0 and at most 1, got {self.gentle_speed_share}",
+        )
         require(
             0 < self.firm_share < self.slippery_share,
             "ActiveConfig needs 0 < firm_share < slippery_share",
         )
 
 
-class ActiveSlam(Explorer):
+class ActiveSlam(Tour):
     """Explores so that the map becomes good: every way is priced by the uncertainty that it would leave, too."""
 
     def __init__(
@@ -112,7 +122,7 @@ class ActiveSlam(Explorer):
         config = self._config
         self._gentle = GentleFollower(
             config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s,
-            gentle_m_s2=config.gentle_m_s2,
+            gentle_m_s2=config.gentle_m_s2, gentle_speed_share=config.gentle_speed_share,
         )  # fmt: skip
         self._follower = self._gentle
         self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * config.firm_share)
@@ -127,7 +137,9 @@ class ActiveSlam(Explorer):
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the frontier of the least price; note down a detour to make first, if one pays."""
         config = self._config
-        prices, paths, chosen = self._price(candidates, belief)
+        if self._outlook is None:  # on stations: noise-free sensing leaves nothing to weigh
+            return super().pick(candidates, belief)
+        prices, paths, chosen = self._price(candidates, self._outlook, belief)
         best = chosen[int(np.argmin(prices))]
         current = candidates.current
         if current is not None and current in chosen:
@@ -139,27 +151,25 @@ class ActiveSlam(Explorer):
         self._weigh_detour(candidates, belief, paths[index], prices[index])
         return best
 
-    def _price(self, candidates: Candidates, belief: Belief) -> tuple[list[float], list[Array], list[int]]:
+    def _price(
+        self, candidates: Candidates, outlook: Outlook, belief: Belief
+    ) -> tuple[list[float], list[Array], list[int]]:
         """Return prices [s] and paths of the candidates that are thought through, and which they are."""
         config = self._config
-        order = np.argsort(candidates.costs, kind="stable")[: config.most]
-        chosen = [int(i) for i in order if np.isfinite(candidates.costs[i])]
-        current = candidates.current
-        if current is not None and current not in chosen and np.isfinite(candidates.costs[current]):
-            chosen.append(current)
-        areas = expected_area(
-            candidates.cost_map, candidates.cells[chosen], range_m=self._lidar.range_max_m, depth_m=2.0
-        )
+        views = outlook.pieces
+        places = np.arange(min(config.most, len(views)))
+        kept = np.flatnonzero((views == self._index) | (views == candidates.current))
         foresight, marks = self._foresight(), marks_of(belief)
-        prices, paths = [], []
-        for i, area in zip(chosen, areas, strict=True):
-            path = self._path(candidates, belief, (int(candidates.cells[i, 0]), int(candidates.cells[i, 1])))
+        prices, paths, chosen = [], [], []
+        for k in np.union1d(places, kept).tolist():
+            piece = int(views[k])
+            row, column = candidates.cells[piece].tolist()
+            path = self._path(candidates, belief, (row, column))
+            delay_s = outlook.delay_m(k + 1, config.thought_tries) / config.foresight.speed_m_s
+            spread = self._spread_after(foresight, marks, candidates, path)
+            prices.append(config.delay * delay_s + config.worth_s_per_m * spread)
             paths.append(path)
-            time_s = float(candidates.costs[i]) / config.foresight.speed_m_s
-            prices.append(
-                time_s - config.area_s * math.log1p(float(area))
-                + config.worth_s_per_m * self._spread_after(foresight, marks, candidates, path)
-            )  # fmt: skip
+            chosen.append(piece)
         return prices, paths, chosen
 
     def _path(self, candidates: Candidates, belief: Belief, cell: tuple[int, int]) -> Array:
@@ -266,7 +276,7 @@ class ActiveSlam(Explorer):
         spread = spread_m(anchoring(marks, seen[0], self._lidar.offset_m), config.foresight.lever_m)
         further = config.look.step_s
         drop = spread * (1.0 - math.sqrt(looked_s / (looked_s + further)))
-        return not drop * config.worth_s_per_m < further
+        return not drop * config.look.worth * config.worth_s_per_m < further
 
     def _remember(self, belief: Belief) -> None:
         """Note down every little way how well the pose is known there."""

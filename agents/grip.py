@@ -79,12 +79,13 @@ class WheelWatch:
 
 
 class GentleFollower(PathFollower):
-    """Speeds up and brakes no harder than a slippery floor lets it, once the wheels have shown that it is one."""
+    """Drives, speeds up and brakes as gently as a slippery floor asks for, once the wheels have told of it."""
 
     def __init__(
-        self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float, gentle_m_s2: float
-    ) -> None:
-        self._usual, self._gentle = config, min(gentle_m_s2, config.acceleration_m_s2)
+        self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float, gentle_m_s2: float,
+        gentle_speed_share: float = 1.0,
+    ) -> None:  # fmt: skip
+        self._usual, self._gentle, self._gentle_share = config, gentle_m_s2, gentle_speed_share
         self._sent = (np.zeros(2), 0.0)
         super().__init__(config, robot=robot, lidar=lidar, step_s=step_s)
 
@@ -94,17 +95,19 @@ class GentleFollower(PathFollower):
         self._sent = (np.zeros(2), 0.0)
 
     def go_gently(self, share: float) -> None:
-        """Take this much (0 … 1) of the way from the usual acceleration to the gentle one."""
+        """Take this much (0 … 1) of the way from the usual speed and acceleration to the gentle ones."""
         usual = self._usual
 
-        def between(value: float) -> float:
-            return value + share * (min(value, self._gentle) - value)
+        def between(value: float, gentle: float) -> float:
+            return value + share * (min(value, gentle) - value)
 
         self.config = replace(
             usual,
-            acceleration_m_s2=between(usual.acceleration_m_s2),
-            deceleration_m_s2=between(usual.deceleration_m_s2),
+            speed_share=between(usual.speed_share, self._gentle_share),
+            acceleration_m_s2=between(usual.acceleration_m_s2, self._gentle),
+            deceleration_m_s2=between(usual.deceleration_m_s2, self._gentle),
         )
+        self._max_speed = self.config.speed_share * self._robot.max_speed_m_s
 
     def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the next twist ``(3,)`` on the way to a stand: wheels stopped at once slide, and tell nothing."""

@@ -26,10 +26,12 @@ from slam.occupancy import FREE
 from slam.settings import from_mapping, require
 from slam.types import Belief
 
-__all__ = ["StationsConfig", "Tour", "TourConfig"]
+__all__ = ["Outlook", "StationsConfig", "Tour", "TourConfig"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
+
+_FAR = 1e6  # [m] farther than anything is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +67,32 @@ class TourConfig(ExplorerConfig):
             require(getattr(self, name) >= 1, f"TourConfig.{name} must be at least 1, got {getattr(self, name)}")
 
 
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What a tour is planned from: view points, what is seen from each, and the ways between them."""
+
+    pieces: Cells  # (n,) piece of frontier that each view point belongs to
+    sight: NDArray[np.bool_]  # (n + 1, m) what each place sees of the pieces; row 0 is the robot's
+    distance: Array  # (n + 1, n + 1) [weighted m]
+    weight: Array  # (n + 1,) price of reaching each place a metre later
+
+    def tour(self, tries: int) -> tuple[Cells, float]:
+        """Return the best tour found, as places in order from 0, and what it costs."""
+        return best_tour(self.sight, self.distance, self.weight, draw_luck(tries, len(self.sight)))
+
+    def delay_m(self, place: int, tries: int) -> float:
+        """Return how far off what is left to see is [m], by the best tour found to begin with a place (1 … n).
+
+        What that tour costs, divided by the weights of all places and one for its end.
+        """
+        others = np.arange(len(self.sight)) != place
+        distance = self.distance.copy()
+        distance[0, others] += _FAR
+        sight = np.column_stack([self.sight, ~others])  # what only this place sees, so that it must be on the tour
+        _, cost = best_tour(sight, distance, self.weight, draw_luck(tries, len(sight)))
+        return cost / (1.0 + float(self.weight.sum()))
+
+
 class Tour(Explorer):
     """Goes to the first place of the best tour over all that is left to look at."""
 
@@ -87,6 +115,7 @@ class Tour(Explorer):
 
     def _candidates(self, belief: Belief) -> Candidates:
         """Return the candidates, the first place of the tour put in as the view point of what is picked."""
+        self._outlook: Outlook | None = None
         found = super()._candidates(belief)
         open_ = np.flatnonzero(np.isfinite(found.costs))
         if not len(open_):
@@ -112,9 +141,8 @@ class Tour(Explorer):
         sight[1 + np.arange(len(owner)), first] = True
         if found.current is not None:
             self._hold(distance, np.asarray(sight[:, near == found.current].any(axis=1)))
-        order, _ = best_tour(
-            sight, distance, self._weights(found, places), draw_luck(self.config.tries, len(places))
-        )
+        self._outlook = Outlook(owner, sight, distance, self._weights(found, places))
+        order, _ = self._outlook.tour(self.config.tries)
         return int(owner[order[1] - 1])
 
     def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> NDArray[np.bool_]:

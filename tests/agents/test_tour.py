@@ -15,7 +15,7 @@ from agents.cost_map import PlannerConfig
 from agents.planning import travel_costs
 from agents.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost
 from agents.stations import count_in_sight, in_sight, join, line_is_free, ways
-from agents.tour import TourConfig
+from agents.tour import Outlook, TourConfig
 from agents.travel import between
 from mecanum_env.config import RobotConfig
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
@@ -80,6 +80,29 @@ def test_a_tour_sees_all_that_can_be_seen(seed, n, m, tries):
     assert cost == pytest.approx(order_cost(distance, np.zeros(n), order))
     again, _ = best_tour(sight, distance, np.zeros(n), draw_luck(tries, n))
     np.testing.assert_array_equal(order, again)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds, n=st.integers(2, 6))
+def test_the_delay_of_a_tour_that_begins_somewhere_against_all_that_do(seed, n):
+    """Every place sees one piece of its own, so that a tour is an order of them all."""
+    distance, rng = places(seed, n), np.random.default_rng(seed)
+    weight = rng.uniform(0.0, 1.0, n) * (np.arange(n) > 0)
+    outlook = Outlook(np.arange(n - 1), np.eye(n, dtype=bool)[:, 1:], distance, weight)
+    for place in range(1, n):
+        others = [k for k in range(1, n) if k != place]
+        best = min(order_cost(distance, weight, np.array((0, place, *rest))) for rest in permutations(others))
+        delay = outlook.delay_m(place, 2) * (1.0 + weight.sum())
+        assert best - 1e-9 <= delay <= 1.15 * best + 1e-9
+    order, cost = outlook.tour(2)
+    assert outlook.delay_m(int(order[1]), 2) * (1.0 + weight.sum()) == pytest.approx(cost, rel=0.15)
+
+
+def test_a_tour_can_be_made_to_begin_with_a_place_that_it_does_not_need():
+    sight = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=bool)
+    distance = np.array([[0, 3, 3, 1], [3, 0, 6, 2], [3, 6, 0, 2], [1, 2, 2, 0]], dtype=float)
+    outlook = Outlook(np.arange(3), sight, distance, np.zeros(4))
+    assert outlook.delay_m(3, 3) == 1.0 and outlook.delay_m(1, 3) == 3.0 + 2.0
 
 
 def test_one_place_that_sees_both_is_enough():
