@@ -1,8 +1,8 @@
 """The network that scores candidates, in NumPy: what was trained runs without PyTorch.
 
-Tokens, one a candidate, look at each other by attention (Vaswani et al., 2017), weaker the farther apart their view
-points lie (a bias linear in the distance, as in Press et al., "Train short, test long", ICLR 2022). There are no
-positions in the row of candidates: permuted candidates get permuted scores, and any number of them will do.
+Tokens, one a candidate, look at each other by attention (Vaswani et al., 2017), weaker the farther apart their
+view points lie (a bias linear in the distance, as in Press et al., "Train short, test long", ICLR 2022). There are
+no positions in the row of candidates: permuted candidates get permuted scores, and any number of them will do.
 """
 
 from __future__ import annotations

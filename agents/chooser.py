@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.outlook import Choice, ChoiceConfig, describe
@@ -60,9 +59,7 @@ class Chooser(Explorer):
         self._found = super()._candidates(belief)
         if not np.isfinite(self._found.costs).any():
             return None
-        choice = describe(
-            self._found, belief, self.config.choice, range_m=self._range_m, time_s=self._time
-        )
+        choice = describe(self._found, belief, self.config.choice, range_m=self._range_m, time_s=self._time)
         self._last = choice, self._found
         return choice
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, SupportsInt
+from typing import Any, SupportsInt, cast
 
 import gymnasium
 import numpy as np
@@ -102,7 +102,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         self._limited = TimeLimit(self.base, max_episode_steps=limit)
         self.discount, self.render_mode = discount, render_mode
         self.action_space = spaces.Discrete(self.driver.choice.most)
-        self.observation_space = choice_space(self.driver)
+        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
         self._agent = Chooser(
             self.driver, robot=self.config.robot, lidar=self.config.lidar, step_s=self.config.step_s
         )
@@ -173,7 +173,8 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         info["duration_s"] = steps * config.step_s
         if terminated or truncated:
             covered = bool(info.get("is_success", False))
-            info["end"] = "covered" if covered else "time" if truncated else "collision" if not idle else agent.status
+            given_up = agent.status if idle >= patience else "collision"
+            info["end"] = "covered" if covered else "time" if truncated else given_up
             info.setdefault("is_success", False)
             info.setdefault("episode_metrics", self.base.episode_metrics())
         return as_observation(self._choice, self.driver), total, bool(terminated), bool(truncated), info

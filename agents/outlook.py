@@ -13,7 +13,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.cost_map import CostMap
 from agents.explorer import Candidates
 from agents.gain import expected_area
 from agents.travel import between
@@ -108,9 +107,7 @@ def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m
     ])  # fmt: skip
     patches = np.zeros((len(index), 2, config.patch_cells, config.patch_cells), dtype=np.uint8)
     frame = np.array([*cost_map.origin, cost_map.resolution])
-    _cut_patches(
-        cost_map.classes, frame, targets, normals, config.patch_m, config.beyond_m, pose[:2], patches
-    )
+    _cut_patches(cost_map.classes, frame, targets, normals, config.patch_m, config.beyond_m, pose[:2], patches)
     places = np.vstack([np.asarray(cost_map.start)[None], cells])
     distances = between(cost_map, found.travel, places, searched=0)[1:, 1:] / 10.0
     known = float((cost_map.classes == FREE).sum()) * cost_map.resolution**2
@@ -133,7 +130,7 @@ def _direction(vectors: Array, heading: float) -> Array:
     """Return the directions ``(2, m)`` of vectors ``(m, 2)``: ahead and to the left, shorter than 1 near by."""
     length = np.maximum(np.hypot(*vectors.T), 0.3)
     c, s = math.cos(heading), math.sin(heading)
-    return np.stack([vectors @ np.array([c, s]), vectors @ np.array([-s, c])]) / length
+    return np.asarray(np.stack([vectors @ np.array([c, s]), vectors @ np.array([-s, c])]) / length)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

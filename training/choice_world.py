@@ -32,7 +32,9 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._world = world
         self._rng = np.random.default_rng(0)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in rooms of the next draw."""
         if seed is not None:
             self._rng = np.random.default_rng(seed)

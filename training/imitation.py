@@ -28,11 +28,10 @@ class Lessons:
     returns: NDArray[np.float32]  # (n,) discounted, from there on
 
 
-def give_lessons(config: TrainConfig, *, workers: int) -> Lessons:
-    """Return a teacher's choices in as many episodes as the configuration says, the same in any number of workers."""
+def give_lessons(config: TrainConfig, pool: ProcessPoolExecutor) -> Lessons:
+    """Return a teacher's choices in as many episodes as the configuration says, however many workers give them."""
     jobs = [(config, k) for k in range(config.imitation.episodes)]
-    with ProcessPoolExecutor(workers) as pool:
-        parts = list(pool.map(_episode, jobs, chunksize=4))
+    parts = list(pool.map(_episode, jobs, chunksize=4))
     keys = parts[0].observations
     return Lessons(
         {key: np.concatenate([part.observations[key] for part in parts]) for key in keys},
@@ -89,7 +88,7 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
         for rows in np.array_split(rng.permutation(train), batches):
             loss, _ = _loss(network, lessons, rows)
             optimizer.zero_grad()
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimizer.step()
             schedule.step()

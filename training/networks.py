@@ -133,7 +133,7 @@ class _Head(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         network, present = self._network[0], features[:, -self._k :]
-        tokens = features[:, : -self._k].unflatten(1, (self._k, network.width))
+        tokens = features[:, : -self._k].reshape(-1, self._k, network.width)
         return network.value(tokens, present) if self._value else network.scores(tokens)
 
 
@@ -141,15 +141,17 @@ class ChoicePolicy(MaskableActorCriticPolicy):
     """:class:`ChoiceNetwork` as the policy of ``MaskablePPO``."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **{"features_extractor_class": ChoiceExtractor, "net_arch": []} | kwargs)
+        settings: dict[str, Any] = {"features_extractor_class": ChoiceExtractor, "net_arch": []}
+        super().__init__(*args, **(settings | kwargs))
 
     def _build(self, lr_schedule: Schedule) -> None:
         extractor = cast("ChoiceExtractor", self.features_extractor)
         k = int(cast("spaces.Discrete", self.action_space).n)
-        self.mlp_extractor = _Whole(extractor.features_dim)
+        self.mlp_extractor = _Whole(extractor.features_dim)  # type: ignore[assignment]
         self.action_net = _Head(extractor.network, k, value=False)
-        self.value_net = _Head(extractor.network, k, value=True)
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+        self.value_net = _Head(extractor.network, k, value=True)  # type: ignore[assignment]
+        make: Any = self.optimizer_class
+        self.optimizer = make(self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
 
     @property
     def network(self) -> ChoiceNetwork:

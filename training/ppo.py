@@ -1,172 +1,208 @@
 """Training of ``ppo-frontier``: a warm start by imitation, then PPO, checkpointed so that it goes on exactly.
 
-A run is a chain of chunks of rollouts. Each begins with fresh episodes and random numbers that follow from the run's
-seed and the chunk's number alone, so that a run that was killed and resumed is the one that was not, bit for bit.
+A run is a chain of chunks of rollouts. Each begins with fresh episodes and random numbers that follow from the
+run's seed and the chunk's number alone, so that a run that was killed and resumed is the one that was not, bit for
+bit.
 """
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor
 
+from agents.choice_network import ChoiceNetwork
 from slam.formats import atomic_write
 from slam.settings import to_mapping
 from training.choice_world import make_world
 from training.imitation import give_lessons, learn
 from training.networks import ChoicePolicy
 from training.semi_markov import Durations, SemiMarkovBuffer
-from training.train_config import TrainConfig
+from training.train_config import TrainConfig, WorldConfig
 
-__all__ = ["train"]
+__all__ = ["Run", "evaluate"]
 
 Log = Callable[[str], None]
+Weights = dict[str, NDArray[np.float32]]
+
+_FIRST_VALIDATION_SEED = 1000
 
 
-def train(config: TrainConfig, out: Path, *, workers: int, log: Log) -> None:
-    """Train a policy into a folder, or go on where the folder's run was broken off.
+class Run:
+    """A training run in a folder: begun there, or gone on with.
 
-    ``out`` gets ``config.json``, ``checkpoint.zip`` (stable-baselines3) with ``progress.json``, ``best.zip`` and
-    ``curve.jsonl``, a line per evaluation, and TensorBoard's files.
+    The folder gets ``checkpoint.zip`` (stable-baselines3), ``progress.json``, ``best.zip``, ``curve.jsonl`` with a
+    line per evaluation, and TensorBoard's files in ``log``.
+
+    Raises
+    ------
+    ValueError
+        Where the folder holds a run with another configuration.
     """
-    torch.set_num_threads(1)
-    out.mkdir(parents=True, exist_ok=True)
-    settings = json.loads(json.dumps(to_mapping(config)))
-    progress: dict[str, Any] = {"chunk": 0, "best": None, "wall_s": 0.0}
-    if (out / "progress.json").exists():
-        progress = json.loads((out / "progress.json").read_text())
-        if progress["config"] != settings:
-            raise ValueError(f"{out} holds a run with another configuration; choose another --out")
-    ppo = config.ppo
-    env = VecMonitor(SubprocVecEnv(
-        [partial(_make, config, k) for k in range(ppo.environments)], start_method="forkserver"
-    ))  # fmt: skip
-    try:
-        model = _model(config, env)
-        model.set_logger(configure(str(out / "log"), ["tensorboard"]))
-        began = time.perf_counter() - progress["wall_s"]
-        if progress["chunk"] == 0 and config.imitation.episodes > 0:
-            lessons = give_lessons(config, workers=workers)
-            log(f"{len(lessons.actions)} choices of {config.imitation.teacher} [{time.perf_counter() - began:.0f} s]")
-            for line in learn(model.policy.network, lessons, config):
-                log("imitation " + _words(line))
-        elif progress["chunk"] > 0:
-            model.set_parameters(out / "checkpoint.zip", exact_match=True, device="cpu")
-            model.num_timesteps = progress["steps"]
+
+    def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log) -> None:
+        self.config, self.out, self._workers, self._log = config, out, workers, log
+        settings = json.loads(json.dumps(to_mapping(config)))
+        self._progress: dict[str, Any] = {
+            "config": settings, "chunk": 0, "steps": 0, "best_s": None, "wall_s": 0.0,
+        }  # fmt: skip
+        if (out / "progress.json").exists():
+            self._progress = json.loads((out / "progress.json").read_text(encoding="utf-8"))
+            if self._progress["config"] != settings:
+                raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+
+    def train(self) -> None:
+        """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
+        torch.set_num_threads(1)
+        self.out.mkdir(parents=True, exist_ok=True)
+        ppo, progress = self.config.ppo, self._progress
+        makers = [partial(make_world, self.config.world, k) for k in range(ppo.environments)]
+        env = VecMonitor(SubprocVecEnv(makers, start_method="forkserver"))  # type: ignore[arg-type]
+        context = multiprocessing.get_context("forkserver")
+        self._began = time.perf_counter() - progress["wall_s"]
+        try:
+            with ProcessPoolExecutor(self._workers, mp_context=context) as pool:
+                model = self._model(env)
+                if progress["chunk"] > 0:
+                    model.set_parameters(str(self.out / "checkpoint.zip"), device="cpu")
+                    model.num_timesteps = progress["steps"]
+                elif self.config.imitation.episodes > 0:
+                    self._imitate(model, pool)
+                self._go_on(model, env, pool)
+        finally:
+            env.close()
+
+    def _imitate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
+        lessons = give_lessons(self.config, pool)
+        self._say(f"{len(lessons.actions)} choices of {self.config.imitation.teacher}")
+        for line in learn(cast("ChoicePolicy", model.policy).network, lessons, self.config):
+            self._say("imitation: " + _words(line))
+
+    def _go_on(self, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor) -> None:
+        ppo, progress = self.config.ppo, self._progress
         size = ppo.chunk * ppo.n_steps * ppo.environments
         chunks = -(-ppo.steps // size)
         while progress["chunk"] <= chunks:
             number = progress["chunk"]
-            if number % config.evaluation.every == 0 or number == chunks:
-                result = {"steps": model.num_timesteps} | evaluate(model, config, env)
-                log("evaluation " + _words(result) + f" [{time.perf_counter() - began:.0f} s]")
-                with (out / "curve.jsonl").open("a") as file:
-                    file.write(json.dumps(result | {"wall_s": time.perf_counter() - began}) + "\n")
-                if progress["best"] is None or result["time_to_95_s"] < progress["best"]:
-                    progress["best"] = result["time_to_95_s"]
-                    model.save(out / "best.zip")
+            if number % self.config.evaluation.every == 0 or number == chunks:
+                self._evaluate(model, pool)
             if number == chunks:
                 break
-            _run_chunk(model, config, env, number, chunks, size)
+            self._learn_chunk(model, env, number, chunks)
             progress |= {
-                "chunk": number + 1, "steps": model.num_timesteps, "wall_s": time.perf_counter() - began,
-                "config": settings,
+                "chunk": number + 1, "steps": model.num_timesteps, "wall_s": time.perf_counter() - self._began,
             }  # fmt: skip
-            model.save(out / "checkpoint.new.zip")
-            (out / "checkpoint.new.zip").replace(out / "checkpoint.zip")
-            atomic_write(out / "progress.json", json.dumps(progress))
-            log(f"chunk {number + 1} of {chunks}: {_words(_recent(model))} [{progress['wall_s']:.0f} s]")
-    finally:
-        env.close()
+            _save(model, self.out / "checkpoint.zip")
+            atomic_write(self.out / "progress.json", json.dumps(progress))
+            self._say(f"chunk {number + 1} of {chunks}: " + _words(_recent(model)))
+
+    def _learn_chunk(self, model: MaskablePPO, env: VecMonitor, number: int, chunks: int) -> None:
+        ppo = self.config.ppo
+        seed = int(np.random.SeedSequence([self.config.seed, number]).generate_state(1)[0] % 2**31)
+        model.set_random_seed(seed)
+        env.seed(seed)
+        model._last_obs = None  # fresh episodes
+        model.lr_schedule = FloatSchedule(ppo.learning_rate * (1.0 - number / chunks))
+        steps = ppo.chunk * ppo.n_steps * ppo.environments
+        model.learn(steps, callback=Durations(), reset_num_timesteps=False)
+
+    def _evaluate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
+        network = cast("ChoicePolicy", model.policy).network
+        weights = {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
+        result = {"steps": model.num_timesteps} | evaluate(weights, self.config, pool)
+        with (self.out / "curve.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(result | {"wall_s": time.perf_counter() - self._began}) + "\n")
+        self._say("evaluation: " + _words(result))
+        if self._progress["best_s"] is None or result["time_to_95_s"] < self._progress["best_s"]:
+            self._progress["best_s"] = result["time_to_95_s"]
+            _save(model, self.out / "best.zip")
+
+    def _model(self, env: VecMonitor) -> MaskablePPO:
+        config, ppo = self.config, self.config.ppo
+        model = MaskablePPO(
+            ChoicePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
+            learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
+            clip_range=ppo.clip_range, target_kl=ppo.target_kl, rollout_buffer_class=SemiMarkovBuffer,
+            device="cpu", seed=config.seed,
+            policy_kwargs={
+                "features_extractor_kwargs": {
+                    "width": config.width, "heads": config.heads, "layers": config.layers,
+                },
+            },
+        )  # fmt: skip
+        model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
+        return model
+
+    def _say(self, text: str) -> None:
+        self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
 
 
-def _run_chunk(
-    model: MaskablePPO, config: TrainConfig, env: VecMonitor, number: int, chunks: int, size: int
-) -> None:
-    ppo = config.ppo
-    seed = int(np.random.SeedSequence([config.seed, number]).generate_state(1)[0] % 2**31)
-    model.set_random_seed(seed)
-    env.seed(seed)
-    model._last_obs = None  # fresh episodes
-    share = 1.0 - number / chunks
-    model.lr_schedule = FloatSchedule(ppo.learning_rate * share)
-    callback: list[BaseCallback] = [Durations()]
-    learning_steps = min(size, max(ppo.steps - number * size, ppo.n_steps * ppo.environments))
-    model.learn(learning_steps, callback=CallbackList(callback), reset_num_timesteps=False)
-
-
-def _recent(model: MaskablePPO) -> dict[str, float]:
-    episodes = list(model.ep_info_buffer or [])
-    values = model.logger.name_to_value
+def evaluate(weights: Weights, config: TrainConfig, pool: ProcessPoolExecutor) -> dict[str, Any]:
+    """Return how long a policy, chance aside, takes to 95 % on validation seeds; unreached counts as the limit."""
+    world, heads = config.world, config.heads
+    jobs = [
+        (weights, heads, world, name, noise, _FIRST_VALIDATION_SEED + k)
+        for name in world.rooms
+        for noise in world.noises
+        for k in range(config.evaluation.episodes)
+    ]
+    ends = list(pool.map(_try, jobs))
+    times: dict[str, list[float]] = {name: [] for name in world.rooms}
+    for job, (time_s, _) in zip(jobs, ends, strict=True):
+        times[job[3]].append(time_s)
+    means = {name: float(np.mean(values)) for name, values in times.items()}
     return {
-        "return": float(np.mean([e["r"] for e in episodes])) if episodes else float("nan"),
-        "choices": float(np.mean([e["l"] for e in episodes])) if episodes else float("nan"),
-        **{k.split("/")[1]: float(v) for k, v in values.items() if k in ("train/approx_kl", "train/explained_variance", "train/entropy_loss")},
+        "time_to_95_s": float(np.mean(list(means.values()))),
+        "collisions": sum(collisions for _, collisions in ends),
+        **means,
     }
 
 
-def evaluate(model: MaskablePPO, config: TrainConfig, env: VecMonitor) -> dict[str, float]:
-    """Return how long the policy, without chance, takes to 95 % on validation seeds; unreached counts as the limit."""
-    jobs = [(name, 1000 + k) for name in config.world.rooms for k in range(config.evaluation.episodes)]
-    venv = env.venv
-    results: dict[str, list[float]] = {name: [] for name in config.world.rooms}
-    collisions = 0
-    # Each environment works through its own share, so that all noises see all families.
-    shares = [jobs[k :: venv.num_envs] for k in range(venv.num_envs)]
-    state = [venv.env_method("reset", options=_options(s[0]), indices=k)[0] if s else None for k, s in enumerate(shares)]
-    observations = [s[0] if s else None for s in state]
-    while any(shares):
-        live = [k for k, s in enumerate(shares) if s]
-        masks = {k: venv.env_method("action_masks", indices=k)[0] for k in live}
-        for k in live:
-            action, _ = model.predict(observations[k], action_masks=masks[k], deterministic=True)
-            venv.remotes[k].send(("env_method", ("step", (int(action),), {})))
-        for k in live:
-            observation, _, terminated, truncated, info = venv.remotes[k].recv()
-            observations[k] = observation
-            if terminated or truncated:
-                name, _ = shares[k].pop(0)
-                results[name].append(info["time_s"] if info["is_success"] else config.world.time_limit_s)
-                collisions += info["collisions"]
-                if shares[k]:
-                    observations[k] = venv.env_method("reset", options=_options(shares[k][0]), indices=k)[0][0]
-    means = {name: float(np.mean(times)) for name, times in results.items()}
-    return {"time_to_95_s": float(np.mean(list(means.values()))), "collisions": collisions, **means}
+def _try(job: tuple[Weights, int, WorldConfig, str, str, int]) -> tuple[float, int]:
+    """Return the time to 95 % [s] and the collisions of one episode."""
+    weights, heads, world, rooms, noise, seed = job
+    network = ChoiceNetwork(weights, heads=heads)
+    env = make_world(replace(world, noises=(noise,)))
+    env.reset(options={"rooms": rooms, "room_seed": seed})
+    while True:
+        k = int(np.argmax(network.scores(env.env.agent.described[0]))) if env.action_masks().sum() > 1 else 0
+        *_, terminated, truncated, info = env.step(k)
+        if terminated or truncated:
+            return info["time_s"] if info["is_success"] else world.time_limit_s, info["collisions"]
 
 
-def _options(job: tuple[str, int]) -> dict[str, Any]:
-    return {"rooms": job[0], "room_seed": job[1]}
+def _save(model: MaskablePPO, path: Path) -> None:
+    new = path.with_name(f".{path.name}")
+    model.save(new)
+    new.replace(path)
 
 
-def _make(config: TrainConfig, index: int) -> Any:
-    torch.set_num_threads(1)
-    return make_world(config.world, index)
-
-
-def _model(config: TrainConfig, env: VecMonitor) -> MaskablePPO:
-    ppo = config.ppo
-    return MaskablePPO(
-        ChoicePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
-        learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
-        clip_range=ppo.clip_range, target_kl=ppo.target_kl, rollout_buffer_class=SemiMarkovBuffer, device="cpu",
-        seed=config.seed,
-        policy_kwargs={
-            "features_extractor_kwargs": {
-                "width": config.width, "heads": config.heads, "layers": config.layers,
-            },
-        },
-    )  # fmt: skip
+def _recent(model: MaskablePPO) -> dict[str, float]:
+    """Return what the last rollouts were like."""
+    episodes = list(model.ep_info_buffer or [])
+    found = {
+        "return": float(np.mean([e["r"] for e in episodes])) if episodes else float("nan"),
+        "choices": float(np.mean([e["l"] for e in episodes])) if episodes else float("nan"),
+    }
+    values = model.logger.name_to_value
+    for name in ("approx_kl", "explained_variance", "entropy_loss"):
+        if f"train/{name}" in values:
+            found[name] = float(values[f"train/{name}"])
+    return found
 
 
 def _words(values: dict[str, Any]) -> str:

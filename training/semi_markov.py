@@ -15,7 +15,7 @@ __all__ = ["Durations", "SemiMarkovBuffer"]
 class SemiMarkovBuffer(MaskableDictRolloutBuffer):
     """A rollout buffer that discounts by ``gamma`` per unit of time, not per step.
 
-    ``durations`` ``(steps, environments)`` are set before each :meth:`add` by :class:`Durations`. λ falls per step.
+    ``durations`` ``(steps, environments)`` are set before each :meth:`add` by :class:`Durations`. λ is per step.
     """
 
     def reset(self) -> None:

@@ -62,9 +62,7 @@ def test_numpy_and_torch_agree(m):
 def test_permuted_candidates_get_permuted_scores():
     made, choice = network(), a_choice(11)
     p = np.random.default_rng(1).permutation(11)
-    turned = Choice(
-        p, choice.candidates[p], choice.patches[p], choice.distances[np.ix_(p, p)], choice.state
-    )
+    turned = Choice(p, choice.candidates[p], choice.patches[p], choice.distances[np.ix_(p, p)], choice.state)
     one, worth = scores(made, choice)
     other, same = scores(made, turned)
     np.testing.assert_allclose(other, one[p], atol=1e-4)
