@@ -16,6 +16,7 @@ from agents.chooser import Chooser, ChooserConfig
 from agents.outlook import CANDIDATE, STATE, Choice
 from mecanum_env.env import ExploreEnv
 from slam.settings import from_mapping, require
+from slam.types import Belief
 
 __all__ = ["ExploreFrontierEnv", "as_observation", "choice_space"]
 
@@ -60,6 +61,23 @@ def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
     return padded
 
 
+class _Beneath(ExploreEnv):
+    """The environment that the driver drives in: it looks at the scan alone."""
+
+    def _observe(self) -> Any:
+        share = self.scan.ranges / self.scan.range_max
+        return {"scan": np.where(share < 1.0, share, 1.0).astype(np.float32)}
+
+    @property
+    def outline(self) -> Belief:
+        """The belief without its landmarks: all that choosing and driving ask for, every step."""
+        backend, nothing = self.backend, np.zeros((0, 2))
+        return Belief(
+            pose=backend.pose, pose_cov=backend.pose_cov, landmarks=nothing, landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64), grid=backend.grid,
+        )  # fmt: skip
+
+
 class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     """Choose where to look next; the way there is planned on the belief's map and driven.
 
@@ -95,7 +113,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     ) -> None:
         require(0 < discount <= 1, f"discount must be in (0, 1], got {discount}")
         self.driver = from_mapping(ChooserConfig, driver)
-        self.base = ExploreEnv(action="twist", render_mode=render_mode, **kwargs)
+        self.base = _Beneath(action="twist", render_mode=render_mode, **kwargs)
         self.config = self.base.config
         # A limit of its own, in its own steps: the one that may be around this environment counts decisions.
         limit = math.ceil(self.config.time_limit_s / self.config.step_s - 1e-9)
@@ -135,8 +153,9 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
         self._seen, info = self._limited.reset(seed=seed, options=options)
-        self._agent.reset(self.base.belief, 0 if seed is None else int(seed))
-        self._choice = self._agent.survey(self.base.belief)
+        belief = self.base.outline
+        self._agent.reset(belief, 0 if seed is None else int(seed))
+        self._choice = self._agent.survey(belief)
         return as_observation(self._choice, self.driver), info | {"duration_s": 0.0}
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -149,7 +168,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         config, agent = self.config, self._agent
         patience = math.ceil(_DONE_AFTER_S / config.step_s)
         total, weight, steps, idle = 0.0, 1.0, 0, 0
-        belief = self.base.belief
+        belief = self.base.outline
         while True:
             act = agent.act(self._seen, belief)
             self._seen, reward, terminated, truncated, info = self._limited.step(act)
@@ -163,7 +182,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
             if idle >= patience:
                 terminated = True
                 break
-            belief = self.base.belief
+            belief = self.base.outline
             if agent.due(belief):
                 self._choice = agent.survey(belief)
                 if self._choice is not None and len(self._choice.index) > 1:

@@ -32,9 +32,7 @@ def register_envs() -> None:
             )
     # An environment that needs an agent's machinery lives with the agents; its own time limit is in seconds.
     if "mecanum_env/ExploreFrontier-v0" not in gymnasium.registry:
-        gymnasium.register(
-            "mecanum_env/ExploreFrontier-v0", entry_point="agents.frontier_env:ExploreFrontierEnv"
-        )
+        gymnasium.register("mecanum_env/ExploreFrontier-v0", entry_point="agents.frontier_env:ExploreFrontierEnv")
 
 
 register_envs()
