@@ -91,6 +91,11 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     render_mode, **kwargs
         As for ``mecanum_env/Explore-v0``.
 
+    Attributes
+    ----------
+    base : ExploreEnv
+        The environment beneath, with all that it has for metrics and drawing.
+
     Notes
     -----
     A step ends when a choice is due again: the goal is reached, what was to be seen from it is seen, the way is
@@ -130,11 +135,6 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     def belief(self) -> Any:
         """What the robot knows; agents may use it."""
         return self.base.belief
-
-    @property
-    def truth(self) -> Any:
-        """What is really so: for metrics and drawing only."""
-        return self.base.truth
 
     @property
     def agent(self) -> Chooser:
