@@ -41,7 +41,6 @@ class Chooser(Explorer):
         step_s: float = 0.1,
     ) -> None:
         super().__init__(from_mapping(ChooserConfig, config), robot=robot, lidar=lidar, step_s=step_s)
-        self._range_m = 0.8 * self._lidar.range_max_m
 
     def _forget(self) -> None:
         super()._forget()
@@ -59,7 +58,7 @@ class Chooser(Explorer):
         self._found = super()._candidates(belief)
         if not np.isfinite(self._found.costs).any():
             return None
-        choice = describe(self._found, belief, self.config.choice, range_m=self._range_m, time_s=self._time)
+        choice = describe(self._found, belief, self.config.choice, lidar=self._lidar, time_s=self._time)
         self._last = choice, self._found
         return choice
 

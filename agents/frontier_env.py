@@ -155,7 +155,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         self._seen, info = self._limited.reset(seed=seed, options=options)
         belief = self.base.outline
         self._agent.reset(belief, 0 if seed is None else int(seed))
-        self._choice = self._agent.survey(belief)
+        self._choice = self._agent.survey(self.base.belief)
         return as_observation(self._choice, self.driver), info | {"duration_s": 0.0}
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -184,7 +184,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
                 break
             belief = self.base.outline
             if agent.due(belief):
-                self._choice = agent.survey(belief)
+                self._choice = agent.survey(self.base.belief)
                 if self._choice is not None and len(self._choice.index) > 1:
                     break
                 if self._choice is not None:

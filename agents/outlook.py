@@ -13,9 +13,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.cost_map import CostMap
 from agents.explorer import Candidates
+from agents.foresight import marks_of
 from agents.gain import expected_area
+from agents.sightings import SensorModel, expected_sightings
 from agents.travel import between
+from mecanum_env.config import LidarConfig
 from slam.occupancy import FREE, OCCUPIED
 from slam.settings import require
 from slam.types import Belief
@@ -25,9 +29,13 @@ __all__ = ["CANDIDATE", "STATE", "Choice", "ChoiceConfig", "describe"]
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
+_FIRST_LEG_M = 0.5  # of a way: where it turns to first
+_SENSOR = SensorModel()
+
 CANDIDATE = (
     "way", "distance", "ahead", "left", "target_ahead", "target_left", "normal_ahead", "normal_left",
-    "area_near", "area_far", "extent", "cells", "clearance", "current", "worth", "rank",
+    "area_near", "area_far", "extent", "cells", "clearance", "current", "worth", "rank", "turn", "corners",
+    "walls", "sigma_left",
 )  # fmt: skip
 """Columns of a candidate's row."""
 
@@ -64,7 +72,9 @@ class Choice:
     state: Floats  # (STATE,)
 
 
-def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m: float, time_s: float) -> Choice:
+def describe(
+    found: Candidates, belief: Belief, config: ChoiceConfig, *, lidar: LidarConfig, time_s: float
+) -> Choice:
     """Return what there is to choose from, described; at least one candidate has a finite cost.
 
     Parameters
@@ -75,8 +85,8 @@ def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m
         The belief that they were found on.
     config
         How much is shown.
-    range_m
-        How far the sensor is counted on to see [m].
+    lidar
+        The sensor; it is counted on to see as far as 0.8 of its range.
     time_s
         Since the episode began.
     """
@@ -86,6 +96,7 @@ def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m
     targets, normals = found.frontiers.targets[index], found.frontiers.normals[index]
     pose = np.asarray(belief.pose, dtype=np.float64)
     views = cost_map.to_points(cells)
+    range_m = 0.8 * lidar.range_max_m
     near = expected_area(cost_map, cells, range_m=range_m, depth_m=config.near_m, rays=60)
     far = expected_area(cost_map, cells, range_m=range_m, depth_m=config.far_m, rays=60)
     offset, target_offset = views - pose[:2], targets - pose[:2]
@@ -104,6 +115,8 @@ def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m
         index == (-1 if found.current is None else found.current),
         np.log1p(near) - 0.2 * costs,
         np.arange(len(index)) / 10.0,
+        _first_turns(found.travel.step, cells, pose[2], _FIRST_LEG_M / cost_map.resolution) / math.pi,
+        *_landmarks_left(belief, cost_map, views, lidar),
     ])  # fmt: skip
     patches = np.zeros((len(index), 2, config.patch_cells, config.patch_cells), dtype=np.uint8)
     frame = np.array([*cost_map.origin, cost_map.resolution])
@@ -124,6 +137,56 @@ def describe(found: Candidates, belief: Belief, config: ChoiceConfig, *, range_m
     ])  # fmt: skip
     as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
     return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def _landmarks_left(
+    belief: Belief, cost_map: CostMap, views: Array, lidar: LidarConfig
+) -> tuple[Array, Array, Array]:
+    """Return how many corners and walls are in sight from each place, and the position's σ that they would leave.
+
+    The last as log10(σ / 1 m + 1e-4), each corner by itself: Σ 1 / (σ² + r²), r that of one sighting.
+    """
+    marks = marks_of(belief)
+    if not len(marks.kinds):
+        nothing = np.zeros(len(views))
+        return nothing, nothing, nothing
+    poses = np.column_stack([views, np.full(len(views), float(belief.pose[2]))])
+    seen, cov = expected_sightings(
+        cost_map, poses, marks.x[3:].reshape(-1, 2), marks.kinds, marks.ends, lidar=lidar, model=_SENSOR,
+        most=len(marks.kinds),
+    )  # fmt: skip
+    n = len(belief.landmarks)
+    known = 0.5 * np.trace(np.asarray(belief.landmark_cov), axis1=1, axis2=2)
+    information = np.where(seen[:, :n], 1.0 / (known + cov[:, :n, 0] + 1e-12), 0.0).sum(axis=1)
+    sigma = np.where(information > 0.0, 1.0 / np.sqrt(np.maximum(information, 1e-12)), 1.0)
+    corners, walls = seen[:, :n].sum(axis=1), seen[:, n:].sum(axis=1)
+    return np.log1p(corners) / 3.0, np.log1p(walls) / 3.0, np.log10(sigma + 1e-4)
+
+
+@njit(cache=True, nogil=True)
+def _first_turns(step: NDArray[np.int8], cells: NDArray[np.int64], heading: float, leg: float) -> Array:
+    """Return by how much the way to each cell turns off the heading at its beginning, 0 … π."""
+    turns = np.zeros(len(cells))
+    rows = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+    cols = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+    for i in range(len(cells)):
+        row, col = cells[i]
+        # To the start and count, then again as far as the first leg's end.
+        length = 0
+        while step[row, col] >= 0:
+            k = step[row, col]
+            row, col = row - rows[k], col - cols[k]
+            length += 1
+        start_r, start_c = row, col
+        row, col = cells[i]
+        for _ in range(length - int(leg)):
+            k = step[row, col]
+            row, col = row - rows[k], col - cols[k]
+        if row == start_r and col == start_c:
+            continue
+        off = math.atan2(row - start_r, col - start_c) - heading
+        turns[i] = abs(math.atan2(math.sin(off), math.cos(off)))
+    return turns
 
 
 def _direction(vectors: Array, heading: float) -> Array:
