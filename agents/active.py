@@ -76,13 +76,13 @@ class ActiveConfig(TourConfig):
     look: LookConfig = field(default_factory=LookConfig)
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
     worth_s_per_m: float = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
-    delay: float = 3.0  # what a second's delay of what is left to see costs [s]
+    delay: float = 8.0  # what a second's delay of what is left to see costs [s]
     switch_s: float = 1.5  # another frontier must be better by this …
     switch_share: float = 0.15  # … and by this share of the way to the present one
     most: int = 5  # candidates that are thought through: the cheapest to reach, and where the best tour begins
     thought_tries: int = 2  # choices of view points that the best tour from each is taken from
     gentle_m_s2: float = 0.6  # acceleration on a floor found slippery …
-    gentle_speed_share: float = 0.8  # … and speed, as a share of the robot's limit: more looks at what it passes
+    gentle_speed_share: float = 0.7  # … and speed, as a share of the robot's limit: more looks at what it passes
     firm_share: float = 0.02  # of the wheels' speed: no greater error of the odometry is taken for slip …
     slippery_share: float = 0.04  # … from here on it is driven as gently as it can be
 

@@ -196,7 +196,8 @@ def test_ctrl_c_before_the_episode_writes_nothing(tmp_path: Path) -> None:
     process = run("explore", "--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out"))
     with open(tmp_path / "config.toml", "w"):  # opens as soon as the other side reads
         process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+    # Closed by now: a signal just before the other side's read would not wake it, the end of the file does.
+    _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err == "mecanum explore: interrupted before the results were written\n"
     assert not (tmp_path / "out").exists()

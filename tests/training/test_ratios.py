@@ -1,0 +1,56 @@
+"""Ratios of means from a benchmark's rows."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+
+from training.ratios import main, ratio, table
+
+FIELDS = ("suite", "place", "seed", "agent", "time_to_95_s", "time_s", "ate_rmse_m", "corner_mean_m", "limit_s")
+
+
+def write(path, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(FIELDS)
+        writer.writerows(rows)
+
+
+def test_the_table_is_of_means_over_shared_seeds(tmp_path, capsys):
+    rows = [["caves", "cave", s, "one", 10 + s, 20, 0.002, "", 300] for s in range(4)]
+    rows += [["caves", "cave", s, "two", "", 40, 0.004, "", 300] for s in range(4)]
+    rows += [["rooms", "rectangular", 0, "one", 1, 1, 1, 1, 300]]
+    write(tmp_path / "episodes.csv", rows)
+    two = table(tmp_path / "episodes.csv", "caves", "one").splitlines()[-1]
+    # Never reached: the limit. No corners in caves: nothing to compare.
+    expected = "| `two` | 300.0 | 40.0 | 4.0 | – | 0.04 [0.04, 0.04] | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] |  |"
+    assert two == expected
+    assert main([str(tmp_path), "--suite", "caves", "--agent", "one"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == expected
+
+
+def test_the_interval_holds_the_true_ratio_nearly_always():
+    rng = np.random.default_rng(0)
+    held = 0
+    for _ in range(200):
+        common = rng.gamma(4.0, 1.0, 50)
+        found = ratio(0.7 * common * rng.uniform(0.8, 1.2, 50), common)
+        held += found.low <= 0.7 <= found.high
+    assert held >= 180
+
+
+@pytest.mark.parametrize("text", [None, "suite,agent\ncaves,one\n"])
+def test_what_cannot_be_read_is_said_in_one_line(tmp_path, capsys, text):
+    if text is not None:
+        (tmp_path / "episodes.csv").write_text(text)
+    assert main([str(tmp_path), "--suite", "caves"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_an_agent_without_rows_is_named(tmp_path, capsys):
+    write(tmp_path / "episodes.csv", [["caves", "cave", 0, "one", 1, 1, 1, 1, 300]])
+    assert main([str(tmp_path), "--suite", "caves", "--agent", "active"]) == 2
+    assert "no rows of active on caves" in capsys.readouterr().err
