@@ -64,7 +64,7 @@ class DriveExtractor(BaseFeaturesExtractor):
         present = rows[..., 5:]
         spread = rows[..., 2:5:2].clamp(min=_LEAST).log10() / 4.0 + 1.0
         each = self.landmark(torch.cat([rows[..., :2] / 8.0, spread, present], dim=2))
-        return cast("Tensor", torch.relu((each * present + (present - 1.0) * 1e3).amax(dim=1)))
+        return torch.relu((each * present + (present - 1.0) * 1e3).amax(dim=1))
 
 
 def _map_network(width: int) -> nn.Sequential:

@@ -72,7 +72,6 @@ class PpoConfig:
     ent_coef: float = 0.003
     clip_range: float = 0.2
     target_kl: float = 0.03
-    critic_rollouts: int = 2  # at first only the critic learns
     chunk: int = 16  # rollouts between two checkpoints
 
     def __post_init__(self) -> None:
