@@ -22,14 +22,15 @@ _D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 _CELLS = 100_000  # that may be searched for exact costs in one call: some 5 ms
 
 
-def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64]) -> Array:
+def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64], *, searched: int = _CELLS) -> Array:
     """Return the travel costs ``(n, n)`` [weighted m] between reachable cells ``(n, 2)``, the robot's first.
 
     The way back along the tree of shortest ways from the robot is one that exists; it is the shortest wherever
-    rooms hang on corridors like leaves on twigs. On a small map, the nearest cells are searched from exactly.
+    rooms hang on corridors like leaves on twigs. As many of the first cells are searched from exactly as there are
+    ``searched`` cells of the map for; from the robot's own it is exact in any case.
     """
     costs = _along_tree(travel.cost, travel.step, cells)
-    exact = min(len(cells), _CELLS // cost_map.classes.size + 1)
+    exact = min(len(cells), searched // cost_map.classes.size + 1)
     for i in range(1, exact):
         row, col = int(cells[i, 0]), int(cells[i, 1])
         own = travel_costs(replace(cost_map, start=(row, col))).cost[tuple(cells.T)]

@@ -30,6 +30,9 @@ def register_envs() -> None:
                 kwargs={"action": action},
                 max_episode_steps=MAX_EPISODE_STEPS,
             )
+    # An environment that needs an agent's machinery lives with the agents; its own time limit is in seconds.
+    if "mecanum_env/ExploreFrontier-v0" not in gymnasium.registry:
+        gymnasium.register("mecanum_env/ExploreFrontier-v0", entry_point="agents.frontier_env:ExploreFrontierEnv")
 
 
 register_envs()

@@ -1,0 +1,83 @@
+"""An explorer whose choices are made by something else: a learned policy, or whoever steps the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.outlook import Choice, ChoiceConfig, describe
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping
+from slam.types import Belief
+
+__all__ = ["Chooser", "ChooserConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChooserConfig(ExplorerConfig):
+    """The parts of the explorer, and how a choice is described."""
+
+    choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+
+
+class Chooser(Explorer):
+    """Describes each choice that is due, and drives to what was chosen.
+
+    :meth:`due` says when a choice is due; :meth:`survey` describes it; :meth:`take` makes it.
+    """
+
+    config: ChooserConfig
+
+    def __init__(
+        self,
+        config: ChooserConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        super().__init__(from_mapping(ChooserConfig, config), robot=robot, lidar=lidar, step_s=step_s)
+
+    def _forget(self) -> None:
+        super()._forget()
+        self._found: Candidates | None = None
+        self._last: tuple[Choice, Candidates] | None = None
+        self._taken = -1  # index of the candidate that was chosen
+
+    def due(self, belief: Belief) -> bool:
+        """Whether the next :meth:`act` will ask for a choice."""
+        return self._due(belief)
+
+    def survey(self, belief: Belief) -> Choice | None:
+        """Return what there is to choose from, or ``None`` where no frontier can be reached."""
+        self._keep_watch(belief)
+        self._found = super()._candidates(belief)
+        if not np.isfinite(self._found.costs).any():
+            return None
+        choice = describe(self._found, belief, self.config.choice, lidar=self._lidar, time_s=self._time)
+        self._last = choice, self._found
+        return choice
+
+    @property
+    def described(self) -> tuple[Choice, Candidates]:
+        """The last choice that there was, and what it was described from."""
+        if self._last is None:
+            raise RuntimeError("there was nothing to choose from yet")
+        return self._last
+
+    def take(self, choice: Choice, k: int) -> None:
+        """Choose candidate ``k`` of the survey; the next :meth:`act` sets off for it."""
+        self._taken = int(choice.index[k])
+
+    def pick(self, candidates: Candidates, belief: Belief) -> int:
+        """Return what was chosen."""
+        return self._taken
+
+    def _candidates(self, belief: Belief) -> Candidates:
+        # Those that were described: the choice was made among them.
+        found, self._found = self._found, None
+        return super()._candidates(belief) if found is None else found

@@ -1,0 +1,207 @@
+"""``mecanum_env/ExploreFrontier-v0``: one decision a step, which of the view points to drive to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, SupportsInt, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
+
+from agents.chooser import Chooser, ChooserConfig
+from agents.outlook import CANDIDATE, STATE, Choice
+from mecanum_env.env import ExploreEnv
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["ExploreFrontierEnv", "as_observation", "choice_space"]
+
+Observation = dict[str, NDArray[Any]]
+
+_DONE_AFTER_S = 2.0  # with nothing to choose from: what is seen a moment later may change that
+
+
+def choice_space(config: ChooserConfig) -> spaces.Dict:
+    """Return the space of :func:`as_observation`."""
+    k, side = config.choice.most, config.choice.patch_cells
+
+    def floats(*shape: int) -> spaces.Box:
+        return spaces.Box(-10.0, 10.0, shape, np.float32)
+
+    return spaces.Dict({
+        "candidates": floats(k, len(CANDIDATE)),
+        "distances": floats(k, k),
+        "patches": spaces.Box(0, 255, (k, 2, side, side), np.uint8),
+        "present": spaces.Box(0.0, 1.0, (k,), np.float32),
+        "state": floats(len(STATE)),
+    })  # fmt: skip
+
+
+def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
+    """Return a choice with as many rows as the space has: those that stand for nothing are zero."""
+    k, side = config.choice.most, config.choice.patch_cells
+    padded: Observation = {
+        "candidates": np.zeros((k, len(CANDIDATE)), np.float32),
+        "distances": np.zeros((k, k), np.float32),
+        "patches": np.zeros((k, 2, side, side), np.uint8),
+        "present": np.zeros(k, np.float32),
+        "state": np.zeros(len(STATE), np.float32),
+    }
+    if choice is not None:
+        m = len(choice.index)
+        padded["candidates"][:m] = choice.candidates
+        padded["distances"][:m, :m] = choice.distances
+        padded["patches"][:m] = choice.patches
+        padded["present"][:m] = 1.0
+        padded["state"][:] = choice.state
+    return padded
+
+
+class _Beneath(ExploreEnv):
+    """The environment that the driver drives in: it looks at the scan alone."""
+
+    def _observe(self) -> Any:
+        share = self.scan.ranges / self.scan.range_max
+        return {"scan": np.where(share < 1.0, share, 1.0).astype(np.float32)}
+
+    @property
+    def outline(self) -> Belief:
+        """The belief without its landmarks: all that choosing and driving ask for, every step."""
+        backend, nothing = self.backend, np.zeros((0, 2))
+        return Belief(
+            pose=backend.pose, pose_cov=backend.pose_cov, landmarks=nothing, landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64), grid=backend.grid,
+        )  # fmt: skip
+
+
+class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
+    """Choose where to look next; the way there is planned on the belief's map and driven.
+
+    Parameters
+    ----------
+    driver : ChooserConfig or mapping, optional
+        How frontiers are found, driven to and described.
+    discount : float
+        Of the reward, per control step of the environment beneath: a step here adds up Σ discountⁿ rₙ, and
+        ``info["duration_s"]`` says how long it took, so that what follows it can be discounted alike.
+    render_mode, **kwargs
+        As for ``mecanum_env/Explore-v0``.
+
+    Attributes
+    ----------
+    base : ExploreEnv
+        The environment beneath, with all that it has for metrics and drawing.
+
+    Notes
+    -----
+    A step ends when a choice is due again: the goal is reached, what was to be seen from it is seen, the way is
+    blocked, or ``driver.patience.replan_s`` is over; and there is something to choose, of more than one. An action
+    that stands for no candidate (see :meth:`action_masks`) takes the first, the cheapest to reach.
+
+    ``terminated``: as in the environment beneath, or the robot has found nothing left to choose for two seconds
+    (``info["end"]`` says why). ``truncated``: after ``time_limit_s`` of the configuration.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 - so in gymnasium
+
+    def __init__(
+        self,
+        *,
+        driver: ChooserConfig | Mapping[str, Any] | None = None,
+        discount: float = 1.0,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        require(0 < discount <= 1, f"discount must be in (0, 1], got {discount}")
+        self.driver = from_mapping(ChooserConfig, driver)
+        self.base = _Beneath(action="twist", render_mode=render_mode, **kwargs)
+        self.config = self.base.config
+        # A limit of its own, in its own steps: the one that may be around this environment counts decisions.
+        limit = math.ceil(self.config.time_limit_s / self.config.step_s - 1e-9)
+        self._limited = TimeLimit(self.base, max_episode_steps=limit)
+        self.discount, self.render_mode = discount, render_mode
+        self.action_space = spaces.Discrete(self.driver.choice.most)
+        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
+        self._agent = Chooser(
+            self.driver, robot=self.config.robot, lidar=self.config.lidar, step_s=self.config.step_s
+        )
+        self._choice: Choice | None = None
+
+    @property
+    def belief(self) -> Any:
+        """What the robot knows; agents may use it."""
+        return self.base.belief
+
+    @property
+    def agent(self) -> Chooser:
+        """The driver."""
+        return self._agent
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
+        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
+        masks[0] = True
+        return masks
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode: draw the room, place the robot, take the first scan."""
+        super().reset(seed=seed)
+        self._seen, info = self._limited.reset(seed=seed, options=options)
+        belief = self.base.outline
+        self._agent.reset(belief, 0 if seed is None else int(seed))
+        self._choice = self._agent.survey(self.base.belief)
+        return as_observation(self._choice, self.driver), info | {"duration_s": 0.0}
+
+    def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Drive to a view point until the next choice is due; see the class."""
+        k = int(action)
+        if not self.action_space.contains(np.int64(k)):
+            raise ValueError(f"action must be 0 … {self.driver.choice.most - 1}, got {action}")
+        if self._choice is not None:
+            self._agent.take(self._choice, k if k < len(self._choice.index) else 0)
+        config, agent = self.config, self._agent
+        patience = math.ceil(_DONE_AFTER_S / config.step_s)
+        total, weight, steps, idle = 0.0, 1.0, 0, 0
+        belief = self.base.outline
+        while True:
+            act = agent.act(self._seen, belief)
+            self._seen, reward, terminated, truncated, info = self._limited.step(act)
+            total += weight * float(reward)
+            weight *= self.discount
+            steps += 1
+            idle = idle + 1 if agent.goal is None else 0
+            self._choice = None
+            if terminated or truncated:
+                break
+            if idle >= patience:
+                terminated = True
+                break
+            belief = self.base.outline
+            if agent.due(belief):
+                self._choice = agent.survey(self.base.belief)
+                if self._choice is not None and len(self._choice.index) > 1:
+                    break
+                if self._choice is not None:
+                    agent.take(self._choice, 0)
+        info["duration_s"] = steps * config.step_s
+        if terminated or truncated:
+            covered = bool(info.get("is_success", False))
+            given_up = agent.status if idle >= patience else "collision"
+            info["end"] = "covered" if covered else "time" if truncated else given_up
+            info.setdefault("is_success", False)
+            info.setdefault("episode_metrics", self.base.episode_metrics())
+        return as_observation(self._choice, self.driver), total, bool(terminated), bool(truncated), info
+
+    def render(self) -> Any:
+        """Return truth beside belief as an RGB image ``(h, w, 3)``."""
+        return self.base.render()
+
+    def close(self) -> None:
+        """Close the environment beneath."""
+        self._limited.close()

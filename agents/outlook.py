@@ -1,0 +1,227 @@
+"""What a learned policy sees of the choice before it: candidates as rows of numbers, patches and distances.
+
+Everything is relative to the robot or to the frontier itself, so that a turned or shifted room looks the same, and
+the rows carry no order: what is learned on few candidates goes for many.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agents.cost_map import CostMap
+from agents.explorer import Candidates
+from agents.foresight import marks_of
+from agents.gain import expected_area
+from agents.sightings import SensorModel, expected_sightings
+from agents.travel import between
+from mecanum_env.config import LidarConfig
+from slam.occupancy import FREE, OCCUPIED
+from slam.settings import require
+from slam.types import Belief
+
+__all__ = ["CANDIDATE", "STATE", "Choice", "ChoiceConfig", "describe"]
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_FIRST_LEG_M = 0.5  # of a way: where it turns to first
+_SENSOR = SensorModel()
+
+CANDIDATE = (
+    "way", "distance", "ahead", "left", "target_ahead", "target_left", "normal_ahead", "normal_left",
+    "area_near", "area_far", "extent", "cells", "clearance", "current", "worth", "rank", "turn", "corners",
+    "walls", "sigma_left",
+)  # fmt: skip
+"""Columns of a candidate's row."""
+
+STATE = ("time", "known_m2", "candidates", "sigma_m", "sigma_rad", "share_visited", "area_m2", "nearest")
+"""What there is to say about the choice as a whole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoiceConfig:
+    """How much of the choice is shown."""
+
+    most: int = 24  # candidates: the cheapest to reach
+    patch_cells: int = 16  # side of a patch
+    patch_m: float = 0.5  # side of one of its cells
+    beyond_m: float = 2.0  # from the frontier to the patch's middle, into the unknown
+    near_m: float = 2.0  # how far into the unknown an optimist sees …
+    far_m: float = 5.0  # … and a greater one
+    horizon_s: float = 300.0  # that time counts against
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value > 0, f"ChoiceConfig.{f.name} must be > 0, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """A choice, described: m candidates, cheapest first."""
+
+    index: NDArray[np.int64]  # (m,) of the candidate among all that were found
+    candidates: Floats  # (m, CANDIDATE)
+    patches: NDArray[np.uint8]  # (m, 2, s, s) share of free and of occupied, the frontier's normal to the right
+    distances: Floats  # (m, m) travel costs between the view points [10 weighted m]
+    state: Floats  # (STATE,)
+
+
+def describe(
+    found: Candidates, belief: Belief, config: ChoiceConfig, *, lidar: LidarConfig, time_s: float
+) -> Choice:
+    """Return what there is to choose from, described; at least one candidate has a finite cost.
+
+    Parameters
+    ----------
+    found
+        The candidates, as the explorer found them.
+    belief
+        The belief that they were found on.
+    config
+        How much is shown.
+    lidar
+        The sensor; it is counted on to see as far as 0.8 of its range.
+    time_s
+        Since the episode began.
+    """
+    open_ = np.flatnonzero(np.isfinite(found.costs))
+    index = open_[np.argsort(found.costs[open_], kind="stable")[: config.most]]
+    cost_map, cells, costs = found.cost_map, found.cells[index], found.costs[index]
+    targets, normals = found.frontiers.targets[index], found.frontiers.normals[index]
+    pose = np.asarray(belief.pose, dtype=np.float64)
+    views = cost_map.to_points(cells)
+    range_m = 0.8 * lidar.range_max_m
+    near = expected_area(cost_map, cells, range_m=range_m, depth_m=config.near_m, rays=60)
+    far = expected_area(cost_map, cells, range_m=range_m, depth_m=config.far_m, rays=60)
+    offset, target_offset = views - pose[:2], targets - pose[:2]
+    away = np.hypot(*offset.T)
+    rows = np.column_stack([
+        costs / 10.0,
+        away / 10.0,
+        *_direction(offset, pose[2]),
+        *_direction(target_offset, pose[2]),
+        *_direction(normals, pose[2]),
+        np.log1p(near),
+        np.log1p(far),
+        found.frontiers.extents[found.frontiers.target_labels[index]] / 3.0,
+        found.frontiers.sizes[index] / 10.0,
+        np.minimum(cost_map.clearance[tuple(cells.T)], 1.0),
+        index == (-1 if found.current is None else found.current),
+        np.log1p(near) - 0.2 * costs,
+        np.arange(len(index)) / 10.0,
+        _first_turns(found.travel.step, cells, pose[2], _FIRST_LEG_M / cost_map.resolution) / math.pi,
+        *_landmarks_left(belief, cost_map, views, lidar),
+    ])  # fmt: skip
+    patches = np.zeros((len(index), 2, config.patch_cells, config.patch_cells), dtype=np.uint8)
+    frame = np.array([*cost_map.origin, cost_map.resolution])
+    _cut_patches(cost_map.classes, frame, targets, normals, config.patch_m, config.beyond_m, pose[:2], patches)
+    places = np.vstack([np.asarray(cost_map.start)[None], cells])
+    distances = between(cost_map, found.travel, places, searched=0)[1:, 1:] / 10.0
+    known = float((cost_map.classes == FREE).sum()) * cost_map.resolution**2
+    cov = np.asarray(belief.pose_cov)
+    state = np.array([
+        time_s / config.horizon_s,
+        math.log1p(known) / 5.0,
+        len(index) / config.most,
+        math.log10(math.sqrt(max(0.5 * (cov[0, 0] + cov[1, 1]), 0.0)) + 1e-4),
+        math.log10(math.sqrt(max(cov[2, 2], 0.0)) + 1e-5),
+        len(index) / max(len(open_), 1),
+        math.log1p(float(near.sum())) / 5.0,
+        float(costs.min()) / 10.0,
+    ])  # fmt: skip
+    as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
+    return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def _landmarks_left(
+    belief: Belief, cost_map: CostMap, views: Array, lidar: LidarConfig
+) -> tuple[Array, Array, Array]:
+    """Return how many corners and walls are in sight from each place, and the position's σ that they would leave.
+
+    The last as log10(σ / 1 m + 1e-4), each corner by itself: Σ 1 / (σ² + r²), r that of one sighting.
+    """
+    marks = marks_of(belief)
+    if not len(marks.kinds):
+        nothing = np.zeros(len(views))
+        return nothing, nothing, nothing
+    poses = np.column_stack([views, np.full(len(views), float(belief.pose[2]))])
+    seen, cov = expected_sightings(
+        cost_map, poses, marks.x[3:].reshape(-1, 2), marks.kinds, marks.ends, lidar=lidar, model=_SENSOR,
+        most=len(marks.kinds),
+    )  # fmt: skip
+    n = len(belief.landmarks)
+    known = 0.5 * np.trace(np.asarray(belief.landmark_cov), axis1=1, axis2=2)
+    information = np.where(seen[:, :n], 1.0 / (known + cov[:, :n, 0] + 1e-12), 0.0).sum(axis=1)
+    sigma = np.where(information > 0.0, 1.0 / np.sqrt(np.maximum(information, 1e-12)), 1.0)
+    corners, walls = seen[:, :n].sum(axis=1), seen[:, n:].sum(axis=1)
+    return np.log1p(corners) / 3.0, np.log1p(walls) / 3.0, np.log10(sigma + 1e-4)
+
+
+@njit(cache=True, nogil=True)
+def _first_turns(step: NDArray[np.int8], cells: NDArray[np.int64], heading: float, leg: float) -> Array:
+    """Return by how much the way to each cell turns off the heading at its beginning, 0 … π."""
+    turns = np.zeros(len(cells))
+    rows = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+    cols = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+    for i in range(len(cells)):
+        row, col = cells[i]
+        # To the start and count, then again as far as the first leg's end.
+        length = 0
+        while step[row, col] >= 0:
+            k = step[row, col]
+            row, col = row - rows[k], col - cols[k]
+            length += 1
+        start_r, start_c = row, col
+        row, col = cells[i]
+        for _ in range(length - int(leg)):
+            k = step[row, col]
+            row, col = row - rows[k], col - cols[k]
+        if row == start_r and col == start_c:
+            continue
+        off = math.atan2(row - start_r, col - start_c) - heading
+        turns[i] = abs(math.atan2(math.sin(off), math.cos(off)))
+    return turns
+
+
+def _direction(vectors: Array, heading: float) -> Array:
+    """Return the directions ``(2, m)`` of vectors ``(m, 2)``: ahead and to the left, shorter than 1 near by."""
+    length = np.maximum(np.hypot(*vectors.T), 0.3)
+    c, s = math.cos(heading), math.sin(heading)
+    return np.asarray(np.stack([vectors @ np.array([c, s]), vectors @ np.array([-s, c])]) / length)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cut_patches(
+    classes: NDArray[np.int8], frame: Array, targets: Array, normals: Array, cell_m: float, beyond_m: float,
+    robot: Array, out: NDArray[np.uint8],
+) -> None:  # fmt: skip
+    """Sample what is around each frontier, its normal along +x of the patch: nine points a cell."""
+    rows, cols = classes.shape
+    size = out.shape[2]
+    for i in range(len(targets)):
+        nx, ny = normals[i]
+        if nx == 0.0 and ny == 0.0:
+            nx, ny = targets[i] - robot
+        norm = math.hypot(nx, ny)
+        nx, ny = (nx / norm, ny / norm) if norm > 0.0 else (1.0, 0.0)
+        for r in range(size):
+            for c in range(size):
+                free = occupied = 0
+                for k in range(9):
+                    along = beyond_m + (c + 0.5 + (k % 3 - 1) / 3.0 - 0.5 * size) * cell_m
+                    across = (r + 0.5 + (k // 3 - 1) / 3.0 - 0.5 * size) * cell_m
+                    x = targets[i, 0] + nx * along - ny * across
+                    y = targets[i, 1] + ny * along + nx * across
+                    row = math.floor((y - frame[1]) / frame[2])
+                    col = math.floor((x - frame[0]) / frame[2])
+                    if 0 <= row < rows and 0 <= col < cols:
+                        free += classes[row, col] == FREE
+                        occupied += classes[row, col] == OCCUPIED
+                out[i, 0, r, c] = free * 28
+                out[i, 1, r, c] = min(occupied * 85, 255)

@@ -1,0 +1,103 @@
+"""A trained policy as an agent: the network's weights beside a JSON file that says where they come from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+
+from agents.choice_network import ChoiceNetwork
+from agents.chooser import Chooser, ChooserConfig
+from agents.outlook import CANDIDATE, STATE
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping
+from slam.types import Belief
+
+__all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
+
+SHIPPED = Path(__file__).parent / "policies"
+"""Where the policies lie that come with the package."""
+
+_FORMAT = "mecanum-slam choice policy 1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoFrontierConfig:
+    """Which policy."""
+
+    policy: str = "ppo-frontier"  # of those shipped, or the path of a .safetensors file
+
+
+def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
+    """Read a policy: the network, the explorer it was trained with, and what the JSON file says of its training.
+
+    Neither file can run code.
+
+    Raises
+    ------
+    ValueError
+        For a missing or damaged file, or one of another format; the message names it.
+    """
+    about = path.with_suffix(".json")
+    try:
+        described = json.loads(about.read_text(encoding="utf-8"))
+        weights = load_file(path)
+    except FileNotFoundError as error:
+        raise ValueError(f"policy {path}: {error.filename or path} is missing; both files are needed") from error
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ValueError(f"policy {path} cannot be read: {error}") from error
+    columns = [list(CANDIDATE), list(STATE)]
+    if not isinstance(described, dict) or described.get("format") != _FORMAT:
+        raise ValueError(f"policy {about}: format is not {_FORMAT!r}")
+    if [described.get("candidate"), described.get("state")] != columns:
+        raise ValueError(f"policy {about} was trained on other columns than this version shows; train it anew")
+    try:
+        network = ChoiceNetwork(weights, heads=int(described["heads"]))
+        driver = from_mapping(ChooserConfig, described["driver"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path}: {error}") from error
+    return network, driver, described
+
+
+class PpoFrontier(Chooser):
+    """Goes where a policy trained with PPO on ``mecanum_env/ExploreFrontier-v0`` says."""
+
+    def __init__(
+        self,
+        config: PpoFrontierConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        settings = from_mapping(PpoFrontierConfig, config)
+        path = Path(settings.policy)
+        if path.suffix != ".safetensors":
+            path = SHIPPED / f"{settings.policy}.safetensors"
+        self._network, driver, self.about = load_choice_policy(path)
+        super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
+
+    def choose(self, belief: Belief) -> Any:
+        """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
+        choice = self.survey(belief)
+        if choice is not None:
+            self.take(choice, int(np.argmax(self._network.scores(choice))))
+        return super().choose(belief)
+
+
+def policy_description(network_heads: int, driver: Mapping[str, Any], **training: Any) -> dict[str, Any]:
+    """Return what the JSON file beside the weights must say."""
+    return {
+        "format": _FORMAT, "heads": network_heads, "candidate": list(CANDIDATE), "state": list(STATE),
+        "driver": dict(driver), **training,
+    }  # fmt: skip
+
+
+Weights = Mapping[str, NDArray[np.float32]]

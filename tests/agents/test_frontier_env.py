@@ -1,0 +1,112 @@
+"""The frontier-choosing environment: Gymnasium's rules, time, masks, the same episode from the same seed."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import agents
+import mecanum_env  # noqa: F401 - registers
+from agents.frontier_env import ExploreFrontierEnv
+from agents.outlook import CANDIDATE, STATE
+
+ID = "mecanum_env:mecanum_env/ExploreFrontier-v0"
+TIME_ALONE = {"area": 0.0, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": 0.0, "effort": 0.0, "time": -1.0}
+
+
+def play(env, seed, *, pick=lambda env, observation: 0, most=400):
+    observation, info = env.reset(seed=seed)
+    trace = [(observation, 0.0, info)]
+    for _ in range(most):
+        observation, reward, terminated, truncated, info = env.step(pick(env.unwrapped, observation))
+        trace.append((observation, reward, info))
+        if terminated or truncated:
+            break
+    return trace
+
+
+def test_it_is_an_environment_after_gymnasiums_rules():
+    env = gymnasium.make(ID, rooms="rectangular")
+    assert isinstance(env.unwrapped, ExploreFrontierEnv)
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+@pytest.mark.parametrize("rooms", ["rectangular", "apartment", "corridors", "cave", "maze"])
+def test_an_episode_adds_up(rooms):
+    env = gymnasium.make(ID, rooms=rooms, reward=TIME_ALONE, config={"time_limit_s": 12.0})
+    trace = play(env, 3)
+    info = trace[-1][2]
+    durations = [i["duration_s"] for _, _, i in trace]
+    assert sum(durations) == pytest.approx(info["time_s"])
+    assert sum(r for _, r, _ in trace) == pytest.approx(-info["time_s"])
+    assert info["end"] in ("covered", "time") and "episode_metrics" in info
+    assert info["time_s"] <= 12.0 + 1e-9
+    # A choice is due at least as often as an agent replans, but for the time with no choice.
+    assert min(durations[1:]) > 0.0
+    for observation, _, _ in trace[:-1]:
+        assert env.observation_space.contains(observation)
+        m = int(observation["present"].sum())
+        assert (observation["present"][:m] == 1.0).all() and not observation["candidates"][m:].any()
+        ways = observation["candidates"][:m, CANDIDATE.index("way")]
+        assert (np.diff(ways) >= 0).all()  # cheapest first
+
+
+def test_the_masks_are_those_of_the_candidates():
+    env = gymnasium.make(ID, rooms="apartment").unwrapped
+    observation, _ = env.reset(seed=0)
+    for _ in range(5):
+        masks = env.action_masks()
+        np.testing.assert_array_equal(masks, observation["present"] > 0.5)
+        assert masks.dtype == bool and masks[0]
+        observation, *_ = env.step(int(np.flatnonzero(masks)[-1]))
+
+
+def test_one_seed_is_one_episode_and_whatever_is_no_candidate_is_the_first():
+    def last(env, observation):
+        return int(np.flatnonzero(env.action_masks())[-1])
+
+    traces = [play(gymnasium.make(ID, rooms="apartment"), 5, pick=last, most=12) for _ in range(2)]
+    for one, other in zip(*traces, strict=True):
+        assert one[1] == other[1] and one[2]["true_pose"].tolist() == other[2]["true_pose"].tolist()
+        for key in one[0]:
+            np.testing.assert_array_equal(one[0][key], other[0][key])
+    first = play(gymnasium.make(ID, rooms="rectangular"), 5, most=5)
+    none = play(gymnasium.make(ID, rooms="rectangular"), 5, pick=lambda env, _: env.action_space.n - 1, most=5)
+    if all(o["present"].sum() < len(o["present"]) for o, _, _ in none[:-1]):
+        assert [i["time_s"] for _, _, i in first] == [i["time_s"] for _, _, i in none]
+
+
+def test_the_discount_is_per_control_step():
+    whole = play(gymnasium.make(ID, rooms="apartment", reward=TIME_ALONE), 2, most=6)
+    less = play(gymnasium.make(ID, rooms="apartment", reward=TIME_ALONE, discount=0.9), 2, most=6)
+    for (_, _, info), (_, reward, _) in list(zip(whole, less, strict=True))[1:]:
+        steps = round(info["duration_s"] / 0.1)
+        assert reward == pytest.approx(-0.1 * (1 - 0.9**steps) / (1 - 0.9))
+
+
+def test_choosing_the_nearest_drives_as_the_nearest_frontier_agent_does_until_it_would_not():
+    """The same first choice, the same driving."""
+    env = gymnasium.make(ID, rooms="apartment").unwrapped
+    env.reset(seed=1)
+    base = gymnasium.make("mecanum_env:mecanum_env/Explore-v0", rooms="apartment").unwrapped
+    observation, _ = base.reset(seed=1)
+    agent = agents.make("nearest-frontier")
+    agent.reset(base.belief, 1)
+    *_, info = env.step(0)
+    for _ in range(round(info["duration_s"] / 0.1)):
+        observation, *_, other = base.step(agent.act(observation, base.belief))
+    np.testing.assert_array_equal(info["true_pose"], other["true_pose"])
+
+
+def test_it_says_what_is_wrong():
+    env = gymnasium.make(ID, rooms="rectangular").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="action must be 0 … 23, got 24"):
+        env.step(24)
+    with pytest.raises(ValueError, match="discount"):
+        ExploreFrontierEnv(discount=0.0)
+    with pytest.raises(ValueError, match="valid"):
+        ExploreFrontierEnv(driver={"speed": 1.0})
+    assert len(STATE) == env.observation_space["state"].shape[0]

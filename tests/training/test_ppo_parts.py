@@ -1,0 +1,109 @@
+"""Networks and advantages: the same without PyTorch, blind to order, and discounted by time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("sb3_contrib")
+
+from gymnasium import spaces  # noqa: E402
+
+from agents import choice_network  # noqa: E402
+from agents.chooser import ChooserConfig  # noqa: E402
+from agents.frontier_env import as_observation, choice_space  # noqa: E402
+from agents.outlook import CANDIDATE, STATE, Choice  # noqa: E402
+from training.networks import ChoiceNetwork  # noqa: E402
+from training.semi_markov import SemiMarkovBuffer  # noqa: E402
+
+CONFIG = ChooserConfig()
+
+
+def a_choice(m: int, seed: int = 0) -> Choice:
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(0.0, 2.0, (m, 2))
+    return Choice(
+        np.arange(m),
+        rng.normal(size=(m, len(CANDIDATE))).astype(np.float32),
+        rng.integers(0, 256, (m, 2, 16, 16)).astype(np.uint8),
+        np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)).astype(np.float32),
+        rng.normal(size=len(STATE)).astype(np.float32),
+    )
+
+
+def network(seed: int = 0) -> ChoiceNetwork:
+    torch.manual_seed(seed)
+    made = ChoiceNetwork(len(CANDIDATE), 2 * 16 * 16, len(STATE))
+    for p in made.parameters():
+        torch.nn.init.normal_(p, std=0.15)
+    return made
+
+
+def scores(made: ChoiceNetwork, choice: Choice) -> tuple[np.ndarray, float]:
+    observation = {k: torch.as_tensor(v)[None] for k, v in as_observation(choice, CONFIG).items()}
+    with torch.no_grad():
+        tokens = made.tokens(observation)
+        value = made.value(tokens, observation["present"])
+        return made.scores(tokens)[0, : len(choice.index)].numpy(), float(value[0, 0])
+
+
+@pytest.mark.parametrize("m", [1, 2, 9, 24])
+def test_numpy_and_torch_agree(m):
+    made = network(m)
+    weights = {name: value.numpy() for name, value in made.state_dict().items()}
+    light = choice_network.ChoiceNetwork(weights, heads=4)
+    choice = a_choice(m, m)
+    wanted, worth = scores(made, choice)
+    np.testing.assert_allclose(light.scores(choice), wanted, atol=2e-4)
+    assert light.value(choice) == pytest.approx(worth, abs=2e-4)
+
+
+def test_permuted_candidates_get_permuted_scores():
+    made, choice = network(), a_choice(11)
+    p = np.random.default_rng(1).permutation(11)
+    turned = Choice(p, choice.candidates[p], choice.patches[p], choice.distances[np.ix_(p, p)], choice.state)
+    one, worth = scores(made, choice)
+    other, same = scores(made, turned)
+    np.testing.assert_allclose(other, one[p], atol=1e-4)
+    assert same == pytest.approx(worth, abs=1e-4)
+
+
+def test_damaged_weights_are_named():
+    weights = {name: value.numpy() for name, value in network().state_dict().items()}
+    with pytest.raises(ValueError, match=r"weight score.weight has the shape \(2, 64\)"):
+        choice_network.ChoiceNetwork(weights | {"score.weight": np.zeros((2, 64), np.float32)}, heads=4)
+    del weights["token.weight"]
+    with pytest.raises(ValueError, match=r"weight token.weight is missing"):
+        choice_network.ChoiceNetwork(weights, heads=4)
+
+
+def test_advantages_against_the_sums_they_stand_for():
+    """γ^duration for γ; with λ = 1 the advantage is the discounted sum to the end less the value."""
+    rng = np.random.default_rng(0)
+    steps, gamma = 12, 0.9
+    space = choice_space(CONFIG)
+    for lam in (1.0, 0.6):
+        buffer = SemiMarkovBuffer(
+            steps, space, spaces.Discrete(24), gamma=gamma, gae_lambda=lam, n_envs=2, device="cpu"
+        )
+        buffer.reset()
+        values, rewards = rng.normal(size=(steps + 1, 2)), rng.normal(size=(steps, 2))
+        durations = rng.uniform(0.3, 2.0, (steps, 2))
+        starts = np.zeros((steps, 2))
+        starts[5, 0] = 1.0  # an episode of the first environment ended with step 4
+        buffer.rewards, buffer.values = rewards.astype(np.float32), values[:-1].astype(np.float32)
+        buffer.durations, buffer.episode_starts = durations.astype(np.float32), starts.astype(np.float32)
+        dones = np.array([False, True])
+        buffer.compute_returns_and_advantage(torch.as_tensor(values[-1:], dtype=torch.float32), dones)
+        for e in range(2):
+            for t in range(steps):
+                total, weight = 0.0, 1.0
+                for k in range(t, steps):
+                    last = bool(dones[e]) if k == steps - 1 else starts[k + 1, e] == 1.0
+                    g = gamma ** durations[k, e]
+                    total += weight * (rewards[k, e] + (0.0 if last else g * values[k + 1, e]) - values[k, e])
+                    weight *= g * lam
+                    if last:
+                        break
+                assert buffer.advantages[t, e] == pytest.approx(total, abs=1e-4)

@@ -1,0 +1,86 @@
+"""``mecanum train`` on the command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from training.errors import BadInput, Interrupted, bad_input, check_writable, suggestion
+
+if TYPE_CHECKING:
+    from training.train_config import TrainConfig
+
+__all__ = ["train"]
+
+CONFIGS = Path(__file__).parent / "configs"
+
+
+def train(
+    config: Annotated[
+        str, typer.Option(help="Name of a configuration that comes with the package, or a TOML file.")
+    ] = "ppo-frontier",
+    seed: Annotated[int | None, typer.Option(min=0, help="Another seed than the configuration's.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Processes of lessons and evaluation.  [default: one a core]"),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+) -> None:
+    """Train a policy with PPO, after a warm start by imitation.
+
+    Writes into --out: checkpoint.zip and best.zip (stable-baselines3), progress.json, curve.jsonl (a line per
+    evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes on from its last
+    checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
+
+    \b
+    Examples:
+      mecanum train --out out/frontier
+      mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
+      mecanum train --config my.toml --out out/mine --resume
+    """  # noqa: D301
+    check_writable(out)
+    settings = _read(config, seed)
+    begun = (out / "progress.json").exists()
+    if begun and not resume:
+        raise BadInput(f"{out} holds a run already; go on with it by --resume, or choose another --out")
+    if resume and not begun:
+        raise BadInput(f"{out} holds no run to go on with; leave out --resume")
+    try:
+        from training.ppo import Run
+    except ModuleNotFoundError as error:
+        raise BadInput(
+            f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
+        ) from error
+    with bad_input():
+        run = Run(settings, out, workers=workers or os.cpu_count() or 1, log=_say)
+    try:
+        run.train()
+    except KeyboardInterrupt as error:
+        raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
+
+
+def _read(config: str, seed: int | None) -> TrainConfig:
+    from slam.settings import from_mapping
+    from training.train_config import TrainConfig
+
+    shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
+    path = CONFIGS / f"{config}.toml" if config in shipped else Path(config)
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        hint = suggestion(config, shipped)
+        raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInput(f"cannot read {path}: {error}") from error
+    with bad_input():
+        return from_mapping(TrainConfig, values if seed is None else values | {"seed": seed})
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

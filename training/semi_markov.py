@@ -1,0 +1,50 @@
+"""Advantages where steps take unequal time: γ to the power of what each took (Sutton, Precup and Singh, 1999)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from torch import Tensor
+
+__all__ = ["Durations", "SemiMarkovBuffer"]
+
+
+class SemiMarkovBuffer(MaskableDictRolloutBuffer):
+    """A rollout buffer that discounts by ``gamma`` per unit of time, not per step.
+
+    ``durations`` ``(steps, environments)`` are set before each :meth:`add` by :class:`Durations`. λ is per step.
+    """
+
+    def reset(self) -> None:
+        """Forget the rollout."""
+        self.durations = np.ones((self.buffer_size, self.n_envs), dtype=np.float32)
+        super().reset()
+
+    def compute_returns_and_advantage(self, last_values: Tensor, dones: np.ndarray[Any, Any]) -> None:
+        """Return nothing; set ``advantages`` and ``returns`` (GAE, with γ^duration for γ)."""
+        next_values = last_values.clone().cpu().numpy().flatten()
+        goes_on = 1.0 - dones.astype(np.float32)
+        advantage = np.zeros(self.n_envs, dtype=np.float32)
+        for step in reversed(range(self.buffer_size)):
+            gamma = self.gamma ** self.durations[step] * goes_on
+            delta = self.rewards[step] + gamma * next_values - self.values[step]
+            advantage = delta + gamma * self.gae_lambda * advantage
+            self.advantages[step] = advantage
+            next_values, goes_on = self.values[step], 1.0 - self.episode_starts[step]
+        self.returns = self.advantages + self.values
+
+
+class Durations(BaseCallback):
+    """Tells the buffer how long each step took, in units of ``unit_s``."""
+
+    def __init__(self, unit_s: float = 1.0) -> None:
+        super().__init__()
+        self._unit_s = unit_s
+
+    def _on_step(self) -> bool:
+        buffer = self.model.rollout_buffer  # type: ignore[attr-defined]
+        buffer.durations[buffer.pos] = [info["duration_s"] / self._unit_s for info in self.locals["infos"]]
+        return True

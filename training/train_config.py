@@ -1,0 +1,107 @@
+"""What a training run is made of: TOML tables, validated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from mecanum_env import rooms as room_registry
+from mecanum_env.config import NOISE_PRESETS
+from slam.settings import require, unknown_name
+
+__all__ = ["EvaluationConfig", "ImitationConfig", "PpoConfig", "TrainConfig", "WorldConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldConfig:
+    """Where is trained: families of rooms, drawn alike often, one noise an environment in turn."""
+
+    rooms: tuple[str, ...] = ("apartment",)
+    noises: tuple[str, ...] = ("nominal",)
+    seeds: tuple[int, int] = (0, 999)  # of the rooms, both included
+    slam: str = "invariant-ekf"
+    time_limit_s: float = 300.0
+    time_1_s: float = -1.0 / 30.0  # reward per second
+    area_1_m2: float = 0.0  # … per square metre newly mapped
+    collision: float = -1.0
+    driver: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require(len(self.rooms) > 0 and len(self.noises) > 0, "[world] needs rooms and noises")
+        for name in self.rooms:
+            if name not in room_registry.names():
+                raise unknown_name("rooms", name, room_registry.names())
+        for name in self.noises:
+            if name not in NOISE_PRESETS:
+                raise unknown_name("noise preset", name, NOISE_PRESETS)
+        low, high = self.seeds
+        require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImitationConfig:
+    """The start: to choose as a heuristic does."""
+
+    teacher: str = "cost-utility"  # or tour
+    episodes: int = 0  # 0: no warm start
+    epochs: int = 8
+    batch: int = 256
+    rate: float = 1e-3
+    astray: float = 0.1  # share of the choices that are made at random, so that more than its own ways are seen
+
+    def __post_init__(self) -> None:
+        require(self.teacher in ("cost-utility", "tour"), "[imitation] teacher must be cost-utility or tour")
+        require(self.episodes >= 0 and self.epochs >= 1, "[imitation] needs episodes ≥ 0 and epochs ≥ 1")
+        require(0 <= self.astray < 1, "[imitation] astray must be in [0, 1)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """Of stable-baselines3, but ``gamma``, which is per second."""
+
+    steps: int = 200_000  # decisions
+    environments: int = 8
+    n_steps: int = 128  # decisions an environment, in one rollout
+    batch_size: int = 256
+    n_epochs: int = 4
+    learning_rate: float = 3e-4  # falls to nothing
+    gamma: float = 0.998
+    gae_lambda: float = 0.97
+    ent_coef: float = 0.003
+    clip_range: float = 0.2
+    target_kl: float = 0.03
+    chunk: int = 16  # rollouts between two checkpoints
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value >= 0, f"[ppo] {f.name} must be ≥ 0, got {value}")
+        for name in ("environments", "n_steps", "batch_size", "n_epochs", "chunk"):
+            require(getattr(self, name) >= 1, f"[ppo] {name} must be at least 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationConfig:
+    """How often it is tried on validation seeds, and on how many."""
+
+    every: int = 2  # chunks
+    episodes: int = 20  # of each family
+
+    def __post_init__(self) -> None:
+        require(self.every >= 1 and 1 <= self.episodes <= 50, "[evaluation] needs every ≥ 1, episodes 1 … 50")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """A training run of ``ppo-frontier``."""
+
+    seed: int = 1
+    width: int = 64
+    heads: int = 4
+    layers: int = 2
+    world: WorldConfig = field(default_factory=WorldConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
