@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.outlook import Choice
+from agents.choice import Choice
 
 __all__ = ["ChoiceNetwork"]
 

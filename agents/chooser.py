@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from agents.choice import Choice, ChoiceConfig, describe
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.outlook import Choice, ChoiceConfig, describe
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping
 from slam.types import Belief

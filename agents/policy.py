@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from agents.choice import CANDIDATE, STATE
 from agents.choice_network import ChoiceNetwork
 from agents.chooser import Chooser, ChooserConfig
-from agents.outlook import CANDIDATE, STATE
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping
 from slam.types import Belief

@@ -11,9 +11,9 @@ pytest.importorskip("sb3_contrib")
 from gymnasium import spaces  # noqa: E402
 
 from agents import choice_network  # noqa: E402
+from agents.choice import CANDIDATE, STATE, Choice  # noqa: E402
 from agents.chooser import ChooserConfig  # noqa: E402
 from agents.frontier_env import as_observation, choice_space  # noqa: E402
-from agents.outlook import CANDIDATE, STATE, Choice  # noqa: E402
 from training.networks import ChoiceNetwork  # noqa: E402
 from training.semi_markov import SemiMarkovBuffer  # noqa: E402
 
