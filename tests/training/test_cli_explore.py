@@ -37,11 +37,13 @@ METRICS = {
 
 
 def run(*argv: str, **kwargs: Any) -> subprocess.Popen[str]:
-    # Started where the results go, to see that nothing depends on the folder it runs in.
+    # Started where the results go, to see that nothing depends on the folder it runs in. A shell's background job
+    # has Ctrl-C ignored, and all that it starts: here it is to be heard.
     return subprocess.Popen(
         [sys.executable, "-m", "training.cli", *argv],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}, **kwargs,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **kwargs,
     )  # fmt: skip
 
 
@@ -196,7 +198,7 @@ def test_ctrl_c_before_the_episode_writes_nothing(tmp_path: Path) -> None:
     process = run("explore", "--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out"))
     with open(tmp_path / "config.toml", "w"):  # opens as soon as the other side reads
         process.send_signal(signal.SIGINT)
-    # Closed by now: a signal just before the other side's read would not wake it, the end of the file does.
+    # Closed by now: a signal just before the other side's read does not wake it, the end of the file does.
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err == "mecanum explore: interrupted before the results were written\n"
