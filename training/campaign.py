@@ -26,7 +26,16 @@ from training.errors import BadInput, Interrupted, check_writable
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-__all__ = ["backend_names", "check_settings", "installed_version", "run_all", "write_settings"]
+__all__ = [
+    "backend_names",
+    "check_settings",
+    "installed_version",
+    "one_thread_each",
+    "run_all",
+    "start_worker",
+    "worker_pool",
+    "write_settings",
+]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -155,14 +164,21 @@ def _results(
         for job in jobs:
             yield job, work(job)
         return
+    with worker_pool(workers) as pool:
+        futures = {pool.submit(work, job): job for job in jobs}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+
+
+@contextmanager
+def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Give spawned processes with single-threaded libraries, which Ctrl-C ends when it ends this one."""
     before = set(multiprocessing.active_children())
-    with _one_thread_each():
+    with one_thread_each():
         context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_start_worker)
+        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker)
         try:
-            futures = {pool.submit(work, job): job for job in jobs}
-            for future in as_completed(futures):
-                yield futures[future], future.result()
+            yield pool
         except BaseException:
             # Do not wait for what is half done: nobody will keep it.
             pool.shutdown(wait=False, cancel_futures=True)
@@ -173,7 +189,7 @@ def _results(
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
     """Have the processes that are started meanwhile load their libraries with one thread each."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
@@ -187,7 +203,8 @@ def _one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _start_worker() -> None:
+def start_worker() -> None:
+    """Set up a worker process: it leaves Ctrl-C to its parent, and ends with it."""
     # Ctrl-C reaches every process of the terminal's group; the parent alone decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)

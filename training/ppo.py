@@ -8,7 +8,6 @@ bit.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -28,7 +27,8 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor
 from agents.choice_network import ChoiceNetwork
 from slam.formats import atomic_write
 from slam.settings import to_mapping
-from training.choice_world import make_world
+from training.campaign import one_thread_each, start_worker, worker_pool
+from training.choice_world import Families, make_world
 from training.imitation import give_lessons, learn
 from training.networks import ChoicePolicy
 from training.semi_markov import Durations, SemiMarkovBuffer
@@ -70,12 +70,12 @@ class Run:
         torch.set_num_threads(1)
         self.out.mkdir(parents=True, exist_ok=True)
         ppo, progress = self.config.ppo, self._progress
-        makers = [partial(make_world, self.config.world, k) for k in range(ppo.environments)]
-        env = VecMonitor(SubprocVecEnv(makers, start_method="forkserver"))  # type: ignore[arg-type]
-        context = multiprocessing.get_context("forkserver")
+        makers = [partial(_world_of_worker, self.config.world, k) for k in range(ppo.environments)]
+        with one_thread_each():
+            env = VecMonitor(SubprocVecEnv(makers, start_method="spawn"))  # type: ignore[arg-type]
         self._began = time.perf_counter() - progress["wall_s"]
         try:
-            with ProcessPoolExecutor(self._workers, mp_context=context) as pool:
+            with worker_pool(self._workers) as pool:
                 model = self._model(env)
                 if progress["chunk"] > 0:
                     model.set_parameters(str(self.out / "checkpoint.zip"), device="cpu")
@@ -183,6 +183,12 @@ def _try(job: tuple[Weights, int, WorldConfig, str, str, int]) -> tuple[float, i
         *_, terminated, truncated, info = env.step(k)
         if terminated or truncated:
             return info["time_s"] if info["is_success"] else world.time_limit_s, info["collisions"]
+
+
+def _world_of_worker(world: WorldConfig, index: int) -> Families:
+    """Make an environment in a process of its own."""
+    start_worker()
+    return make_world(world, index)
 
 
 def _save(model: MaskablePPO, path: Path) -> None:
