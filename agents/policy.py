@@ -9,21 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
+from agents.base import Goal
 from agents.choice import CANDIDATE, STATE
 from agents.choice_network import ChoiceNetwork
 from agents.chooser import Chooser, ChooserConfig
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.settings import from_mapping
+from slam.settings import from_mapping, require
 from slam.types import Belief
 
-__all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
-
-SHIPPED = Path(__file__).parent / "policies"
-"""Where the policies lie that come with the package."""
+__all__ = ["PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
 
 _FORMAT = "mecanum-slam choice policy 1"
 
@@ -32,7 +29,10 @@ _FORMAT = "mecanum-slam choice policy 1"
 class PpoFrontierConfig:
     """Which policy."""
 
-    policy: str = "ppo-frontier"  # of those shipped, or the path of a .safetensors file
+    policy: str = ""  # path of a .safetensors file, the .json file beside it
+
+    def __post_init__(self) -> None:
+        require(self.policy != "", "PpoFrontierConfig.policy must be the path of a .safetensors file")
 
 
 def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
@@ -78,13 +78,10 @@ class PpoFrontier(Chooser):
         step_s: float = 0.1,
     ) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
-        path = Path(settings.policy)
-        if path.suffix != ".safetensors":
-            path = SHIPPED / f"{settings.policy}.safetensors"
-        self._network, driver, self.about = load_choice_policy(path)
+        self._network, driver, self.about = load_choice_policy(Path(settings.policy))
         super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
 
-    def choose(self, belief: Belief) -> Any:
+    def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
         choice = self.survey(belief)
         if choice is not None:
@@ -98,6 +95,3 @@ def policy_description(network_heads: int, driver: Mapping[str, Any], **training
         "format": _FORMAT, "heads": network_heads, "candidate": list(CANDIDATE), "state": list(STATE),
         "driver": dict(driver), **training,
     }  # fmt: skip
-
-
-Weights = Mapping[str, NDArray[np.float32]]

@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save
+from safetensors.numpy import save
 
 from agents.policy import load_choice_policy, policy_description
 from slam.formats import atomic_write
 from slam.settings import to_mapping
-from training.networks import ChoiceNetwork
 
-__all__ = ["export_policy", "read_zip", "set_weights"]
+__all__ = ["export_policy", "read_zip"]
 
 _INSIDE = "features_extractor.network."
 """Where the network is among the parameters of :class:`training.networks.ChoicePolicy`."""
@@ -62,9 +61,3 @@ def export_policy(source: Path, target: Path, *, heads: int, driver: Any, traini
     atomic_write(target, save(read_zip(source)))
     atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     load_choice_policy(target)  # it is read back
-
-
-def set_weights(network: ChoiceNetwork, source: Path) -> None:
-    """Load a shipped policy's weights into a network of the same sizes, to train it on."""
-    load_choice_policy(source)
-    network.load_state_dict({name: torch.as_tensor(value) for name, value in load_file(source).items()})

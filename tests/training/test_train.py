@@ -106,5 +106,7 @@ def test_an_exported_policy_chooses_as_the_one_in_the_zip(tmp_path):
     target.write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="cannot be read"):
         load_choice_policy(target)
+    with pytest.raises(ValueError, match=r"policy must be the path of a \.safetensors file"):
+        PpoFrontier()
     with pytest.raises(ValueError, match="is missing"):
         load_choice_policy(tmp_path / "none.safetensors")
