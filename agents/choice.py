@@ -35,7 +35,7 @@ _SENSOR = SensorModel()
 CANDIDATE = (
     "way", "distance", "ahead", "left", "target_ahead", "target_left", "normal_ahead", "normal_left",
     "area_near", "area_far", "extent", "cells", "clearance", "current", "worth", "rank", "turn", "corners",
-    "walls", "sigma_left",
+    "walls", "sigma_left", "pieces",
 )  # fmt: skip
 """Columns of a candidate's row."""
 
@@ -49,8 +49,9 @@ class ChoiceConfig:
 
     most: int = 24  # candidates: the cheapest to reach
     patch_cells: int = 16  # side of a patch
-    patch_m: float = 0.5  # side of one of its cells
-    beyond_m: float = 2.0  # from the frontier to the patch's middle, into the unknown
+    patch_m: float = 0.5  # side of one of its cells …
+    wide_m: float = 1.0  # … and of a wider one's
+    beyond_m: float = 2.0  # from the frontier to the patches' middle, into the unknown
     near_m: float = 2.0  # how far into the unknown an optimist sees …
     far_m: float = 5.0  # … and a greater one
     horizon_s: float = 300.0  # that time counts against
@@ -63,11 +64,12 @@ class ChoiceConfig:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """A choice, described: m candidates, cheapest first."""
+    """A choice, described: m candidates, cheapest first. Pieces of frontier that share a view point are one."""
 
     index: NDArray[np.int64]  # (m,) of the candidate among all that were found
     candidates: Floats  # (m, CANDIDATE)
-    patches: NDArray[np.uint8]  # (m, 2, s, s) share of free and of occupied, the frontier's normal to the right
+    # Share of free and of occupied, then the same in the wider patch, the frontier's normal to the right.
+    patches: NDArray[np.uint8]  # (m, 4, s, s)
     distances: Floats  # (m, m) travel costs between the view points [10 weighted m]
     state: Floats  # (STATE,)
 
@@ -90,8 +92,7 @@ def describe(
     time_s
         Since the episode began.
     """
-    open_ = np.flatnonzero(np.isfinite(found.costs))
-    index = open_[np.argsort(found.costs[open_], kind="stable")[: config.most]]
+    index, pieces, views_found = _apart(found, config.most)
     cost_map, cells, costs = found.cost_map, found.cells[index], found.costs[index]
     targets, normals = found.frontiers.targets[index], found.frontiers.normals[index]
     pose = np.asarray(belief.pose, dtype=np.float64)
@@ -117,10 +118,12 @@ def describe(
         np.arange(len(index)) / 10.0,
         _first_turns(found.travel.step, cells, pose[2], _FIRST_LEG_M / cost_map.resolution) / math.pi,
         *_landmarks_left(belief, cost_map, views, lidar),
+        pieces / 3.0,
     ])  # fmt: skip
-    patches = np.zeros((len(index), 2, config.patch_cells, config.patch_cells), dtype=np.uint8)
+    patches = np.zeros((len(index), 4, config.patch_cells, config.patch_cells), dtype=np.uint8)
     frame = np.array([*cost_map.origin, cost_map.resolution])
-    _cut_patches(cost_map.classes, frame, targets, normals, config.patch_m, config.beyond_m, pose[:2], patches)
+    for side_m, channels in ((config.patch_m, patches[:, :2]), (config.wide_m, patches[:, 2:])):
+        _cut_patches(cost_map.classes, frame, targets, normals, side_m, config.beyond_m, pose[:2], channels)
     places = np.vstack([np.asarray(cost_map.start)[None], cells])
     distances = between(cost_map, found.travel, places, searched=0)[1:, 1:] / 10.0
     known = float((cost_map.classes == FREE).sum()) * cost_map.resolution**2
@@ -131,12 +134,25 @@ def describe(
         len(index) / config.most,
         math.log10(math.sqrt(max(0.5 * (cov[0, 0] + cov[1, 1]), 0.0)) + 1e-4),
         math.log10(math.sqrt(max(cov[2, 2], 0.0)) + 1e-5),
-        len(index) / max(len(open_), 1),
+        len(index) / views_found,
         math.log1p(float(near.sum())) / 5.0,
         float(costs.min()) / 10.0,
     ])  # fmt: skip
     as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
     return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def _apart(found: Candidates, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Return one candidate a view point, cheapest first, and the number of pieces that are seen from each.
+
+    Of several at one view point it is the one that the robot is driving to, or the first. The last number
+    returned is that of all view points, before the dearest are left out.
+    """
+    open_ = np.flatnonzero(np.isfinite(found.costs))
+    by_cost = open_[np.lexsort((open_ != (-1 if found.current is None else found.current), found.costs[open_]))]
+    _, first, pieces = np.unique(found.cells[by_cost], axis=0, return_index=True, return_counts=True)
+    order = np.argsort(first)[:most]
+    return by_cost[first[order]], pieces[order], len(first)
 
 
 def _landmarks_left(

@@ -35,7 +35,7 @@ def choice_space(config: ChooserConfig) -> spaces.Dict:
     return spaces.Dict({
         "candidates": floats(k, len(CANDIDATE)),
         "distances": floats(k, k),
-        "patches": spaces.Box(0, 255, (k, 2, side, side), np.uint8),
+        "patches": spaces.Box(0, 255, (k, 4, side, side), np.uint8),
         "present": spaces.Box(0.0, 1.0, (k,), np.float32),
         "state": floats(len(STATE)),
     })  # fmt: skip
@@ -47,7 +47,7 @@ def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
     padded: Observation = {
         "candidates": np.zeros((k, len(CANDIDATE)), np.float32),
         "distances": np.zeros((k, k), np.float32),
-        "patches": np.zeros((k, 2, side, side), np.uint8),
+        "patches": np.zeros((k, 4, side, side), np.uint8),
         "present": np.zeros(k, np.float32),
         "state": np.zeros(len(STATE), np.float32),
     }

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.cost_map import CostMap
 
-__all__ = ["TravelCosts", "resample", "shortest_path", "travel_costs"]
+__all__ = ["TravelCosts", "resample", "shortest_path", "travel_costs", "way_cells"]
 
 Array = NDArray[np.float64]
 
@@ -71,13 +71,18 @@ def shortest_path(
     """
     if not math.isfinite(float(travel.cost[cell])):
         raise ValueError(f"cell {cell} cannot be reached: choose one whose travel cost is finite")
-    cells = _chain(travel.step, cell[0], cell[1])
+    cells = way_cells(travel, cell)
     points = cost_map.to_points(cells)
     points[0] = np.asarray(start, dtype=np.float64)[:2]
     keep = _cut_straight(
         points, cost_map.weight, cost_map.clearance, cost_map.resolution, np.asarray(cost_map.origin)
     )
     return resample(points[keep], spacing_m)
+
+
+def way_cells(travel: TravelCosts, cell: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cells ``(n, 2)`` of the cheapest way from the robot to a cell, both included."""
+    return np.asarray(_chain(travel.step, int(cell[0]), int(cell[1])))
 
 
 def resample(path: Array, spacing_m: float) -> Array:

@@ -14,7 +14,9 @@ from agents.explorer import Candidates
 from agents.frontier_env import ExploreFrontierEnv
 from agents.tour import Tour
 from mecanum_env import rooms as room_registry
+from training.hindsight import Hindsight
 from training.train_config import WorldConfig
+from training.true_places import TruePlaces
 
 __all__ = ["Families", "Teacher", "make_world"]
 
@@ -26,11 +28,13 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
 
     env: ExploreFrontierEnv
+    _hindsight: Hindsight | None
 
     def __init__(self, env: ExploreFrontierEnv, world: WorldConfig) -> None:
         super().__init__(env)
         self._world = world
         self._rng = np.random.default_rng(0)
+        self._places: dict[tuple[str, int], TruePlaces] = {}
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -46,9 +50,37 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
             name, room_seed = options["rooms"], options["room_seed"]
             episode_seed = room_seed  # as the benchmark has it
         plan = room_registry.make(name, seed=room_seed)
-        self.family = name
+        self._room, self._hindsight = (name, room_seed), None
         observation, info = self.env.reset(seed=episode_seed, options={"floor_plan": plan})
+        self._potential = self._worth(observation)
         return observation, info
+
+    def step(self, action: SupportsInt) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step; the reward is shaped by what is still to go, by hindsight, if the configuration says so.
+
+        The shaping is the difference of a potential (Ng, Harada and Russell, ICML 1999), 0 at the end: what is
+        best to do stays the same, and a choice's part in how long it takes is felt at once.
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        before, self._potential = self._potential, 0.0 if terminated else self._worth(observation)
+        return observation, float(reward) + self._potential - before, terminated, truncated, info
+
+    def _worth(self, observation: dict[str, NDArray[Any]]) -> float:
+        world = self._world
+        if world.shaping_s_m == 0.0 or not observation["present"].any():
+            return 0.0
+        return world.time_1_s * world.shaping_s_m * float(self.prices().min())
+
+    def prices(self) -> NDArray[np.float32]:
+        """Return what each candidate would cost by the truth ``(m,)`` [weighted m]: for teaching only."""
+        env = self.env
+        if self._hindsight is None:
+            if self._room not in self._places:
+                self._places[self._room] = TruePlaces(
+                    env.base.truth.ground, env.driver.planner, robot=env.config.robot, lidar=env.config.lidar
+                )
+            self._hindsight = Hindsight(self._places[self._room])
+        return self._hindsight.prices(*env.agent.described, env.belief)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions stand for a candidate."""
@@ -81,12 +113,17 @@ class Teacher:
         assert isinstance(made, CostUtility | Tour)
         self._agent, self._env = made, env
 
+    def begin(self) -> None:
+        """Forget the last episode."""
+        self._agent.reset(self._env.belief)
+
     def __call__(self) -> SupportsInt:
         """Return the action."""
         env, agent = self._env, self._agent
         choice, found = env.agent.described
         index = self._pick(agent, found)
-        at = np.flatnonzero(choice.index == index)
+        # Pieces at one view point are one candidate.
+        at = np.flatnonzero((found.cells[choice.index] == found.cells[index]).all(axis=1))
         return int(at[0]) if len(at) else 0
 
     def _pick(self, agent: CostUtility | Tour, found: Candidates) -> int:

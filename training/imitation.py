@@ -1,10 +1,17 @@
-"""The warm start: to choose as a heuristic does, learned from what it chose and how that went on."""
+"""The warm start: to choose as a teacher does, learned from what each candidate would have cost.
+
+The teacher is ``hindsight``, which prices every candidate by the truth (``training/hindsight.py``), or a
+heuristic, whose choice costs nothing and every other one alike. In the first round a heuristic drives; in later
+ones what was learned from the rounds before, so that it learns from the states that it gets into (DAgger: Ross,
+Gordon and Bagnell, AISTATS 2011; with costs of all actions, AggreVaTe: Ross and Bagnell, 2014).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,50 +19,88 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from training.choice_world import Teacher, make_world
+from agents import choice_network
+from agents.choice import CANDIDATE
+from slam.formats import replacing
+from training.choice_world import Families, Teacher, make_world
 from training.networks import ChoiceNetwork
 from training.train_config import TrainConfig
 
 __all__ = ["Lessons", "give_lessons", "learn"]
 
+Weights = dict[str, NDArray[np.float32]]
+
+_MIRRORED = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
+_METRES = 5.0  # of price, for one unit of loss
+
 
 @dataclass(frozen=True, eq=False)
 class Lessons:
-    """What a teacher was shown, chose and got."""
+    """What was shown, what each candidate would have cost, and how it went on."""
 
     observations: dict[str, NDArray[Any]]  # (n, …) each
-    actions: NDArray[np.int64]  # (n,)
+    prices: NDArray[np.float32]  # (n, K) weighted metres; inf where there is no candidate
     returns: NDArray[np.float32]  # (n,) discounted, from there on
 
+    @classmethod
+    def joined(cls, parts: Sequence[Lessons]) -> Lessons:
+        """Return several as one."""
+        keys = parts[0].observations
+        return cls(
+            {key: np.concatenate([part.observations[key] for part in parts]) for key in keys},
+            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)[1:]),
+        )
 
-def give_lessons(config: TrainConfig, pool: ProcessPoolExecutor) -> Lessons:
-    """Return a teacher's choices in as many episodes as the configuration says, however many workers give them."""
-    jobs = [(config, k) for k in range(config.imitation.episodes)]
-    parts = list(pool.map(_episode, jobs, chunksize=4))
-    keys = parts[0].observations
-    return Lessons(
-        {key: np.concatenate([part.observations[key] for part in parts]) for key in keys},
-        np.concatenate([part.actions for part in parts]),
-        np.concatenate([part.returns for part in parts]),
-    )
+    def save(self, path: Path) -> None:
+        """Write as ``.npz``, whole or not at all."""
+        with replacing(path) as new:
+            np.savez_compressed(new, prices=self.prices, returns=self.returns, **self.observations)
+
+    @classmethod
+    def load(cls, path: Path) -> Lessons:
+        """Read what :meth:`save` wrote."""
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        return cls(prices=arrays.pop("prices"), returns=arrays.pop("returns"), observations=arrays)
 
 
-def _episode(job: tuple[TrainConfig, int]) -> Lessons:
-    config, number = job
+def give_lessons(
+    config: TrainConfig, pool: ProcessPoolExecutor, *, number: int = 0, weights: Weights | None = None
+) -> Lessons:
+    """Return the lessons of a round, the same however many workers give them.
+
+    Parameters
+    ----------
+    config
+        Says how many episodes, and who teaches.
+    pool
+        The workers.
+    number
+        Of the round, from 0.
+    weights
+        Of the network that drives; without, a heuristic does.
+    """
+    episodes = range(number * config.imitation.episodes, (number + 1) * config.imitation.episodes)
+    return Lessons.joined(list(pool.map(_episode, [(config, k, weights) for k in episodes], chunksize=4)))
+
+
+def _episode(job: tuple[TrainConfig, int, Weights | None]) -> Lessons:
+    config, number, weights = job
     torch.set_num_threads(1)
     imitation = config.imitation
     world = make_world(config.world, number)
-    teacher = Teacher(imitation.teacher, world.env)
+    heuristic = Teacher("tour" if imitation.teacher == "hindsight" else imitation.teacher, world.env)
+    network = None if weights is None else choice_network.ChoiceNetwork(weights, heads=config.heads)
     rng = np.random.default_rng([config.seed, number])
     observation, _ = world.reset(seed=int(rng.integers(2**31)))
-    seen, actions, rewards, durations = [], [], [], []
+    heuristic.begin()
+    seen, prices, rewards, durations = [], [], [], []
     done = False
-    while not done:
-        if not observation["present"].any():
-            break
-        action = int(teacher())
+    while not done and observation["present"].any():
+        wanted = int(heuristic())
         seen.append(observation)
-        actions.append(action)
+        prices.append(_prices(world, wanted, hindsight=imitation.teacher == "hindsight"))
+        action = wanted if network is None else int(np.argmax(network.scores(world.env.agent.described[0])))
         if rng.random() < imitation.astray:
             action = int(rng.integers(observation["present"].sum()))
         observation, reward, terminated, truncated, info = world.step(action)
@@ -67,18 +112,29 @@ def _episode(job: tuple[TrainConfig, int]) -> Lessons:
     for k in reversed(range(len(rewards))):
         total = rewards[k] + config.ppo.gamma ** durations[k] * total
         returns[k] = total
-    stacked = {key: np.stack([o[key] for o in seen]) for key in seen[0]}
-    return Lessons(stacked, np.array(actions), returns)
+    return Lessons({key: np.stack([o[key] for o in seen]) for key in seen[0]}, np.array(prices), returns)
+
+
+def _prices(world: Families, wanted: int, *, hindsight: bool) -> NDArray[np.float32]:
+    """Return each action's price ``(K,)``, inf where it stands for no candidate."""
+    masks = world.action_masks()
+    prices = np.full(len(masks), np.inf, dtype=np.float32)
+    if hindsight:
+        prices[masks] = world.prices()
+    else:
+        prices[masks] = _METRES
+        prices[wanted] = 0.0
+    return prices
 
 
 def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iterator[dict[str, float]]:
     """Train the network on lessons, epoch by epoch; a tenth of them is kept to test it on."""
     imitation = config.imitation
     rng = np.random.default_rng(config.seed)
-    n = len(lessons.actions)
-    kept = np.arange(n) >= n - n // 10  # the last episodes: rooms that the rest does not show
+    n = len(lessons.prices)
+    kept = np.arange(n) >= n - n // 10  # the last episodes
     train = np.flatnonzero(~kept)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=imitation.rate, weight_decay=1e-4)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=imitation.rate, weight_decay=1e-2)
     batches = -(-len(train) // imitation.batch)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimizer, max_lr=imitation.rate, total_steps=imitation.epochs * batches
@@ -86,7 +142,7 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
     for epoch in range(imitation.epochs):
         losses = []
         for rows in np.array_split(rng.permutation(train), batches):
-            loss, _ = _loss(network, lessons, rows)
+            loss, _ = _loss(network, lessons, rows, mirror=rng.random(len(rows)) < 0.5)
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -94,21 +150,39 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
             schedule.step()
             losses.append(float(loss.detach()))
         with torch.no_grad():
-            parts = [_loss(network, lessons, r) for r in np.array_split(np.flatnonzero(kept), max(n // 2560, 1))]
+            tests = np.array_split(np.flatnonzero(kept), max(n // 2560, 1))
+            parts = [_loss(network, lessons, r, mirror=np.zeros(len(r), np.bool_)) for r in tests]
         yield {
             "epoch": epoch + 1,
             "loss": float(np.mean(losses)),
             "test_loss": float(np.mean([float(p[0]) for p in parts])),
-            "agreement": float(np.mean([p[1] for p in parts])),
+            "regret_m": float(np.mean([p[1] for p in parts])),
         }
 
 
-def _loss(network: ChoiceNetwork, lessons: Lessons, rows: NDArray[np.int64]) -> tuple[torch.Tensor, float]:
-    observation = {key: torch.as_tensor(value[rows]) for key, value in lessons.observations.items()}
-    present = observation["present"]
+def _loss(
+    network: ChoiceNetwork, lessons: Lessons, rows: NDArray[np.int64], *, mirror: NDArray[np.bool_]
+) -> tuple[torch.Tensor, float]:
+    """Return the loss, and what the choice with the highest score costs above the cheapest."""
+    shown = {key: torch.as_tensor(value[rows]) for key, value in lessons.observations.items()}
+    observation = _mirrored(shown, mirror)
+    prices = torch.as_tensor(lessons.prices[rows])
+    present = torch.isfinite(prices)
+    above = torch.where(present, prices - prices.amin(dim=1, keepdim=True), 0.0)
     tokens = network.tokens(observation)
-    scores = network.scores(tokens).masked_fill(present < 0.5, -1e9)
-    actions = torch.as_tensor(lessons.actions[rows])
-    choice = nn.functional.cross_entropy(scores, actions)
-    worth = nn.functional.mse_loss(network.value(tokens, present)[:, 0], torch.as_tensor(lessons.returns[rows]))
-    return choice + 0.5 * worth, float((scores.argmax(dim=1) == actions).float().mean())
+    scores = network.scores(tokens).masked_fill(~present, -1e9)
+    # What choosing by these scores costs on average: least where it is the choice of the lowest mean price.
+    choice = (scores.softmax(dim=1) * above).sum(dim=1).mean() / _METRES
+    returns = torch.as_tensor(lessons.returns[rows])
+    worth = nn.functional.mse_loss(network.value(tokens, observation["present"])[:, 0], returns)
+    best = scores.argmax(dim=1, keepdim=True)
+    return choice + 0.5 * worth, float(above.gather(1, best).mean())
+
+
+def _mirrored(observation: dict[str, torch.Tensor], mirror: NDArray[np.bool_]) -> dict[str, torch.Tensor]:
+    """Return an observation of as many choices, those asked for seen in a mirror: left is right."""
+    turned = torch.as_tensor(mirror)
+    rows, patches = observation["candidates"].clone(), observation["patches"]
+    rows[..., _MIRRORED] *= torch.where(turned, -1.0, 1.0)[:, None, None]
+    patches = torch.where(turned[:, None, None, None, None], patches.flip(3), patches)
+    return observation | {"candidates": rows, "patches": patches}

@@ -29,7 +29,7 @@ from slam.formats import atomic_write
 from slam.settings import to_mapping
 from training.campaign import one_thread_each, start_worker, worker_pool
 from training.choice_world import Families, make_world
-from training.imitation import give_lessons, learn
+from training.imitation import Lessons, give_lessons, learn
 from training.networks import ChoicePolicy
 from training.semi_markov import Durations, SemiMarkovBuffer
 from training.train_config import TrainConfig, WorldConfig
@@ -87,10 +87,21 @@ class Run:
             env.close()
 
     def _imitate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
-        lessons = give_lessons(self.config, pool)
-        self._say(f"{len(lessons.actions)} choices of {self.config.imitation.teacher}")
-        for line in learn(cast("ChoicePolicy", model.policy).network, lessons, self.config):
-            self._say("imitation: " + _words(line))
+        network = cast("ChoicePolicy", model.policy).network
+        untrained = {name: value.clone() for name, value in network.state_dict().items()}
+        rounds: list[Lessons] = []
+        for number in range(self.config.imitation.rounds):
+            # Lessons are kept in the folder: what they cost in time is not spent again after a kill.
+            path = self.out / f"lessons-{number + 1}.npz"
+            if not path.exists():
+                weights = _weights(network) if number > 0 else None
+                give_lessons(self.config, pool, number=number, weights=weights).save(path)
+            rounds.append(Lessons.load(path))
+            self._say(f"round {number + 1}: {len(rounds[-1].prices)} choices")
+            # From the beginning with the lessons of all rounds, whatever the last one came to.
+            network.load_state_dict(untrained)
+            for line in learn(network, Lessons.joined(rounds), self.config):
+                self._say(f"imitation {number + 1}: " + _words(line))
 
     def _go_on(self, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor) -> None:
         ppo, progress = self.config.ppo, self._progress
@@ -121,8 +132,7 @@ class Run:
         model.learn(steps, callback=Durations(), reset_num_timesteps=False)
 
     def _evaluate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
-        network = cast("ChoicePolicy", model.policy).network
-        weights = {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
+        weights = _weights(cast("ChoicePolicy", model.policy).network)
         result = {"steps": model.num_timesteps} | evaluate(weights, self.config, pool)
         with (self.out / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(result | {"wall_s": time.perf_counter() - self._began}) + "\n")
@@ -189,6 +199,10 @@ def _world_of_worker(world: WorldConfig, index: int) -> Families:
     """Make an environment in a process of its own."""
     start_worker()
     return make_world(world, index)
+
+
+def _weights(network: torch.nn.Module) -> Weights:
+    return {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
 
 
 def _save(model: MaskablePPO, path: Path) -> None:

@@ -13,6 +13,8 @@ from slam.settings import require, unknown_name
 
 __all__ = ["EvaluationConfig", "ImitationConfig", "PpoConfig", "TrainConfig", "WorldConfig"]
 
+TEACHERS = ("hindsight", "tour", "cost-utility")
+
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
@@ -26,6 +28,7 @@ class WorldConfig:
     time_1_s: float = -1.0 / 30.0  # reward per second
     area_1_m2: float = 0.0  # … per square metre newly mapped
     collision: float = -1.0
+    shaping_s_m: float = 0.0  # seconds that a metre less still to go, by hindsight, counts for; 0: no such reward
     driver: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -44,16 +47,19 @@ class WorldConfig:
 class ImitationConfig:
     """The start: to choose as a heuristic does."""
 
-    teacher: str = "cost-utility"  # or tour
-    episodes: int = 0  # 0: no warm start
+    teacher: str = "hindsight"  # or tour, or cost-utility
+    episodes: int = 0  # a round; 0: no warm start
+    rounds: int = 1  # after the first, what was learned so far drives
     epochs: int = 8
     batch: int = 256
     rate: float = 1e-3
     astray: float = 0.1  # share of the choices that are made at random, so that more than its own ways are seen
 
     def __post_init__(self) -> None:
-        require(self.teacher in ("cost-utility", "tour"), "[imitation] teacher must be cost-utility or tour")
-        require(self.episodes >= 0 and self.epochs >= 1, "[imitation] needs episodes ≥ 0 and epochs ≥ 1")
+        if self.teacher not in TEACHERS:
+            raise unknown_name("[imitation] teacher", self.teacher, TEACHERS)
+        require(self.episodes >= 0, "[imitation] needs episodes ≥ 0")
+        require(self.rounds >= 1 and self.epochs >= 1, "[imitation] needs rounds ≥ 1 and epochs ≥ 1")
         require(0 <= self.astray < 1, "[imitation] astray must be in [0, 1)")
 
 

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import agents
+from agents.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
 from training.explore import ExploreOptions, prepare, run
-from training.known_map import NAME, KnownMap, _greedy, _per_tile, _way_until
+from training.known_map import NAME, _greedy, _way_until
+from training.true_places import TruePlaces, cells_per_tile
 
 
 def episode(tmp_path, agent, rooms="apartment", seed=5):
@@ -34,14 +36,14 @@ def test_it_covers_all_and_sooner_than_the_nearest_frontier(tmp_path):
 def test_tiles_seen_are_in_the_line_of_sight():
     plan = make("apartment", seed=3)
     ground = GroundTruth(plan, plan.start, robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
-    planner = KnownMap(ground)
-    whole = _per_tile(ground.mappable)
+    places = TruePlaces(ground, PlannerConfig(), robot=RobotConfig(), lidar=LidarConfig())
+    whole = cells_per_tile(ground.mappable)
     rng = np.random.default_rng(0)
     checked = 0
-    for place in rng.choice(len(planner._places), 6, replace=False):
-        eye = planner._map.to_points(planner._places[[place]])[0] / ground.resolution
+    for place in rng.choice(len(places.cells), 6, replace=False):
+        eye = places.map.to_points(places.cells[[place]])[0] / ground.resolution
         eye -= np.array(ground.lattice_origin[::-1])
-        tiles = np.argwhere(planner._sight[place].reshape(whole.shape))
+        tiles = np.argwhere(places.sight[place].reshape(whole.shape))
         for tile in tiles[rng.choice(len(tiles), min(10, len(tiles)), replace=False)]:
             cells = np.argwhere(ground.mappable[6 * tile[0] : 6 * tile[0] + 6, 6 * tile[1] : 6 * tile[1] + 6])
             clear = [is_clear(ground.walls, eye, 6 * tile[::-1] + cell[::-1] + 0.5) for cell in cells]

@@ -26,7 +26,7 @@ def a_choice(m: int, seed: int = 0) -> Choice:
     return Choice(
         np.arange(m),
         rng.normal(size=(m, len(CANDIDATE))).astype(np.float32),
-        rng.integers(0, 256, (m, 2, 16, 16)).astype(np.uint8),
+        rng.integers(0, 256, (m, 4, 16, 16)).astype(np.uint8),
         np.hypot(*(places[:, None] - places[None]).transpose(2, 0, 1)).astype(np.float32),
         rng.normal(size=len(STATE)).astype(np.float32),
     )
@@ -34,7 +34,7 @@ def a_choice(m: int, seed: int = 0) -> Choice:
 
 def network(seed: int = 0) -> ChoiceNetwork:
     torch.manual_seed(seed)
-    made = ChoiceNetwork(len(CANDIDATE), 2 * 16 * 16, len(STATE))
+    made = ChoiceNetwork(len(CANDIDATE), 4 * 16 * 16, len(STATE))
     for p in made.parameters():
         torch.nn.init.normal_(p, std=0.15)
     return made
