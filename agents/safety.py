@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.cost_map import belief_classes, clearance
+from agents.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.types import Belief
 
@@ -74,8 +74,7 @@ def local_map(belief: Belief, radius_m: float) -> LocalMap:
     if high_r <= low_r or high_c <= low_c:  # off the map: nothing is known to be near
         low_r, high_r, low_c, high_c = 0, 1, 0, 1
     origin = np.array([grid.origin[0] + low_c * resolution, grid.origin[1] + low_r * resolution])
-    window = belief_classes(belief, slice(low_r, high_r), slice(low_c, high_c))
-    return LocalMap(clearance(window, resolution), origin, resolution)
+    return LocalMap(clearance(grid.log_odds[low_r:high_r, low_c:high_c], resolution), origin, resolution)
 
 
 def footprint(robot: RobotConfig, spacing_m: float = 0.05) -> Array:
@@ -208,10 +207,9 @@ def body_gaps(
             dx, dy = hits[i, 0] - x, hits[i, 1] - y
             out_x = abs(c * dx + s * dy) - half[0]
             out_y = abs(-s * dx + c * dy) - half[1]
-            if out_x > 0.0 and out_y > 0.0:
-                scan_gap = min(scan_gap, math.hypot(out_x, out_y))
-            else:
-                scan_gap = min(scan_gap, max(out_x, out_y))
+            out = max(out_x, out_y)
+            if out < scan_gap:  # few are: the root is taken for them alone
+                scan_gap = min(scan_gap, math.hypot(out_x, out_y) if out_x > 0.0 and out_y > 0.0 else out)
         if k == 0:
             map_now, scan_now = map_gap, scan_gap
         else:
