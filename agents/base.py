@@ -118,5 +118,7 @@ class Agent(ABC):
         """
 
     def _to_action(self, twist: Array) -> NDArray[np.float32]:
-        limits = (self._robot.max_speed_m_s, self._robot.max_speed_m_s, self._robot.max_turn_rate_rad_s)
-        return np.clip(np.asarray(twist) / limits, -1.0, 1.0).astype(np.float32)
+        speed, turn_rate = self._robot.max_speed_m_s, self._robot.max_turn_rate_rad_s
+        # Three numbers: plain arithmetic takes a fraction of what array calls do.
+        shares = (twist[0] / speed, twist[1] / speed, twist[2] / turn_rate)
+        return np.array([min(max(share, -1.0), 1.0) for share in shares], dtype=np.float32)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["FAR_M", "Blocks", "coarsen", "known_extent"]
+__all__ = ["FAR_M", "Blocks", "coarsen", "known_extent", "to_walls"]
 
 FAR_M = 10.0
 """Clearances [m] beyond this say nothing more."""
@@ -60,13 +60,13 @@ def coarsen(
     clearance = np.full((rows, cols), FAR_M, dtype=np.float32)
     suspect = np.zeros((rows, cols), dtype=np.bool_)
     _fill(
-        log_odds, visited, _to_walls(log_odds), np.float32(resolution), np.float32(FAR_M), factor,
+        log_odds, visited, to_walls(log_odds), np.float32(resolution), np.float32(FAR_M), factor,
         pads[0], pads[1], classes, clearance, suspect,
     )  # fmt: skip
     return Blocks(classes, clearance, suspect)
 
 
-def _to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
+def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
     """Return each cell's distance to the nearest occupied cell's centre, in cells, infinite without any."""
     free_of_wall = cv2.LUT(log_odds.view(np.uint8), _NO_WALL)
     if cv2.countNonZero(free_of_wall) == free_of_wall.size:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.coarsening import FAR_M, coarsen, known_extent
+from agents.coarsening import FAR_M, coarsen, known_extent, to_walls
 from mecanum_env.config import RobotConfig
 from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import require
@@ -95,13 +95,10 @@ def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> ND
     return classes
 
 
-def clearance(classes: NDArray[np.int8], resolution: float) -> NDArray[np.float32]:
+def clearance(log_odds: NDArray[np.int8], resolution: float) -> NDArray[np.float32]:
     """Return each cell's distance [m] ``(rows, cols)`` from its centre to the nearest occupied cell's edge."""
-    if not (classes == OCCUPIED).any():
-        return np.full(classes.shape, FAR_M, dtype=np.float32)
-    walls = (classes != OCCUPIED).view(np.uint8)
-    distance: NDArray[np.float32] = cv2.distanceTransform(walls, cv2.DIST_L2, cv2.DIST_MASK_5)
-    # Half a cell: from the occupied cell's centre to its edge. In place: these maps may be a million cells.
+    distance = to_walls(log_odds)
+    # Half a cell: from the occupied cell's centre to its edge.
     distance -= np.float32(0.5)
     distance *= np.float32(resolution)
     return np.minimum(distance, np.float32(FAR_M), out=distance)

@@ -19,7 +19,6 @@ from agents.base import Goal
 from agents.control import PathFollower
 from agents.frontier import NearestFrontier, NearestFrontierConfig
 from agents.planning import shortest_path, travel_costs
-from agents.safety import LocalMap
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.settings import from_mapping, require
@@ -176,12 +175,8 @@ class ExploreAndReturn(NearestFrontier):
 class _HomeFollower(PathFollower):
     """Ends with the start's heading, also where the sensor sees all round and would not need to turn."""
 
+    # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
+    _turn_within_m = _TURN_WITHIN_M
+
     def set_path(self, path: Array, heading: float | None) -> None:
         super().set_path(path, float(_HOME[2]))
-
-    def _wanted_heading(
-        self, pose: Array, near: LocalMap, at: float, room: Array
-    ) -> tuple[float | None, float | None]:
-        heading, tight_in = super()._wanted_heading(pose, near, at, room)
-        # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
-        return (self._heading if self.remaining_m < _TURN_WITHIN_M else heading), tight_in

@@ -18,7 +18,7 @@ from agents import cost_map as cost_maps
 from agents.base import Agent, Goal
 from agents.control import ControlConfig, PathFollower
 from agents.cost_map import CostMap, PlannerConfig
-from agents.frontiers import FrontierConfig, Frontiers, find, frontier_mask
+from agents.frontiers import FrontierConfig, Frontiers, find, frontier_cells
 from agents.gain import expected_area
 from agents.planning import TravelCosts, shortest_path, travel_costs
 from agents.sight import Watch, view_points
@@ -108,7 +108,7 @@ class Explorer(Agent):
         self._deadline = math.inf
         self._arrived_for = 0.0
         self._recover_until = -math.inf
-        self._anchor = np.zeros(3)
+        self._anchor = (0.0, 0.0, 0.0)  # pose [m, m, rad] from which it has to get away in time
         self._anchored_at = 0.0
         self._troubles = Troubles(0.6 * self.config.patience.same_m)
         self._ending = "covered"  # why there is nothing left to choose, once there is nothing
@@ -205,15 +205,15 @@ class Explorer(Agent):
 
     def _keep_watch(self, belief: Belief) -> None:
         """Remember from where the sensor has looked, every little way and turn."""
-        sensor = geometry.compose(
-            np.asarray(belief.pose, dtype=np.float64), np.array([self._lidar.offset_m, 0.0, 0.0])
-        )
+        x, y, heading = belief.pose.tolist()
+        x, y = x + self._lidar.offset_m * math.cos(heading), y + self._lidar.offset_m * math.sin(heading)
         if self._track:
-            moved = float(np.hypot(*(sensor[:2] - self._track[-1][:2])))
-            turned = abs(geometry.wrap_scalar(sensor[2] - self._track[-1][2]))
+            last_x, last_y, last_heading = self._track[-1].tolist()
+            moved = math.hypot(x - last_x, y - last_y)
+            turned = abs(geometry.wrap_scalar(heading - last_heading))
             if moved < 0.2 and (self._lidar.field_of_view_deg >= 360.0 or turned < 0.3):
                 return
-        self._track.append(sensor)
+        self._track.append(np.array([x, y, geometry.wrap_scalar(heading)]))
 
     def _current(self, frontiers: Frontiers, costs: Array) -> int | None:
         if self._target is None or not len(costs):
@@ -262,20 +262,18 @@ class Explorer(Agent):
         """Whether any real stretch of frontier is left around the point, on the fine grid."""
         grid = belief.grid
         span = math.ceil(0.35 / grid.resolution)
-        row, col = grid.to_cells(np.asarray(point)[None])[0]
+        row, col = grid.to_cells(point)
         rows = slice(max(int(row) - span - 1, 0), max(int(row) + span + 2, 0))
         cols = slice(max(int(col) - span - 1, 0), max(int(col) + span + 2, 0))
         window = cost_maps.belief_classes(belief, rows, cols)
         if window.shape[0] < 3 or window.shape[1] < 3:
             return True
-        # The rim of the window is cut off: there the mask takes the outside for unknown.
-        count = int(np.count_nonzero(frontier_mask(window)[1:-1, 1:-1]))
-        return count * grid.resolution >= 0.5 * self._frontier_config.min_extent_m
+        return frontier_cells(window) * grid.resolution >= 0.5 * self._frontier_config.min_extent_m
 
     def _watch(self, belief: Belief) -> None:
         """Count looks taken, and notice when nothing moves or a goal takes too long."""
         patience, now = self.config.patience, self._time
-        pose = np.asarray(belief.pose, dtype=np.float64)
+        x, y, heading = belief.pose.tolist()
         assert self._target is not None
         self._arrived_for = self._arrived_for + self._step_s if self._follower.arrived else 0.0
         if self._arrived_for >= patience.settle_s - 1e-9:
@@ -284,10 +282,11 @@ class Explorer(Agent):
             self._arrived_for = 0.0
             self._anchored_at = now
             return
-        moved = float(np.hypot(*(pose[:2] - self._anchor[:2])))
-        turned = abs(geometry.wrap_scalar(pose[2] - self._anchor[2]))
+        anchor_x, anchor_y, anchor_heading = self._anchor
+        moved = math.hypot(x - anchor_x, y - anchor_y)
+        turned = abs(geometry.wrap_scalar(heading - anchor_heading))
         if moved > 0.15 or turned > 0.4 or self._follower.arrived:
-            self._anchor, self._anchored_at = pose.copy(), now
+            self._anchor, self._anchored_at = (x, y, heading), now
         stuck = now - self._anchored_at > patience.stuck_s
         if (stuck or now > self._deadline) and now >= self._recover_until:
             trouble = self._troubles.note(self._target)

@@ -15,7 +15,7 @@ from agents.sight import Watch, in_good_sight
 from slam.occupancy import FREE, UNKNOWN
 from slam.settings import require
 
-__all__ = ["FrontierConfig", "Frontiers", "find", "frontier_mask"]
+__all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
 
 Array = NDArray[np.float64]
 
@@ -78,12 +78,25 @@ class Frontiers:
     normals: Array  # (m, 2) unit vectors from free towards unknown; zero where they cancel
 
 
-def frontier_mask(classes: NDArray[np.int8]) -> NDArray[np.bool_]:
-    """Return the FREE cells with an UNKNOWN 8-neighbour ``(rows, cols)``; outside the grid counts as unknown."""
-    unknown = (classes == UNKNOWN).view(np.uint8)
-    kernel = np.ones((3, 3), dtype=np.uint8)
-    near = cv2.dilate(unknown, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1)
-    return np.asarray((classes == FREE) & (near != 0))
+@njit(cache=True, nogil=True)
+def frontier_cells(classes: NDArray[np.int8]) -> int:
+    """Return how many FREE cells, those on the raster's rim left out, have an UNKNOWN 8-neighbour."""
+    count = 0
+    for row in range(1, classes.shape[0] - 1):
+        for col in range(1, classes.shape[1] - 1):
+            if classes[row, col] == FREE:
+                count += _touches(classes, row, col, UNKNOWN)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _touches(classes: NDArray[np.int8], row: int, col: int, kind: int) -> bool:
+    """Whether a cell or one of its 8 neighbours is of this class."""
+    for r in range(row - 1, row + 2):
+        for c in range(col - 1, col + 2):
+            if classes[r, c] == kind:
+                return True
+    return False
 
 
 def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) -> Frontiers:

@@ -107,7 +107,6 @@ class GentleFollower(PathFollower):
             acceleration_m_s2=between(usual.acceleration_m_s2, self._gentle),
             deceleration_m_s2=between(usual.deceleration_m_s2, self._gentle),
         )
-        self._max_speed = self.config.speed_share * self._robot.max_speed_m_s
 
     def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the next twist ``(3,)`` on the way to a stand: wheels stopped at once slide, and tell nothing."""

@@ -7,7 +7,7 @@ import pytest
 
 from agents.control import ControlConfig, PathFollower
 from agents.planning import resample
-from agents.safety import body_gaps, footprint, local_map, scan_points
+from agents.safety import Guard, body_gaps, footprint, local_map, scan_points
 from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
 from slam import geometry
 from tests.agents.grids import belief_of, body_gap, drive, fill, room, two_rooms
@@ -113,12 +113,17 @@ def test_gaps_against_brute_force():
     fill(classes, 2.5, 1.9, 2.6, 2.1)
     pose = np.array([1.9, 2.0, 0.0])
     near = local_map(belief_of(classes, tuple(pose)), 2.0)
-    half, timing = np.array([0.29, 0.19]), np.array([0.2, 1.5, 6.0])
+    guard = Guard(
+        rim=footprint(ROBOT),
+        half=np.array([0.29, 0.19]),
+        lag_s=0.2,
+        braking_m_s2=1.5,
+        turn_braking_rad_s2=6.0,
+        scan_gap_m=0.04,
+    )
     hits = np.array([[0.6, 0.05], [0.5, 0.4]])
     twist = np.array([0.3, 0.0, 0.0])
-    now, ahead, scan_now, scan_ahead = body_gaps(
-        twist, pose, timing, half, footprint(ROBOT), near.clearance, near.origin, near.resolution, hits
-    )
+    now, ahead, scan_now, scan_ahead = body_gaps(twist, pose, near, hits, guard)
     assert now == pytest.approx(body_gap(classes, pose, ROBOT), abs=0.02)
     travelled = 0.3 * 0.2 + 0.3**2 / (2 * 1.5)  # v t + v²/2a
     assert ahead == pytest.approx(now - travelled, abs=0.02)
