@@ -166,12 +166,12 @@ def evaluate(weights: Weights, config: TrainConfig, pool: ProcessPoolExecutor) -
     world, heads = config.world, config.heads
     jobs = [
         (weights, heads, world, name, noise, _FIRST_VALIDATION_SEED + k)
-        for name in world.rooms
+        for name in dict.fromkeys(world.rooms)
         for noise in world.noises
         for k in range(config.evaluation.episodes)
     ]
     ends = list(pool.map(_try, jobs))
-    times: dict[str, list[float]] = {name: [] for name in world.rooms}
+    times: dict[str, list[float]] = {job[3]: [] for job in jobs}
     for job, (time_s, _) in zip(jobs, ends, strict=True):
         times[job[3]].append(time_s)
     means = {name: float(np.mean(values)) for name, values in times.items()}

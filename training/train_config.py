@@ -18,7 +18,7 @@ TEACHERS = ("hindsight", "tour", "cost-utility")
 
 @dataclass(frozen=True, kw_only=True)
 class WorldConfig:
-    """Where is trained: families of rooms, drawn alike often, one noise an environment in turn."""
+    """Where is trained: families of rooms, drawn as often as named, one noise an environment in turn."""
 
     rooms: tuple[str, ...] = ("apartment",)
     noises: tuple[str, ...] = ("nominal",)

@@ -20,8 +20,8 @@ from training.ppo import Run
 from training.train_config import TrainConfig
 
 SMALL = {
-    "world": {"rooms": ["rectangular"]},
-    "imitation": {"episodes": 3, "epochs": 1},
+    "world": {"rooms": ["rectangular"], "shaping_s_m": 1.7},
+    "imitation": {"episodes": 2, "rounds": 2, "epochs": 1},
     "ppo": {"steps": 48, "environments": 2, "n_steps": 8, "chunk": 1, "batch_size": 16},
     "evaluation": {"episodes": 1, "every": 2},
 }
@@ -45,7 +45,7 @@ def run(out: Path, *, kill_after: int | None = None) -> list[str]:
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
     said = run(tmp_path / "whole")
-    assert any(text.startswith("imitation: epoch 1") for text in said)
+    assert any(text.startswith("imitation 2: epoch 1") for text in said)
     with pytest.raises(Killed):
         run(tmp_path / "parts", kill_after=2)
     again = run(tmp_path / "parts")
