@@ -15,6 +15,7 @@ from agents.choice import Choice
 from agents.cost_map import CostMap
 from agents.explorer import Candidates
 from agents.planning import way_cells
+from agents.routing import improve
 from slam.types import Belief
 from training.true_places import TruePlaces
 
@@ -23,7 +24,7 @@ __all__ = ["Hindsight"]
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
-_OFFSETS_M = np.array([0.5, 1.0, 2.0, 4.0, 8.0])  # greedy tours tried: what a new cell is worth against its way
+_OFFSETS_M = np.array([0.5, 2.0, 6.0])  # greedy tours tried: what a new cell is worth against its way
 _ENOUGH = 0.04  # share of the cells that may stay unseen: small remains are left out of the count anyway
 _HERE_M = 0.43  # the robot is at a place: no cell of the lattice is farther from all of them
 
@@ -53,11 +54,14 @@ class Hindsight:
         tiles = np.flatnonzero((missing > 0) & self._sight.any(axis=0))
         cells = missing[tiles].astype(np.float64)
         spare = _ENOUGH * true.ground.mappable_cells
+        if cells.sum() <= spare:
+            spare = 0.0
         seen = np.ascontiguousarray(self._sight[:, tiles].T)
+        gains = cells @ seen
         prices = np.empty(len(choice.index), dtype=np.float32)
         for i, index in enumerate(choice.index):
             places, costs = self._on_the_way(found.cost_map, found, index)
-            prices[i] = _price(seen, true.distance, cells, places, costs, spare if cells.sum() > spare else 0.0)
+            prices[i] = _price(seen, true.distance, cells, gains, places, costs, spare)
         return prices
 
     def _on_the_way(self, cost_map: CostMap, found: Candidates, index: int) -> tuple[Cells, Array]:
@@ -92,9 +96,9 @@ def _lattice(true: TruePlaces) -> Cells:
 
 @njit(cache=True, nogil=True)
 def _price(
-    seen: NDArray[np.bool_], distance: Array, cells: Array, places: Cells, costs: Array, spare: float
+    seen: NDArray[np.bool_], distance: Array, cells: Array, gains: Array, places: Cells, costs: Array, spare: float
 ) -> float:
-    """Return the cost of a way by ``places`` and of the best of some greedy tours from its end.
+    """Return the cost of a way by ``places`` and of the best of some greedy tours from its end, improved.
 
     Parameters
     ----------
@@ -102,36 +106,35 @@ def _price(
         ``(tiles, places)``.
     distance
         ``(places, places)`` [weighted m].
-    cells
-        ``(tiles,)`` missing in each.
+    cells, gains
+        ``(tiles,)`` missing in each, and ``(places,)`` those in sight of each place.
     places, costs
         On the way, and what it has cost until there.
     spare
         That many cells need not be seen.
     """
-    gains = np.zeros(seen.shape[1])
-    for j in range(len(cells)):
-        for i in range(seen.shape[1]):
-            gains[i] += cells[j] * seen[j, i]
+    gains = gains.copy()
     left, total = cells.copy(), cells.sum()
     for k in range(len(places)):
         total -= _look(seen, places[k], left, gains)
         if total <= spare + 0.5:
             return float(costs[k])
-    lowest = np.inf
+    lowest, best = np.inf, places[-1:]
     for offset in _OFFSETS_M:
-        tour = _greedy_way(seen, distance, left.copy(), gains.copy(), total, places[-1], spare, offset)
-        lowest = min(lowest, tour)
-    return float(costs[-1] + lowest)
+        order, way = _greedy_tour(seen, distance, left.copy(), gains.copy(), total, places[-1], spare, offset)
+        if way < lowest:
+            lowest, best = way, order
+    return float(costs[-1] + min(lowest, _improved(seen, distance, left, total, best, spare)))
 
 
 @njit(cache=True, nogil=True)
-def _greedy_way(
+def _greedy_tour(
     seen: NDArray[np.bool_], distance: Array, left: Array, gains: Array, total: float, place: int, spare: float,
     offset: float,
-) -> float:  # fmt: skip
-    """Return the way until enough is seen, going on to where most is new for the way there and ``offset``."""
-    way = 0.0
+) -> tuple[Cells, float]:  # fmt: skip
+    """Return the places in turn until enough is seen, each where most is new for the way there, and the way."""
+    order, count, way = np.empty(len(gains) + 1, dtype=np.int64), 1, 0.0
+    order[0] = place
     while total > spare + 0.5:
         best, most = -1, 0.0
         for i in range(len(gains)):
@@ -142,7 +145,32 @@ def _greedy_way(
             break
         way += distance[place, best]
         place = best
+        order[count] = place
+        count += 1
         total -= _look(seen, place, left, gains)
+    return order[:count], way
+
+
+@njit(cache=True, nogil=True)
+def _improved(
+    seen: NDArray[np.bool_], distance: Array, left: Array, total: float, order: Cells, spare: float
+) -> float:
+    """Return the way along a tour's places in a better order, until enough is seen."""
+    own = np.empty((len(order), len(order)))
+    for a in range(len(order)):
+        for b in range(len(order)):
+            own[a, b] = distance[order[a], order[b]]
+    turn = np.arange(len(order))
+    improve(own, np.zeros(len(order)), turn)
+    unseen, way = left.copy(), 0.0
+    for k in range(1, len(turn)):
+        if total <= spare + 0.5:
+            break
+        way += own[turn[k - 1], turn[k]]
+        for j in range(len(unseen)):
+            if seen[j, order[turn[k]]]:
+                total -= unseen[j]
+                unseen[j] = 0.0
     return way
 
 

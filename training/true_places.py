@@ -61,6 +61,7 @@ class TruePlaces:
         self, ground: GroundTruth, planner: PlannerConfig, *, robot: RobotConfig, lidar: LidarConfig
     ) -> None:
         self.ground = ground
+        self._whole = cells_per_tile(ground.mappable)
         self.map = _true_cost_map(ground, planner, robot)
         reached = np.isfinite(travel_costs(self.map).cost)
         self.stride = max(1, round(_PLACES_M / self.map.resolution))
@@ -77,12 +78,12 @@ class TruePlaces:
         """Return the mappable cells of each tile ``(tiles,)`` that the belief lacks; 0 where hardly any."""
         ground = self.ground
         free = on_lattice(belief.grid.classes() == FREE, belief.grid.lattice_origin, ground)
-        missing, whole = cells_per_tile(ground.mappable & ~free), cells_per_tile(ground.mappable)
-        return np.where((missing > _LEAST_SHARE * whole) & (missing >= TILE), missing, 0).ravel()
+        missing = cells_per_tile(ground.mappable & ~free)
+        return np.where((missing > _LEAST_SHARE * self._whole) & (missing >= TILE), missing, 0).ravel()
 
     def _sights(self, lidar: LidarConfig) -> NDArray[np.bool_]:
         ground = self.ground
-        whole = cells_per_tile(ground.mappable)
+        whole = self._whole
         corner = np.array(ground.lattice_origin[::-1]) * ground.resolution
         eyes = (self.map.to_points(self.cells) - corner) / ground.resolution
         reach = _NEARER * lidar.range_max_m / ground.resolution
