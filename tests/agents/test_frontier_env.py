@@ -63,6 +63,28 @@ def test_the_masks_are_those_of_the_candidates():
         observation, *_ = env.step(int(np.flatnonzero(masks)[-1]))
 
 
+def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
+    env = gymnasium.make(ID, rooms="apartment", driver={"choice": {"most": 200}}).unwrapped
+    observation, _ = env.reset(seed=0)
+    shared = 0
+    for _ in range(12):
+        choice, found = env.agent.described
+        cells = found.cells[choice.index]
+        assert len(np.unique(cells, axis=0)) == len(cells)
+        reachable = found.cells[np.isfinite(found.costs)]
+        for cell, row in zip(cells, choice.candidates, strict=True):
+            pieces = (reachable == cell).all(axis=1).sum()
+            assert row[CANDIDATE.index("pieces")] == pytest.approx(pieces / 3.0)
+            shared += pieces > 1
+        assert len(np.unique(reachable, axis=0)) == len(cells)
+        if found.current is not None:
+            current = choice.candidates[:, CANDIDATE.index("current")]
+            np.testing.assert_array_equal(current == 1.0, choice.index == found.current)
+            assert current.sum() == 1.0
+        observation, *_ = env.step(len(cells) // 2)
+    assert shared > 0
+
+
 def test_one_seed_is_one_episode_and_whatever_is_no_candidate_is_the_first():
     def last(env, observation):
         return int(np.flatnonzero(env.action_masks())[-1])
