@@ -19,6 +19,7 @@ __all__ = ["make", "names"]
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
     "active": "agents.active:ActiveSlam",
+    "brisk-tour": "agents.brisk_tour:BriskTour",
     "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "nearest-frontier": "agents.frontier:NearestFrontier",
