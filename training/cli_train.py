@@ -58,7 +58,8 @@ def train(
             f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
         ) from error
     with bad_input():
-        run = Run(settings, out, workers=workers or os.cpu_count() or 1, log=_say)
+        command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
+        run = Run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)
     try:
         run.train()
     except KeyboardInterrupt as error:

@@ -53,8 +53,9 @@ class Lessons:
 
     def save(self, path: Path) -> None:
         """Write as ``.npz``, whole or not at all."""
+        arrays: Any = {"prices": self.prices, "returns": self.returns} | self.observations
         with replacing(path) as new:
-            np.savez_compressed(new, prices=self.prices, returns=self.returns, **self.observations)
+            np.savez_compressed(new, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> Lessons:

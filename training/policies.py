@@ -7,18 +7,24 @@ import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import save
+from safetensors.numpy import load_file, save
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents.chooser import ChooserConfig
 from agents.policy import load_choice_policy, policy_description
-from slam.formats import atomic_write
-from slam.settings import to_mapping
+from slam.formats import atomic_write, replacing
+from slam.settings import from_mapping, to_mapping
+from training.choice_world import make_world
+from training.networks import ChoicePolicy
+from training.ppo import make_model
+from training.train_config import TrainConfig
 
-__all__ = ["export_policy", "read_zip"]
+__all__ = ["export_policy", "export_run", "read_zip", "write_zip"]
 
 _INSIDE = "features_extractor.network."
 """Where the network is among the parameters of :class:`training.networks.ChoicePolicy`."""
@@ -43,21 +49,64 @@ def read_zip(path: Path) -> dict[str, NDArray[np.float32]]:
     return {name: value.numpy() for name, value in weights.items()}
 
 
-def export_policy(source: Path, target: Path, *, heads: int, driver: Any, training: Mapping[str, Any]) -> None:
-    """Write the policy of a stable-baselines3 zip as ``target`` (.safetensors) and the JSON file beside it.
+def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:
+    """Write a policy of ``ppo-frontier`` as ``target`` (.safetensors) and the JSON file beside it.
 
     Parameters
     ----------
-    source
-        As ``MaskablePPO.save`` wrote it.
-    heads
-        Of the attention.
-    driver
-        The ``ChooserConfig`` that it was trained with.
+    weights
+        Of the network, by name.
+    target
+        Where to.
     training
-        What else the JSON file says: configuration, curve, seeds, steps, hours, command.
+        What else the JSON file says; ``config``, the training's, among it: it says how the policy drives.
     """
-    described = policy_description(heads, to_mapping(driver), **training)
-    atomic_write(target, save(read_zip(source)))
+    config = training["config"]
+    driver = to_mapping(from_mapping(ChooserConfig, config["world"]["driver"]))
+    described = policy_description(config["heads"], driver, **training)
+    atomic_write(target, save(dict(weights)))
     atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     load_choice_policy(target)  # it is read back
+
+
+def export_run(run: Path, target: Path) -> None:
+    """Write the best policy of a run's folder; the JSON file says by which run it was trained.
+
+    Raises
+    ------
+    ValueError
+        Where the folder holds no run that got as far as an evaluation.
+    """
+    try:
+        progress = json.loads((run / "progress.json").read_text(encoding="utf-8"))
+        curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{run} holds no finished part of a run: {error}") from error
+    config = progress["config"]
+    training = {
+        "command": progress["command"], "config": config, "steps": progress["steps"],
+        "hours": round(progress["wall_s"] / 3600.0, 3), "training_seeds": config["world"]["seeds"], "curve": curve,
+    }  # fmt: skip
+    export_policy(read_zip(run / "best.zip"), target, training)
+
+
+def write_zip(source: Path, target: Path) -> None:
+    """Write a policy of the package's format as a zip that ``MaskablePPO.load`` reads, to train on from.
+
+    Raises
+    ------
+    ValueError
+        Where ``source`` is no such policy, or its JSON file does not say how it was trained.
+    """
+    load_choice_policy(source)
+    described = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
+    if "config" not in described:
+        raise ValueError(f"{source.with_suffix('.json')} does not say with which config it was trained")
+    config = from_mapping(TrainConfig, described["config"])
+    env = DummyVecEnv([lambda: make_world(config.world)])
+    model = make_model(config, env)
+    network = cast("ChoicePolicy", model.policy).network
+    network.load_state_dict({name: torch.as_tensor(value) for name, value in load_file(source).items()})
+    with replacing(target) as new:
+        model.save(new)
+    env.close()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
 from agents.choice_network import ChoiceNetwork
 from slam.formats import atomic_write
@@ -34,7 +34,7 @@ from training.networks import ChoicePolicy
 from training.semi_markov import Durations, SemiMarkovBuffer
 from training.train_config import TrainConfig, WorldConfig
 
-__all__ = ["Run", "evaluate"]
+__all__ = ["Run", "evaluate", "make_model"]
 
 Log = Callable[[str], None]
 Weights = dict[str, NDArray[np.float32]]
@@ -46,7 +46,8 @@ class Run:
     """A training run in a folder: begun there, or gone on with.
 
     The folder gets ``checkpoint.zip`` (stable-baselines3), ``progress.json``, ``best.zip``, ``curve.jsonl`` with a
-    line per evaluation, and TensorBoard's files in ``log``.
+    line per evaluation, TensorBoard's files in ``log`` and the lessons of the warm start. ``command`` is noted in
+    ``progress.json``, from where exported policies have it.
 
     Raises
     ------
@@ -54,11 +55,11 @@ class Run:
         Where the folder holds a run with another configuration.
     """
 
-    def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log) -> None:
+    def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
         settings = json.loads(json.dumps(to_mapping(config)))
         self._progress: dict[str, Any] = {
-            "config": settings, "chunk": 0, "steps": 0, "best_s": None, "wall_s": 0.0,
+            "command": command, "config": settings, "chunk": 0, "steps": 0, "best_s": None, "wall_s": 0.0,
         }  # fmt: skip
         if (out / "progress.json").exists():
             self._progress = json.loads((out / "progress.json").read_text(encoding="utf-8"))
@@ -76,7 +77,8 @@ class Run:
         self._began = time.perf_counter() - progress["wall_s"]
         try:
             with worker_pool(self._workers) as pool:
-                model = self._model(env)
+                model = make_model(self.config, env)
+                model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
                 if progress["chunk"] > 0:
                     model.set_parameters(str(self.out / "checkpoint.zip"), device="cpu")
                     model.num_timesteps = progress["steps"]
@@ -141,24 +143,24 @@ class Run:
             self._progress["best_s"] = result["time_to_95_s"]
             _save(model, self.out / "best.zip")
 
-    def _model(self, env: VecMonitor) -> MaskablePPO:
-        config, ppo = self.config, self.config.ppo
-        model = MaskablePPO(
-            ChoicePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
-            learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
-            clip_range=ppo.clip_range, target_kl=ppo.target_kl, rollout_buffer_class=SemiMarkovBuffer,
-            device="cpu", seed=config.seed,
-            policy_kwargs={
-                "features_extractor_kwargs": {
-                    "width": config.width, "heads": config.heads, "layers": config.layers,
-                },
-            },
-        )  # fmt: skip
-        model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
-        return model
-
     def _say(self, text: str) -> None:
         self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
+
+
+def make_model(config: TrainConfig, env: VecEnv) -> MaskablePPO:
+    """Return an untrained model for an environment with the configuration's choices."""
+    ppo = config.ppo
+    return MaskablePPO(
+        ChoicePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
+        learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
+        clip_range=ppo.clip_range, target_kl=ppo.target_kl, rollout_buffer_class=SemiMarkovBuffer,
+        device="cpu", seed=config.seed,
+        policy_kwargs={
+            "features_extractor_kwargs": {
+                "width": config.width, "heads": config.heads, "layers": config.layers,
+            },
+        },
+    )  # fmt: skip
 
 
 def evaluate(weights: Weights, config: TrainConfig, pool: ProcessPoolExecutor) -> dict[str, Any]:

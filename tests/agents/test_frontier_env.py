@@ -65,7 +65,7 @@ def test_the_masks_are_those_of_the_candidates():
 
 def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
     env = gymnasium.make(ID, rooms="apartment", driver={"choice": {"most": 200}}).unwrapped
-    observation, _ = env.reset(seed=0)
+    env.reset(seed=0)
     shared = 0
     for _ in range(12):
         choice, found = env.agent.described
@@ -81,7 +81,7 @@ def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
             current = choice.candidates[:, CANDIDATE.index("current")]
             np.testing.assert_array_equal(current == 1.0, choice.index == found.current)
             assert current.sum() == 1.0
-        observation, *_ = env.step(len(cells) // 2)
+        env.step(len(cells) // 2)
     assert shared > 0
 
 

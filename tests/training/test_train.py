@@ -15,7 +15,7 @@ pytest.importorskip("sb3_contrib")
 from slam.settings import from_mapping
 from training.cli import main
 from training.cli_train import CONFIGS
-from training.policies import export_policy, read_zip
+from training.policies import read_zip
 from training.ppo import Run
 from training.train_config import TrainConfig
 
@@ -88,22 +88,64 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_exported_policy_chooses_as_the_one_in_the_zip(tmp_path):
+def same_weights(one, other):
+    assert one.keys() == other.keys()
+    for name, weights in one.items():
+        np.testing.assert_array_equal(weights, other[name])
+
+
+def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_path, capsys):
+    from sb3_contrib import MaskablePPO
+
     from agents.chooser import ChooserConfig
     from agents.policy import PpoFrontier, load_choice_policy
+    from slam.settings import to_mapping
 
-    config = SMALL | {"ppo": SMALL["ppo"] | {"steps": 16}, "imitation": {"episodes": 0}}
-    Run(from_mapping(TrainConfig, config), tmp_path, workers=1, log=lambda _: None).train()
+    drive = {"control": {"near_wall_m_s": 0.6}}
+    config = SMALL | {
+        "world": {"rooms": ["rectangular"], "driver": drive},
+        "ppo": SMALL["ppo"] | {"steps": 16}, "imitation": {"episodes": 0},
+    }  # fmt: skip
+    run_out, mine = tmp_path / "run", tmp_path / "mine.safetensors"
+    Run(from_mapping(TrainConfig, config), run_out, workers=1, log=lambda _: None, command="as typed").train()
+    assert main(["policy", str(run_out), str(mine)]) == 0
+    _, driver, about = load_choice_policy(mine)
+    assert about["steps"] == 16 and about["command"] == "as typed" and about["curve"]
+    assert driver == from_mapping(ChooserConfig, drive) and driver.control.near_wall_m_s == 0.6
+    agent = PpoFrontier({"policy": str(mine)})
+    same_weights(read_zip(run_out / "best.zip"), agent._network._weights)
+    assert to_mapping(agent.config)["control"]["near_wall_m_s"] == 0.6
+    # To a zip, which stable-baselines3 reads, and back.
+    assert main(["policy", str(mine), str(tmp_path / "mine.zip")]) == 0
+    same_weights(read_zip(run_out / "best.zip"), read_zip(tmp_path / "mine.zip"))
+    assert MaskablePPO.load(tmp_path / "mine.zip", device="cpu").policy.network.width == 64
+    again = tmp_path / "again.safetensors"
+    assert main(["policy", str(tmp_path / "mine.zip"), str(again), "--like", str(mine.with_suffix(".json"))]) == 0
+    assert again.read_bytes() == mine.read_bytes()
+    assert again.with_suffix(".json").read_text() == mine.with_suffix(".json").read_text()
+    # What is wrong is said.
+    capsys.readouterr()
+    for arguments, message in [
+        ([mine, tmp_path / "x.safetensors"], "cannot make"),
+        ([tmp_path / "none", tmp_path / "x.safetensors"], "there is no"),
+        ([tmp_path / "mine.zip", tmp_path / "x.safetensors"], "--like belongs to a .zip"),
+        ([tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", mine], "cannot read"),
+        ([tmp_path, tmp_path / "x.safetensors"], "holds no finished part of a run"),
+    ]:
+        assert main(["policy", *map(str, arguments)]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "x.safetensors").exists()
+
+
+def test_a_damaged_policy_is_named(tmp_path):
+    from agents.policy import PpoFrontier, load_choice_policy
+
     target = tmp_path / "mine.safetensors"
-    export_policy(tmp_path / "checkpoint.zip", target, heads=4, driver=ChooserConfig(), training={"steps": 16})
-    _, driver, about = load_choice_policy(target)
-    assert about["steps"] == 16 and driver == ChooserConfig()
-    agent = PpoFrontier({"policy": str(target)})
-    for name, weights in read_zip(tmp_path / "checkpoint.zip").items():
-        np.testing.assert_array_equal(agent._network._weights[name], weights)
+    target.write_bytes(b"nonsense")
+    target.with_suffix(".json").write_text("{}")
     with pytest.raises(ValueError, match="no zip that stable-baselines3 wrote"):
         read_zip(target)
-    target.write_bytes(b"nonsense")
     with pytest.raises(ValueError, match="cannot be read"):
         load_choice_policy(target)
     with pytest.raises(ValueError, match=r"policy must be the path of a \.safetensors file"):
