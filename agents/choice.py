@@ -55,11 +55,13 @@ class ChoiceConfig:
     near_m: float = 2.0  # how far into the unknown an optimist sees …
     far_m: float = 5.0  # … and a greater one
     horizon_s: float = 300.0  # that time counts against
+    uncertainty: bool = True  # covariance and landmarks are shown; else 0 stands in their columns
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"ChoiceConfig.{f.name} must be > 0, got {value}")
+            good = f.name == "uncertainty" or (math.isfinite(value) and value > 0)
+            require(good, f"ChoiceConfig.{f.name} must be > 0, got {value}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +119,7 @@ def describe(
         np.log1p(near) - 0.2 * costs,
         np.arange(len(index)) / 10.0,
         _first_turns(found.travel.step, cells, pose[2], _FIRST_LEG_M / cost_map.resolution) / math.pi,
-        *_landmarks_left(belief, cost_map, views, lidar),
+        *(_landmarks_left(belief, cost_map, views, lidar) if config.uncertainty else np.zeros((3, len(index)))),
         pieces / 3.0,
     ])  # fmt: skip
     patches = np.zeros((len(index), 4, config.patch_cells, config.patch_cells), dtype=np.uint8)
@@ -127,19 +129,24 @@ def describe(
     places = np.vstack([np.asarray(cost_map.start)[None], cells])
     distances = between(cost_map, found.travel, places, searched=0)[1:, 1:] / 10.0
     known = float((cost_map.classes == FREE).sum()) * cost_map.resolution**2
-    cov = np.asarray(belief.pose_cov)
+    sigmas = _sigmas(np.asarray(belief.pose_cov)) if config.uncertainty else (0.0, 0.0)
     state = np.array([
         time_s / config.horizon_s,
         math.log1p(known) / 5.0,
         len(index) / config.most,
-        math.log10(math.sqrt(max(0.5 * (cov[0, 0] + cov[1, 1]), 0.0)) + 1e-4),
-        math.log10(math.sqrt(max(cov[2, 2], 0.0)) + 1e-5),
+        *sigmas,
         len(index) / views_found,
         math.log1p(float(near.sum())) / 5.0,
         float(costs.min()) / 10.0,
     ])  # fmt: skip
     as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
     return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def _sigmas(cov: Array) -> tuple[float, float]:
+    """Return log10 of the position's σ [m] and of the heading's [rad]."""
+    position, heading = 0.5 * (cov[0, 0] + cov[1, 1]), cov[2, 2]
+    return math.log10(math.sqrt(max(position, 0.0)) + 1e-4), math.log10(math.sqrt(max(heading, 0.0)) + 1e-5)
 
 
 def _apart(found: Candidates, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:

@@ -85,6 +85,22 @@ def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
     assert shared > 0
 
 
+def test_without_uncertainty_nothing_is_shown_of_it_and_all_else_is_the_same():
+    columns = [CANDIDATE.index(name) for name in ("corners", "walls", "sigma_left")]
+    numbers = [STATE.index(name) for name in ("sigma_m", "sigma_rad")]
+    shown, blind = (
+        play(gymnasium.make(ID, rooms="apartment", driver={"choice": {"uncertainty": u}}), 4, most=6)
+        for u in (True, False)
+    )
+    for (one, _, _), (other, _, _) in zip(shown, blind, strict=True):
+        m = int(one["present"].sum())
+        assert one["candidates"][:m, columns].any() and one["state"][numbers].all()
+        assert not other["candidates"][:, columns].any() and not other["state"][numbers].any()
+        one["candidates"][:, columns], one["state"][numbers] = 0.0, 0.0
+        for key in one:
+            np.testing.assert_array_equal(one[key], other[key])
+
+
 def test_one_seed_is_one_episode_and_whatever_is_no_candidate_is_the_first():
     def last(env, observation):
         return int(np.flatnonzero(env.action_masks())[-1])
