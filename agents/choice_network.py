@@ -58,7 +58,7 @@ class ChoiceNetwork:
         patches = choice.patches.reshape(len(choice.patches), -1).astype(np.float32) / np.float32(255.0)
         x = (
             self._linear("row", choice.candidates)
-            + self._linear("patch", patches)
+            + self._linear("patch_2", np.maximum(self._linear("patch_1", patches), 0.0))
             + self._linear("state", choice.state)
         )
         x = self._linear("token", np.maximum(x, 0.0))
@@ -91,7 +91,8 @@ class ChoiceNetwork:
         try:
             width = len(self._weights["norm.bias"])
             wanted: dict[str, tuple[int, ...]] = {
-                "token.weight": (width, width), "norm.weight": (width,), "score.weight": (1, width),
+                "patch_2.weight": (width, 2 * width), "token.weight": (width, width), "norm.weight": (width,),
+                "score.weight": (1, width),
                 "score.bias": (1,), "value_1.weight": (width, 2 * width), "value_2.weight": (1, width),
             }  # fmt: skip
             for k in range(self._layers):

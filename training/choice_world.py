@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
+from agents.choice import Choice
 from agents.cost_utility import CostUtility
 from agents.explorer import Candidates
 from agents.frontier_env import ExploreFrontierEnv
@@ -29,6 +30,7 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     env: ExploreFrontierEnv
     _hindsight: Hindsight | None
+    _priced: tuple[Choice, NDArray[np.float32]] | None  # the last choice, and what was made of it
 
     def __init__(self, env: ExploreFrontierEnv, world: WorldConfig) -> None:
         super().__init__(env)
@@ -50,7 +52,7 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
             name, room_seed = options["rooms"], options["room_seed"]
             episode_seed = room_seed  # as the benchmark has it
         plan = room_registry.make(name, seed=room_seed)
-        self._room, self._hindsight = (name, room_seed), None
+        self._room, self._hindsight, self._priced = (name, room_seed), None, None
         observation, info = self.env.reset(seed=episode_seed, options={"floor_plan": plan})
         self._potential = self._worth(observation)
         return observation, info
@@ -73,14 +75,18 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def prices(self) -> NDArray[np.float32]:
         """Return what each candidate would cost by the truth ``(m,)`` [weighted m]: for teaching only."""
-        env = self.env
+        env, (choice, found) = self.env, self.env.agent.described
+        if self._priced is not None and self._priced[0] is choice:
+            return self._priced[1]
         if self._hindsight is None:
             if self._room not in self._places:
                 self._places[self._room] = TruePlaces(
                     env.base.truth.ground, env.driver.planner, robot=env.config.robot, lidar=env.config.lidar
                 )
             self._hindsight = Hindsight(self._places[self._room])
-        return self._hindsight.prices(*env.agent.described, env.belief)
+        prices = self._hindsight.prices(choice, found, env.belief)
+        self._priced = choice, prices
+        return prices
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions stand for a candidate."""

@@ -98,7 +98,8 @@ def _episode(job: tuple[TrainConfig, int, Weights | None]) -> Lessons:
     seen, prices, rewards, durations = [], [], [], []
     done = False
     while not done and observation["present"].any():
-        wanted = int(heuristic())
+        asked = network is None or imitation.teacher != "hindsight"
+        wanted = int(heuristic()) if asked else -1
         seen.append(observation)
         prices.append(_prices(world, wanted, hindsight=imitation.teacher == "hindsight"))
         action = wanted if network is None else int(np.argmax(network.scores(world.env.agent.described[0])))

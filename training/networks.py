@@ -57,7 +57,7 @@ class ChoiceNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.width = width
-        self.patch = nn.Linear(patch, width)
+        self.patch_1, self.patch_2 = nn.Linear(patch, 2 * width), nn.Linear(2 * width, width)
         self.row = nn.Linear(features, width)
         self.state = nn.Linear(state, width)
         self.token = nn.Linear(width, width)
@@ -71,7 +71,8 @@ class ChoiceNetwork(nn.Module):
         """Return the candidates after attention ``(b, k, width)``."""
         absent = observation["present"] < 0.5
         patches = observation["patches"].flatten(2).float() / 255.0
-        x = self.row(observation["candidates"]) + self.patch(patches) + self.state(observation["state"])[:, None]
+        seen = self.patch_2(torch.relu(self.patch_1(patches)))
+        x = self.row(observation["candidates"]) + seen + self.state(observation["state"])[:, None]
         x = self.token(torch.relu(x))
         for layer in self.layers:
             x = layer(x, observation["distances"], absent)
