@@ -44,7 +44,7 @@ def test_it_runs(name: str, tmp_path: Path) -> None:
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
     assert result.returncode == 0, result.stderr
     assert re.search(said, " ".join(result.stdout.split())), result.stdout
