@@ -5,6 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OTHER_GYMNASIUM := 1.2.2
 OTHER := $(VENV)/gymnasium-$(OTHER_GYMNASIUM)
+RAY := $(VENV)/ray
 SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
@@ -18,7 +19,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium monte-carlo evaluate benchmark speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium rllib monte-carlo evaluate benchmark speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -36,6 +37,13 @@ $(VENV)/test.stamp: $(VENV)/core.stamp
 $(OTHER).stamp: $(VENV)/test.stamp
 	rm -rf $(OTHER)
 	$(BIN)/python -m pip install --quiet --no-deps --target $(OTHER) gymnasium==$(OTHER_GYMNASIUM)
+	@touch $@
+
+# RLlib pins the oldest Gymnasium, so it cannot share an environment with the newest: all other versions stay.
+$(RAY).stamp: pyproject.toml constraints.txt
+	test -x $(RAY)/bin/python || $(PYTHON) -m venv $(RAY)
+	grep -v '^gymnasium==' constraints.txt > $(RAY)/constraints.txt
+	$(RAY)/bin/python -m pip install --quiet -c $(RAY)/constraints.txt -e '.[ray,test]'
 	@touch $@
 
 install: $(VENV)/core.stamp ## install the core into .venv
@@ -61,6 +69,9 @@ other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) $(API_TESTS)
+
+rllib: $(RAY).stamp ## the RLlib example, in an environment of its own (not in CI: large)
+	$(RAY)/bin/python -m pytest tests/examples -k rllib
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo

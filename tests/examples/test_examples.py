@@ -1,0 +1,50 @@
+"""The examples run as they stand, for a few steps each."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = ROOT / "examples"
+NEEDS = {
+    "sb3_ppo.py": ("torch", "stable_baselines3"),
+    "sb3_maskable_ppo.py": ("torch", "sb3_contrib"),
+    "cleanrl_loop.py": ("torch",),
+    "rllib_ppo.py": ("torch", "ray.rllib"),
+}
+# What is asked for, and what is said once it is done: a rollout of 4 · 256, 4 · 64, 4 · 64 steps, or of some 512.
+RUNS = {
+    "sb3_ppo.py": (["1"], r"total_timesteps \| 1024"),
+    "sb3_maskable_ppo.py": (["1"], r"total_timesteps \| 256"),
+    "cleanrl_loop.py": (["1"], r"256 steps, \d+ episodes"),
+    "rllib_ppo.py": (["1", "0"], r"1: 5\d\d steps, \d+ episodes"),
+}
+
+
+def test_every_example_is_run() -> None:
+    assert {path.name for path in EXAMPLES.glob("*.py")} == set(RUNS)
+
+
+@pytest.mark.parametrize("name", sorted(RUNS))
+def test_it_runs(name: str, tmp_path: Path) -> None:
+    for module in NEEDS[name]:
+        extra = "ray" if module.startswith("ray") else "train"
+        pytest.importorskip(module, reason=f"{name} needs the extra `{extra}`: {module} is not installed")
+    arguments, said = RUNS[name]
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    result = subprocess.run(
+        [sys.executable, str(EXAMPLES / name), *arguments],
+        env=os.environ | {"PYTHONPATH": path, "HOME": str(tmp_path)},  # RLlib keeps its results in the home folder
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert result.returncode == 0, result.stderr
+    assert re.search(said, " ".join(result.stdout.split())), result.stdout
