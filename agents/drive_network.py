@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agents.drive_plan import descend, distances, node_prices
 
 __all__ = [
-    "NUMBERS", "PATH_POINTS", "SECTORS", "Plan", "PlanSettings", "control", "landmark_rows", "numbers", "pixel_size", "plan",
+    "BEAMS", "NUMBERS", "PATH_POINTS", "RANGE_M", "SECTORS", "Plan", "DriveNetwork", "Inputs", "PlanSettings", "control", "landmark_rows", "numbers", "pixel_size", "plan",
     "sectors",
 ]  # fmt: skip
 
@@ -182,6 +182,8 @@ def _smooth(path: Array) -> Array:
     return np.asarray(out)
 
 
+BEAMS, RANGE_M = 360, 8.0
+"""The lidar that scans are taken with [beams, m]; the first beam looks backwards."""
 SECTORS = 72
 """Directions that the scan is summed up in."""
 NUMBERS = 3 * PATH_POINTS + 10
@@ -265,6 +267,11 @@ class DriveNetwork:
         Of the planning layer.
     uncertainty : bool
         Whether the belief's covariance and its landmarks are looked at; without, for an ablation.
+
+    Raises
+    ------
+    ValueError
+        Where a weight is missing or has another shape than the others ask for.
     """
 
     def __init__(
@@ -272,6 +279,7 @@ class DriveNetwork:
     ) -> None:
         self._weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
         self._settings, self._uncertainty = settings or PlanSettings(), uncertainty
+        self._check()
 
     def plan(self, observation: Mapping[str, Any]) -> Plan:
         """Return the way that the planning layer finds."""
@@ -288,3 +296,26 @@ class DriveNetwork:
     def twist(self, inputs: Inputs) -> Floats:
         """Return the action ``(3,)``."""
         return np.clip(control(self._weights, *inputs), -1.0, 1.0).astype(np.float32)
+
+    def _check(self) -> None:
+        try:
+            width, hidden = len(self._weights["local.0.bias"]), len(self._weights["head.0.bias"])
+            summary = 16 * SECTORS // 4 + 16 + NUMBERS
+            wanted: dict[str, tuple[int, ...]] = {
+                "scan.0.weight": (8, 1, 5), "scan.2.weight": (16, 8, 5), "landmark.0.weight": (16, 5),
+                "landmark.2.weight": (16, 16), "head.0.weight": (hidden, summary),
+                "head.2.weight": (hidden, hidden), "head.4.weight": (3, hidden),
+            }  # fmt: skip
+            for name, out in (("local", 2), ("overview", 5)):
+                wanted |= {
+                    f"{name}.0.weight": (width, 3, 5, 5), f"{name}.2.weight": (width, width, 3, 3),
+                    f"{name}.4.weight": (width, width, 3, 3), f"{name}.6.weight": (out, width, 1, 1),
+                }  # fmt: skip
+            for name, shape in list(wanted.items()):
+                wanted[name.replace("weight", "bias")] = shape[:1]
+            for name, shape in wanted.items():
+                found: Any = self._weights[name].shape
+                if found != shape:
+                    raise ValueError(f"weight {name} has the shape {found}, expected {shape}")
+        except KeyError as error:
+            raise ValueError(f"weight {error.args[0]} is missing") from error

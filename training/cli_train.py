@@ -13,6 +13,11 @@ import typer
 from training.errors import BadInput, Interrupted, bad_input, check_writable, suggestion
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from training.drive import DriveRun
+    from training.drive_config import DriveConfig
+    from training.ppo import Run
     from training.train_config import TrainConfig
 
 __all__ = ["train"]
@@ -52,21 +57,34 @@ def train(
     if resume and not begun:
         raise BadInput(f"{out} holds no run to go on with; leave out --resume")
     try:
-        from training.ppo import Run
+        make_run = _runner(settings)
     except ModuleNotFoundError as error:
         raise BadInput(
             f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
         ) from error
     with bad_input():
-        run = Run(settings, out, workers=workers or os.cpu_count() or 1, log=_say)
+        run = make_run(settings, out, workers=workers or os.cpu_count() or 1, log=_say)
     try:
         run.train()
     except KeyboardInterrupt as error:
         raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
 
 
-def _read(config: str, seed: int | None) -> TrainConfig:
+def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | DriveRun]:
+    from training.drive_config import DriveConfig
+
+    if isinstance(settings, DriveConfig):
+        from training.drive import DriveRun
+
+        return DriveRun
+    from training.ppo import Run
+
+    return Run
+
+
+def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
     from slam.settings import from_mapping
+    from training.drive_config import DriveConfig
     from training.train_config import TrainConfig
 
     shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
@@ -78,8 +96,9 @@ def _read(config: str, seed: int | None) -> TrainConfig:
         raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"cannot read {path}: {error}") from error
+    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
     with bad_input():
-        return from_mapping(TrainConfig, values if seed is None else values | {"seed": seed})
+        return from_mapping(kind, values if seed is None else values | {"seed": seed})
 
 
 def _say(text: str) -> None:

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import save
+from safetensors.numpy import load_file, save
 
+from agents.drive_policy import FORMAT, load_drive_policy
 from agents.policy import load_choice_policy, policy_description
 from slam.formats import atomic_write
 from slam.settings import to_mapping
 
-__all__ = ["export_policy", "read_zip"]
+__all__ = ["export_drive_policy", "export_policy", "read_zip"]
 
 _INSIDE = "features_extractor.network."
 """Where the network is among the parameters of :class:`training.networks.ChoicePolicy`."""
@@ -61,3 +62,28 @@ def export_policy(source: Path, target: Path, *, heads: int, driver: Any, traini
     atomic_write(target, save(read_zip(source)))
     atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     load_choice_policy(target)  # it is read back
+
+
+def export_drive_policy(run: Path, target: Path, *, command: str) -> None:
+    """Write the best weights of a run of ``ppo`` as ``target`` (.safetensors, half precision), and the JSON beside it.
+
+    Parameters
+    ----------
+    run
+        The run's folder.
+    command
+        What it was trained by.
+    """
+    progress = json.loads((run / "progress.json").read_text(encoding="utf-8"))
+    config = progress["config"]
+    curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
+    described = {
+        "format": FORMAT, "uncertainty": config["uncertainty"],
+        "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
+        "command": command, "config": config, "steps": progress["steps"], "hours": progress["wall_s"] / 3600.0,
+        "curve": curve,
+    }  # fmt: skip
+    weights = {name: value.astype(np.float16) for name, value in load_file(run / "best.safetensors").items()}
+    atomic_write(target, save(weights))
+    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    load_drive_policy(target)  # it is read back
