@@ -1,7 +1,8 @@
-"""The end-to-end policy's network in NumPy: observation in, body twist out. ``training/drive_networks.py`` trains it.
+"""The end-to-end policy's network in NumPy: observation in, body twist out.
 
-Convolutions turn either map into prices and goals; the planning layer turns these into a way; and the way, the scan,
-the landmarks and the numbers go through a small network that says the twist.
+Convolutions turn either map into prices and goals; the planning layer turns these into a way; and the way, the
+scan, the landmarks and the numbers go through a small network that says the twist. What trains it is in
+``training/drive_networks.py``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,20 @@ from numpy.typing import NDArray
 from agents.drive_plan import descend, distances, node_prices
 
 __all__ = [
-    "BEAMS", "NUMBERS", "PATH_POINTS", "RANGE_M", "SECTORS", "Plan", "DriveNetwork", "Inputs", "PlanSettings", "control", "landmark_rows", "numbers", "pixel_size", "plan",
+    "BEAMS",
+    "NUMBERS",
+    "PATH_POINTS",
+    "RANGE_M",
+    "SECTORS",
+    "DriveNetwork",
+    "Inputs",
+    "Plan",
+    "PlanSettings",
+    "control",
+    "landmark_rows",
+    "numbers",
+    "pixel_size",
+    "plan",
     "sectors",
 ]  # fmt: skip
 
@@ -146,7 +160,7 @@ def plan(weights: Mapping[str, Floats], observation: Mapping[str, Any], settings
     best, parent = distances(node_prices(np.exp(price), CELL_M), ends)
     start = min(((i, j) for i in (31, 32) for j in (31, 32)), key=lambda p: best[p])
     way = descend(parent, *start)
-    path = _smooth((0.5 * SIZE - 0.5 - way) * CELL_M)
+    path = _smooth(np.asarray((0.5 * SIZE - 0.5 - way) * CELL_M, dtype=np.float64))
     arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
     at = np.minimum(np.arange(1, PATH_POINTS + 1) * PATH_STEP_M, arc[-1])
     points = np.stack([np.interp(at, arc, path[:, k]) for k in (0, 1)], axis=1)
@@ -167,7 +181,9 @@ def _used(known: Bytes) -> tuple[slice, slice]:
 
 
 def _doubt(logit: Floats, settings: PlanSettings) -> Floats:
-    return np.asarray(np.float32(settings.goal_m) * np.logaddexp(np.float32(0.0), np.float32(settings.goal_bias) - logit))
+    return np.asarray(
+        np.float32(settings.goal_m) * np.logaddexp(np.float32(0.0), np.float32(settings.goal_bias) - logit)
+    )
 
 
 def _smooth(path: Array) -> Array:
@@ -213,7 +229,7 @@ def sectors(scan: Floats) -> Floats:
 
 
 def landmark_rows(rows: Floats, *, uncertainty: bool = True) -> Floats:
-    """Return the landmarks scaled ``(…, n, 5)``: x, y, the logarithms of two variances, and whether there is one."""
+    """Return the landmarks scaled ``(…, n, 5)``: x, y, two variances' logarithms, whether there is one."""
     out = np.empty((*rows.shape[:-1], 5), np.float32)
     out[..., :2] = rows[..., :2] / 8.0
     out[..., 2:4] = np.log10(np.maximum(rows[..., [2, 4]], _LEAST)) / 4.0 + 1.0

@@ -1,11 +1,11 @@
 """The planning layer of the end-to-end policy: distances over a learned price of each step, and the way down them.
 
-A value iteration network (Tamar et al., 2016) in its shortest-path form: what convolutions make of the maps is the
-price of every step between neighbouring pixels and of ending at any of them, and the distances follow from
+A value iteration network (Tamar et al., 2016) in its shortest-path form: what convolutions make of the maps is
+the price of every step between neighbouring pixels and of ending at any of them, and the distances follow from
 
     D(p) = min(goal(p), min over the eight neighbours q of D(q) + price(p, q)).
 
-The minimum has a gradient, that of the steps it is made of (``gradient``), so that prices are learned from distances.
+The minimum has a gradient, that of the steps it is made of (``gradient``): prices are learned from distances.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _NOWHERE = 1e30
 def distances(prices: Floats, goal: Floats) -> tuple[Floats, NDArray[np.int8]]:
     """Return the distances ``(n, m)`` and each pixel's direction to the next one, −1 where it is an end itself.
 
-    ``prices`` is ``(4, n, m)``, in the order of :data:`EDGES`, all above 0; ``goal`` ``(n, m)``. Sweeps down and up
-    the rows in turn, until two of them change nothing.
+    ``prices`` is ``(4, n, m)``, in the order of :data:`EDGES`, all above 0; ``goal`` ``(n, m)``. Sweeps down and
+    up the rows in turn, until two of them change nothing.
     """
     rows, cols = goal.shape
     # A rim that nothing comes from, in place of asking at each pixel whether it has all its neighbours.
@@ -122,7 +122,7 @@ def gradient(best: Floats, parent: NDArray[np.int8], upstream: Floats) -> tuple[
 
 @njit(cache=True, nogil=True)
 def node_prices(price: Floats, length: float) -> Floats:
-    """Return the steps' prices ``(4, n, m)`` where each pixel ``(n, m)`` has one a length, and is ``length`` wide."""
+    """Return the steps' prices ``(4, n, m)`` where each pixel ``(n, m)``, ``length`` wide, has one a length."""
     rows, cols = price.shape
     out = np.full((4, rows, cols), np.float32(1e6))
     for k in range(4):

@@ -1,8 +1,8 @@
-"""Training of ``ppo``, the end-to-end policy: rounds of lessons, then PPO, checkpointed so that it goes on exactly.
+"""Training of ``ppo``, the end-to-end policy: rounds of lessons, then PPO, resumable to the bit.
 
-A run is a chain of rounds and then of chunks of rollouts. Each follows from the weights that the one before it left,
-from the lessons kept in the folder, and from random numbers of its own, drawn by the run's seed and its number: a
-run that was killed and resumed is the one that was not.
+A run is a chain of rounds and then of chunks of rollouts. Each follows from the weights that the one before it
+left, from the lessons kept in the folder, and from random numbers of its own, drawn by the run's seed and its
+number: a run that was killed and resumed is the one that was not.
 """
 
 from __future__ import annotations
@@ -216,8 +216,8 @@ class DriveRun:
 def summary(jobs: list[Episode], outcomes: list[Outcome]) -> dict[str, Any]:
     """Return by family the share of episodes with 90 % covered and the mean time to that; collisions an episode.
 
-    ``score`` is what the best checkpoint is chosen by: the shares' mean, less half the collisions an episode, less a
-    tenth of the time as a share of its limit.
+    ``score`` is what the best checkpoint is chosen by: the shares' mean, less half the collisions an episode, less
+    a tenth of the time as a share of its limit.
     """
     found: dict[str, Any] = {}
     shares, times = [], []

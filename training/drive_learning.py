@@ -1,4 +1,4 @@
-"""What the end-to-end policy learns from lessons: maps to prices, distances and goals, and situations to twists."""
+"""What the end-to-end policy learns from lessons: of maps prices and goals, of situations twists."""
 
 from __future__ import annotations
 
@@ -123,16 +123,14 @@ def control_batch(lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool) 
 def _rims(maps: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Return for each map how many pixels at its rim, all around, are far from all that is known."""
     known = maps[:, 1] > 0
-    used = known.any(axis=1) | known.any(axis=2)
+    used = np.asarray(known.any(axis=1) | known.any(axis=2))
     first, last = used.argmax(axis=1), used[:, ::-1].argmax(axis=1)
     return np.asarray(np.maximum(np.minimum(first, last) - _MARGIN, 0))
 
 
 def _goal_loss(logit: Tensor, goal: NDArray[np.uint8]) -> Tensor:
     weight = torch.tensor(_GOAL_WEIGHT)
-    return functional.binary_cross_entropy_with_logits(
-        logit, _tensor(goal.astype(np.float32)), pos_weight=weight
-    )
+    return functional.binary_cross_entropy_with_logits(logit, _tensor(goal.astype(np.float32)), pos_weight=weight)
 
 
 def _set_rate(optimizer: torch.optim.Optimizer, rate: float, step: int, steps: int) -> None:

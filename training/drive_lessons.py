@@ -8,7 +8,6 @@ would send on the way that the student itself has planned.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -54,7 +53,7 @@ class FollowingTeacher:
             control or ControlConfig(), robot=robot, lidar=config.lidar, step_s=config.step_s
         )
 
-    def __call__(self, path: Array, executed: Array, observation: dict[str, Any], belief: Belief) -> Floats:
+    def __call__(self, path: Array, executed: Floats, observation: dict[str, Any], belief: Belief) -> Floats:
         """Return the action ``(3,)``.
 
         Parameters
@@ -69,7 +68,8 @@ class FollowingTeacher:
         follower._velocity = geometry.rotation(pose[2] - 0.5 * sent[2] * self._step_s) @ sent[:2]
         follower._turn = float(sent[2])
         follower.set_path(pose[:2] + path @ geometry.rotation(pose[2]).T, None)
-        return np.clip(follower.follow(observation, belief) / self._limits, -1.0, 1.0).astype(np.float32)
+        wanted = np.clip(follower.follow(observation, belief) / self._limits, -1.0, 1.0)
+        return np.asarray(wanted, dtype=np.float32)
 
 
 def map_lesson(teacher: Agent, env: ExploreEnv) -> dict[str, NDArray[Any]]:

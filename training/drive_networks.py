@@ -1,4 +1,4 @@
-"""The end-to-end policy's network in PyTorch; ``agents/drive_network.py`` is the same in NumPy, forward only."""
+"""The end-to-end policy's network in PyTorch; ``agents/drive_network.py`` is the same in NumPy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Shortest(Function):
         return torch.from_numpy(np.stack([best for best, _ in found]))
 
     @staticmethod
-    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor]:
         flow = upstream.contiguous().numpy()
         parts = [gradient(best, parent, flow[i]) for i, (best, parent) in enumerate(ctx.found)]
         by_price, by_goal = (torch.from_numpy(np.stack(part)) for part in zip(*parts, strict=True))
@@ -39,7 +39,7 @@ def shortest(prices: Tensor, goal: Tensor) -> Tensor:
 
 
 def step_prices(logs: Tensor, pixel: Tensor) -> Tensor:
-    """Return the prices of the steps ``(b, 4, n, m)``, of log prices a metre and the pixels' sides ``(b,)`` [m]."""
+    """Return the prices of the steps ``(b, 4, n, m)``, of log prices a metre and the pixels' sides [m]."""
     lengths = torch.from_numpy(STEP_LENGTHS)[None]
     return pixel.view(-1, 1, 1, 1) * lengths * torch.exp(logs.clamp(*LOG_PRICES))
 
@@ -47,8 +47,8 @@ def step_prices(logs: Tensor, pixel: Tensor) -> Tensor:
 class PlanNetwork(nn.Module):
     """What the two maps say of prices and goals.
 
-    Of ``map_local``: the log price of a metre and the log odds of a goal, of each pixel. Of ``map_global``: the log
-    price of a metre along each of the four steps that a pixel owns, and the log odds of a goal.
+    Of ``map_local``: the log price of a metre and the log odds of a goal, of each pixel. Of ``map_global``: the
+    log price of a metre along each of the four steps that a pixel owns, and the log odds of a goal.
     """
 
     def __init__(self, width: int = 8) -> None:

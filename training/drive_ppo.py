@@ -128,7 +128,7 @@ class _Flat(nn.Module):
         self.network = ControlNetwork(out=out)
 
     def forward(self, features: Tensor) -> Tensor:
-        landmarks, numbers, scan = features.split([LANDMARKS * 5, NUMBERS, SECTORS], dim=1)
+        landmarks, numbers, scan = torch.split(features, [LANDMARKS * 5, NUMBERS, SECTORS], dim=1)
         return cast("Tensor", self.network(scan, landmarks.reshape(-1, LANDMARKS, 5), numbers))
 
 
@@ -144,5 +144,3 @@ def make_model(config: DriveConfig, env: VecEnv, folder: Path, *, log_std: float
     )  # fmt: skip
     model.set_logger(configure(str(folder / "log"), ["tensorboard"]))
     return model
-
-

@@ -80,9 +80,11 @@ def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
         wanted = follow(way.path, scene.action, observation, scene.env.belief)
         rows.append(
             {
-                "scan": observation["scan"].astype(np.float16), "landmarks": inputs.landmarks.astype(np.float16),
-                "numbers": inputs.numbers, "wanted": wanted,
-            }  # fmt: skip
+                "scan": observation["scan"].astype(np.float16),
+                "landmarks": inputs.landmarks.astype(np.float16),
+                "numbers": inputs.numbers,
+                "wanted": wanted,
+            }
         )
         if scene.time_s >= switch_at:
             teacher_drives = bool(scene.rng.random() < episode.teacher_share)
@@ -101,9 +103,10 @@ class _Scene:
         config = self.env.config
         self.guide = agents.make(episode.teacher, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
         self.guide.reset(self.env.belief, episode.seed)
-        self.action = np.zeros(3, np.float32)
+        self.action: NDArray[np.float32] = np.zeros(3, np.float32)
         self.maps: list[dict[str, Any]] = []
-        self.time_s, self._maps_at, self._reached = 0.0, 0.0, None
+        self.time_s, self._maps_at = 0.0, 0.0
+        self._reached: float | None = None
         self._shake, self._shake_end = np.zeros(3), 0.0
         self._shake_at = float(self.rng.exponential(_PAUSE_S))
         self._terminated = False

@@ -65,7 +65,7 @@ def export_policy(source: Path, target: Path, *, heads: int, driver: Any, traini
 
 
 def export_drive_policy(run: Path, target: Path, *, command: str) -> None:
-    """Write the best weights of a run of ``ppo`` as ``target`` (.safetensors, half precision), and the JSON beside it.
+    """Write the best weights of a run of ``ppo`` as ``target`` (.safetensors, half precision), and its JSON file.
 
     Parameters
     ----------
