@@ -75,6 +75,7 @@ class DriveRun:
         else:
             torch.manual_seed(self.config.seed)
             self._plan, self._control = PlanNetwork(), ControlNetwork()
+            self._keep({})
         with worker_pool(self._workers) as pool:
             while self._progress["round"] <= len(self.config.lessons.teacher_shares):
                 self._round(self._progress["round"], pool)
@@ -95,7 +96,8 @@ class DriveRun:
 
     def _round(self, number: int, pool: ProcessPoolExecutor) -> None:
         learning = self.config.learning
-        self._give_lessons(number, pool)
+        if not (self.out / f"maps-{number}.npz").exists():
+            self._give_lessons(number, pool)
         rng = np.random.default_rng([self.config.seed, number])
         torch.manual_seed(int(rng.integers(2**31)))
         maps = _gathered(self.out / f"maps-{k}.npz" for k in range(number + 1))
@@ -128,9 +130,9 @@ class DriveRun:
             for _ in range(lessons.episodes if number else lessons.guided_episodes)
         ]  # fmt: skip
         found = list(pool.map(give_lessons if number else guided_lessons, jobs))
-        _save_rows(self.out / f"maps-{number}.npz", [maps for maps, _, _ in found])
         if number > 0:
             _save_rows(self.out / f"control-{number}.npz", [rows for _, rows, _ in found])
+        _save_rows(self.out / f"maps-{number}.npz", [maps for maps, _, _ in found])  # last: it says all are there
         said = summary(jobs, [outcome for _, _, outcome in found])
         self._say(f"round {number}: lessons of {len(jobs)} episodes, " + _words(said))
 

@@ -114,7 +114,7 @@ def run(out: Path, *, kill_at: str = "", **changes) -> None:
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
     run(tmp_path / "whole")
-    for moment in ("round 1 of 2 done", "chunk 1 of 2"):
+    for moment in ("round 1: lessons", "round 1 of 2 done", "chunk 1 of 2"):
         with pytest.raises(Killed):
             run(tmp_path / "parts", kill_at=moment)
     run(tmp_path / "parts")
