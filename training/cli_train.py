@@ -39,13 +39,14 @@ def train(
 ) -> None:
     """Train a policy with PPO, after a warm start by imitation.
 
-    Writes into --out: checkpoint.zip and best.zip (stable-baselines3), progress.json, curve.jsonl (a line per
-    evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes on from its last
-    checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
+    Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
+    curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes
+    on from its last checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
 
     \b
     Examples:
       mecanum train --out out/frontier
+      mecanum train --config ppo --out out/ppo
       mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
       mecanum train --config my.toml --out out/mine --resume
     """  # noqa: D301
