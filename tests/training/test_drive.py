@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import gymnasium
@@ -29,7 +31,7 @@ assert mecanum_env
 
 SMALL = {
     "policy": "drive",
-    "world": {"rooms": ["rectangular"]},
+    "world": {"rooms": ["rectangular"], "time_limit_s": 3.0},
     "lessons": {"guided_episodes": 2, "teacher_shares": [1.0, 0.0], "episodes": 1, "time_limit_s": 4.0},
     "learning": {"map_steps": 2, "map_steps_a_round": 1, "map_batch": 4, "control_steps": 3, "control_batch": 8},
     "ppo": {"steps": 32, "environments": 1, "n_steps": 16, "chunk": 1, "batch_size": 8},
@@ -104,6 +106,17 @@ class Killed(Exception):
     pass
 
 
+class InThisProcess:
+    """A pool that takes no time to start."""
+
+    map = staticmethod(map)
+
+
+@contextmanager
+def no_workers(count: int) -> Iterator[InThisProcess]:
+    yield InThisProcess()
+
+
 def run(out: Path, *, kill_at: str = "", **changes) -> None:
     def log(text: str) -> None:
         if kill_at and text.startswith(kill_at):
@@ -112,7 +125,9 @@ def run(out: Path, *, kill_at: str = "", **changes) -> None:
     DriveRun(from_mapping(DriveConfig, SMALL | changes), out, workers=1, log=log).train()
 
 
-def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
+def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("training.drive.worker_pool", no_workers)
+    monkeypatch.setattr("training.drive_ppo.start_worker", lambda: None)
     run(tmp_path / "whole")
     for moment in ("round 1: lessons", "round 1 of 2 done", "chunk 1 of 2"):
         with pytest.raises(Killed):
