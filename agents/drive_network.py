@@ -50,7 +50,8 @@ LOG_PRICES = (-0.5, 3.5)
 _PIXELS_M = np.array([0.05, 0.1, 0.2, 0.4, 0.8, 1.6])
 _FAR = np.float32(1e6)
 _MARGIN = 6
-_HERE_M = 0.3
+_HERE_M = 0.3  # nearer goals are none: from here the robot looks already
+_RIM_M = 2.6  # square of the local map from which on the way goes on by the whole map
 
 
 class PlanSettings(NamedTuple):
@@ -134,13 +135,12 @@ def _ends(goal: Floats, far: Floats, pose: Floats, pixel: float, turn_m: float) 
     for i in range(SIZE):
         for j in range(SIZE):
             ahead, left = (0.5 * SIZE - 0.5 - i) * CELL_M, (0.5 * SIZE - 0.5 - j) * CELL_M
-            if max(abs(ahead), abs(left)) > 2.6:
+            if max(abs(ahead), abs(left)) > _RIM_M:
                 dx, dy = pose[2] * ahead - pose[3] * left, pose[3] * ahead + pose[2] * left
                 row, col = math.floor(at_row - dy / pixel), math.floor(at_col + dx / pixel)
                 if 0 <= row < SIZE and 0 <= col < SIZE:
                     out[i, j] = min(out[i, j], far[row, col])
             away = math.hypot(ahead, left)
-            # From here the robot looks already.
             out[i, j] = out[i, j] + turn_m * (1.0 - ahead / away) if away > _HERE_M else 1e6
     return out
 
