@@ -24,6 +24,7 @@ _REGISTRY = {
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "nearest-frontier": "agents.frontier:NearestFrontier",
     "next-best-view": "agents.next_best_view:NextBestView",
+    "ppo": "agents.drive_policy:Ppo",
     "random": "agents.random:RandomAgent",
     "rrt": "agents.rrt:Rrt",
     "tour": "agents.tour:Tour",

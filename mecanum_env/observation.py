@@ -15,7 +15,7 @@ from slam.joint_gaussian import OBSERVED_LIMIT
 from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Scan
 
-__all__ = ["LOCAL_CELL_M", "MAP_SIZE", "map_frame", "observation_space", "observe"]
+__all__ = ["LOCAL_CELL_M", "MAP_SIZE", "draw_maps", "map_frame", "observation_space", "observe"]
 
 Array = NDArray[np.float64]
 Observation = dict[str, NDArray[np.uint8] | NDArray[np.float32]]
@@ -115,6 +115,19 @@ def observe(
         "twist": numbers[10:13],
         "progress": numbers[13:15],
     }
+
+
+def draw_maps(grid: OccupancyGrid, pose: Array) -> Observation:
+    """Return an observation's ``map_local``, ``map_global`` and ``pose``, of a map and a pose ``(3,)`` alone."""
+    maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
+    numbers = np.empty(15, np.float32)
+    row0, col0 = grid.lattice_origin
+    _fill(
+        maps, np.empty(0, np.float32), numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution,
+        grid.overview_sums, grid.overview_block, np.empty(0), 1.0, np.asarray(pose, dtype=np.float64),
+        np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0,
+    )  # fmt: skip
+    return {"map_local": maps[0], "map_global": maps[1], "pose": numbers[:4]}
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -21,7 +21,7 @@ def policy(
         typer.Option(help="With a .zip for source: the .json file of the policy that it was trained on from."),
     ] = None,
 ) -> None:
-    """Convert a policy of ppo-frontier: a run's best, the package's files, a zip of stable-baselines3.
+    """Convert a policy: a run's best, the package's files, a zip of stable-baselines3 (ppo-frontier's only).
 
     The package's files, .safetensors and .json, hold no code; of a zip the weights alone are read.
 

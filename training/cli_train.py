@@ -13,6 +13,11 @@ import typer
 from training.errors import BadInput, Interrupted, bad_input, check_writable, suggestion
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from training.drive import DriveRun
+    from training.drive_config import DriveConfig
+    from training.ppo import Run
     from training.train_config import TrainConfig
 
 __all__ = ["train"]
@@ -34,13 +39,14 @@ def train(
 ) -> None:
     """Train a policy with PPO, after a warm start by imitation.
 
-    Writes into --out: checkpoint.zip and best.zip (stable-baselines3), progress.json, curve.jsonl (a line per
-    evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes on from its last
-    checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
+    Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
+    curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes
+    on from its last checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
 
     \b
     Examples:
       mecanum train --out out/frontier
+      mecanum train --config ppo --out out/ppo
       mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
       mecanum train --config my.toml --out out/mine --resume
     """  # noqa: D301
@@ -52,22 +58,35 @@ def train(
     if resume and not begun:
         raise BadInput(f"{out} holds no run to go on with; leave out --resume")
     try:
-        from training.ppo import Run
+        make_run = _runner(settings)
     except ModuleNotFoundError as error:
         raise BadInput(
             f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
         ) from error
     with bad_input():
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
-        run = Run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)
+        run = make_run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)
     try:
         run.train()
     except KeyboardInterrupt as error:
         raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
 
 
-def _read(config: str, seed: int | None) -> TrainConfig:
+def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | DriveRun]:
+    from training.drive_config import DriveConfig
+
+    if isinstance(settings, DriveConfig):
+        from training.drive import DriveRun
+
+        return DriveRun
+    from training.ppo import Run
+
+    return Run
+
+
+def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
     from slam.settings import from_mapping
+    from training.drive_config import DriveConfig
     from training.train_config import TrainConfig
 
     shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
@@ -79,8 +98,9 @@ def _read(config: str, seed: int | None) -> TrainConfig:
         raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"cannot read {path}: {error}") from error
+    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
     with bad_input():
-        return from_mapping(TrainConfig, values if seed is None else values | {"seed": seed})
+        return from_mapping(kind, values if seed is None else values | {"seed": seed})
 
 
 def _say(text: str) -> None:

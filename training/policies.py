@@ -16,6 +16,7 @@ from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.chooser import ChooserConfig
+from agents.drive_policy import FORMAT, load_drive_policy
 from agents.policy import load_choice_policy, policy_description
 from slam.formats import atomic_write, replacing
 from slam.settings import from_mapping, to_mapping
@@ -70,7 +71,7 @@ def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, trai
 
 
 def export_run(run: Path, target: Path) -> None:
-    """Write the best policy of a run's folder; the JSON file says by which run it was trained.
+    """Write the best policy of a run of ``ppo-frontier`` or ``ppo``; the JSON file says how it was trained.
 
     Raises
     ------
@@ -82,12 +83,10 @@ def export_run(run: Path, target: Path) -> None:
         curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
     except (OSError, ValueError) as error:
         raise ValueError(f"{run} holds no finished part of a run: {error}") from error
-    config = progress["config"]
-    training = {
-        "command": progress["command"], "config": config, "steps": progress["steps"],
-        "hours": round(progress["wall_s"] / 3600.0, 3), "training_seeds": config["world"]["seeds"], "curve": curve,
-    }  # fmt: skip
-    export_policy(read_zip(run / "best.zip"), target, training)
+    if progress["config"].get("policy") == "drive":
+        _export_drive(run, target, progress, curve)
+    else:
+        export_policy(read_zip(run / "best.zip"), target, _training(progress, curve))
 
 
 def write_zip(source: Path, target: Path) -> None:
@@ -110,3 +109,25 @@ def write_zip(source: Path, target: Path) -> None:
     with replacing(target) as new:
         model.save(new)
     env.close()
+
+
+def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: Any) -> None:
+    """Write the best weights of a run of ``ppo`` in half precision, and the JSON file."""
+    config = progress["config"]
+    described = {
+        "format": FORMAT, "uncertainty": config["uncertainty"],
+        "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
+        **_training(progress, curve),
+    }  # fmt: skip
+    weights = {name: value.astype(np.float16) for name, value in load_file(run / "best.safetensors").items()}
+    atomic_write(target, save(weights))
+    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    load_drive_policy(target)  # it is read back
+
+
+def _training(progress: Mapping[str, Any], curve: Any) -> dict[str, Any]:
+    config = progress["config"]
+    return {
+        "command": progress["command"], "config": config, "steps": progress["steps"],
+        "hours": round(progress["wall_s"] / 3600.0, 3), "training_seeds": config["world"]["seeds"], "curve": curve,
+    }  # fmt: skip

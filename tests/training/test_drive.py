@@ -1,0 +1,147 @@
+"""The end-to-end policy's training: the same without PyTorch, mirrored rightly, and exactly resumed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("stable_baselines3")
+
+from safetensors.numpy import load_file  # noqa: E402
+
+import agents  # noqa: E402
+import mecanum_env  # noqa: E402
+from agents.drive_network import NUMBERS, SECTORS, DriveNetwork, control, sectors, stack  # noqa: E402
+from agents.drive_policy import load_drive_policy  # noqa: E402
+from slam.settings import from_mapping  # noqa: E402
+from training.drive import DriveRun  # noqa: E402
+from training.drive_config import DriveConfig  # noqa: E402
+from training.drive_lessons import FollowingTeacher, map_lesson  # noqa: E402
+from training.drive_networks import ControlNetwork, PlanNetwork, shortest  # noqa: E402
+from training.policies import export_run  # noqa: E402
+
+assert mecanum_env
+
+SMALL = {
+    "policy": "drive",
+    "world": {"rooms": ["rectangular"], "time_limit_s": 3.0},
+    "lessons": {"guided_episodes": 2, "teacher_shares": [1.0, 0.0], "episodes": 1, "time_limit_s": 4.0},
+    "learning": {"map_steps": 2, "map_steps_a_round": 1, "map_batch": 4, "control_steps": 3, "control_batch": 8},
+    "ppo": {"steps": 32, "environments": 1, "n_steps": 16, "chunk": 1, "batch_size": 8},
+    "evaluation": {"episodes": 1, "every": 2},
+}
+
+
+def arrays(network) -> dict[str, np.ndarray]:
+    return {name: value.numpy() for name, value in network.state_dict().items()}
+
+
+def test_numpy_and_torch_agree():
+    torch.manual_seed(0)
+    plan, steer = PlanNetwork(), ControlNetwork()
+    rng = np.random.default_rng(0)
+    maps = rng.integers(0, 256, (2, 3, 64, 64)).astype(np.uint8)
+    with torch.no_grad():
+        price, goal, steps, far = plan(*torch.from_numpy(maps[:, None]))
+    near = stack(arrays(plan), "local", maps[0])
+    np.testing.assert_allclose(near, torch.cat([price, goal]).numpy(), atol=1e-4)
+    overview = stack(arrays(plan), "overview", maps[1])
+    np.testing.assert_allclose(overview, torch.cat([steps[0], far]).numpy(), atol=1e-4)
+    scan = sectors(rng.uniform(size=360).astype(np.float32))
+    rows = rng.normal(size=(32, 5)).astype(np.float32)
+    rows[:, 4] = np.arange(32) < 9
+    rows *= rows[:, 4:]
+    for landmarks in (rows, 0.0 * rows):
+        rest = rng.normal(size=NUMBERS).astype(np.float32)
+        with torch.no_grad():
+            wanted = steer(*(torch.from_numpy(v)[None] for v in (scan, landmarks, rest)))[0].numpy()
+        np.testing.assert_allclose(control(arrays(steer), scan, landmarks, rest), wanted, atol=1e-4)
+    assert scan.shape == (SECTORS,)
+
+
+def test_the_gradient_reaches_the_prices():
+    torch.manual_seed(1)
+    logs, goal = torch.randn(2, 4, 6, 5, requires_grad=True), torch.rand(2, 6, 5) * 9.0
+    shortest(logs.exp(), goal).sum().backward()
+    assert logs.grad is not None and float(logs.grad.abs().sum()) > 0.0
+
+
+def test_lessons_on_maps_lie_where_the_maps_are():
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms="apartment").unwrapped
+    observation, _ = env.reset(seed=5)
+    guide = agents.make("nearest-frontier")
+    guide.reset(env.belief)
+    for _ in range(30):
+        observation, *_ = env.step(guide.act(observation, env.belief))
+    lesson = map_lesson(guide, env)
+    price = np.exp(lesson["price"] / 70.0)
+    walls = (observation["map_local"][0] > 200) & (observation["map_local"][1] > 0)
+    assert (price[walls] > 20.0).mean() > 0.95
+    goals = np.unpackbits(lesson["goal_local"], axis=-1).astype(bool)
+    # Frontier has what is known on one side of it.
+    assert goals.any() and (observation["map_local"][1][goals] > 0).mean() > 0.5
+    x, y = (observation["pose"][:2] + 1.0) * 32.0
+    nearest = np.unravel_index(lesson["travel"].argmin(), (64, 64))
+    assert abs(nearest[0] - (63 - int(y))) <= 1 and abs(nearest[1] - int(x)) <= 1
+
+
+def test_the_teacher_goes_on_from_what_was_sent():
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms="apartment").unwrapped
+    observation, _ = env.reset(seed=5)
+    path = np.stack([np.linspace(0.0, 1.5, 16), np.zeros(16)], axis=1)
+    teacher = FollowingTeacher(env)
+    still = teacher(path, np.zeros(3), observation, env.belief)
+    moving = teacher(path, np.array([0.5, 0.0, 0.0]), observation, env.belief)
+    assert 0.0 <= still[0] < 0.2 and moving[0] > 0.25
+
+
+class Killed(Exception):
+    pass
+
+
+class InThisProcess:
+    """A pool that takes no time to start."""
+
+    map = staticmethod(map)
+
+
+@contextmanager
+def no_workers(count: int) -> Iterator[InThisProcess]:
+    yield InThisProcess()
+
+
+def run(out: Path, *, kill_at: str = "", **changes) -> None:
+    def log(text: str) -> None:
+        if kill_at and text.startswith(kill_at):
+            raise Killed
+
+    DriveRun(from_mapping(DriveConfig, SMALL | changes), out, workers=1, log=log).train()
+
+
+def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, monkeypatch):
+    monkeypatch.setattr("training.drive.worker_pool", no_workers)
+    monkeypatch.setattr("training.drive_ppo.start_worker", lambda: None)
+    run(tmp_path / "whole")
+    for moment in ("round 1: lessons", "round 1 of 2 done", "chunk 1 of 2"):
+        with pytest.raises(Killed):
+            run(tmp_path / "parts", kill_at=moment)
+    run(tmp_path / "parts")
+    one, other = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("whole", "parts"))
+    for name, weights in one.items():
+        np.testing.assert_array_equal(weights, other[name])
+    lines = [json.loads(line) for line in (tmp_path / "whole" / "curve.jsonl").read_text().splitlines()]
+    assert [line.get("round", line.get("steps")) for line in lines] == [1, 2, 32]
+    with pytest.raises(ValueError, match="another configuration"):
+        run(tmp_path / "parts", seed=2)
+    target = tmp_path / "mine.safetensors"
+    export_run(tmp_path / "whole", target)
+    network, about = load_drive_policy(target)
+    assert isinstance(network, DriveNetwork) and len(about["curve"]) == 3
+    agents.make("ppo", config={"policy": str(target)})
