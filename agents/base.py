@@ -20,7 +20,7 @@ __all__ = ["ENDINGS", "Agent", "Goal"]
 Array = NDArray[np.float64]
 
 ENDINGS = {
-    "covered": "no frontier worth a visit is left",
+    "covered": "nothing is left that it holds worth a visit",
     "unreachable": "frontiers are left, and no way to a place to see them from",
     "stuck": "frontiers are left that could not be driven to, though there seemed to be a way",
     "returned": "all explored, and back at the start",

@@ -5,7 +5,6 @@ It was trained for the youBot and its lidar; another body's twists are fractions
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,11 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
 
 from agents.base import Agent, Goal
 from agents.drive_network import BEAMS, RANGE_M, DriveNetwork, Plan, PlanSettings
+from agents.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.observation import draw_maps
 from slam import geometry
@@ -54,16 +52,7 @@ def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
     ValueError
         For a missing or damaged file, or one of another format; the message names it.
     """
-    about = path.with_suffix(".json")
-    try:
-        described = json.loads(about.read_text(encoding="utf-8"))
-        weights = load_file(path)
-    except FileNotFoundError as error:
-        raise ValueError(f"policy {path}: {error.filename or path} is missing; both files are needed") from error
-    except (OSError, ValueError, SafetensorError) as error:
-        raise ValueError(f"policy {path} cannot be read: {error}") from error
-    if not isinstance(described, dict) or described.get("format") != FORMAT:
-        raise ValueError(f"policy {about}: format is not {FORMAT!r}")
+    weights, described = read_policy(path, FORMAT)
     try:
         settings = PlanSettings(**{key: float(value) for key, value in described["planning"].items()})
         network = DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))

@@ -2,35 +2,35 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load_file
 
 from agents.base import Goal
 from agents.choice import CANDIDATE, STATE
 from agents.choice_network import ChoiceNetwork
 from agents.chooser import Chooser, ChooserConfig
+from agents.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.settings import from_mapping
+from slam.settings import from_mapping, require
 from slam.types import Belief
 
 __all__ = ["PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
 
 _FORMAT = "mecanum-slam choice policy 1"
-_SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PpoFrontierConfig:
     """Which policy."""
 
-    policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
+    policy: str = ""  # path of a .safetensors file, the .json file beside it
+
+    def __post_init__(self) -> None:
+        require(self.policy != "", "PpoFrontierConfig.policy must be the path of a .safetensors file")
 
 
 def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
@@ -43,19 +43,10 @@ def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[s
     ValueError
         For a missing or damaged file, or one of another format; the message names it.
     """
-    about = path.with_suffix(".json")
-    try:
-        described = json.loads(about.read_text(encoding="utf-8"))
-        weights = load_file(path)
-    except FileNotFoundError as error:
-        raise ValueError(f"policy {path}: {error.filename or path} is missing; both files are needed") from error
-    except (OSError, ValueError, SafetensorError) as error:
-        raise ValueError(f"policy {path} cannot be read: {error}") from error
+    weights, described = read_policy(path, _FORMAT)
     columns = [list(CANDIDATE), list(STATE)]
-    if not isinstance(described, dict) or described.get("format") != _FORMAT:
-        raise ValueError(f"policy {about}: format is not {_FORMAT!r}")
     if [described.get("candidate"), described.get("state")] != columns:
-        raise ValueError(f"policy {about} was trained on other columns than this version shows; train it anew")
+        raise ValueError(f"policy {path} was trained on other columns than this version shows; train it anew")
     try:
         network = ChoiceNetwork(weights, heads=int(described["heads"]))
         driver = from_mapping(ChooserConfig, described["driver"])
@@ -82,8 +73,7 @@ class PpoFrontier(Chooser):
         step_s: float = 0.1,
     ) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
-        path = Path(settings.policy) if settings.policy else _SHIPPED
-        self._network, driver, self.about = load_choice_policy(path)
+        self._network, driver, self.about = load_choice_policy(Path(settings.policy))
         super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
 
     def choose(self, belief: Belief) -> Goal | None:

@@ -24,6 +24,7 @@ from mecanum_env.env import ExploreEnv
 from training.campaign import start_worker
 from training.drive_config import DriveConfig, DriveWorldConfig
 from training.drive_networks import ControlNetwork
+from training.networks import PassedOn
 
 __all__ = ["DrivePolicy", "DriveWorld", "make_drive_world", "make_model"]
 
@@ -86,7 +87,7 @@ class DrivePolicy(MultiInputActorCriticPolicy):
     """:class:`ControlNetwork` as the mean of a Gaussian, and another for the value."""
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self.mlp_extractor = _Whole(self.features_dim)  # type: ignore[assignment]
+        self.mlp_extractor = PassedOn(self.features_dim)  # type: ignore[assignment]
         self.action_net, self.value_net = _Flat(3), _Flat(1)  # type: ignore[assignment]
         self.log_std = nn.Parameter(torch.full((3,), self.log_std_init))
         make: Any = self.optimizer_class
@@ -101,23 +102,6 @@ class DrivePolicy(MultiInputActorCriticPolicy):
     def network(self) -> ControlNetwork:
         """The network of the mean."""
         return cast("_Flat", self.action_net).network
-
-
-class _Whole(nn.Module):
-    """No layers between the observation and the two networks."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.latent_dim_pi = self.latent_dim_vf = width
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        return features, features
-
-    def forward_actor(self, features: Tensor) -> Tensor:
-        return features
-
-    def forward_critic(self, features: Tensor) -> Tensor:
-        return features
 
 
 class _Flat(nn.Module):

@@ -13,7 +13,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy"]
+__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "PassedOn"]
 
 _NOWHERE = -1e9
 
@@ -107,20 +107,23 @@ class ChoiceExtractor(BaseFeaturesExtractor):
         return torch.cat([tokens.flatten(1), observation["present"]], dim=1)
 
 
-class _Whole(nn.Module):
-    """No further layers between trunk and heads."""
+class PassedOn(nn.Module):
+    """No further layers between what stable-baselines3 calls features and the heads."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.latent_dim_pi = self.latent_dim_vf = width
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the features for actor and critic."""
         return features, features
 
     def forward_actor(self, features: Tensor) -> Tensor:
+        """Return the features for the actor."""
         return features
 
     def forward_critic(self, features: Tensor) -> Tensor:
+        """Return the features for the critic."""
         return features
 
 
@@ -148,7 +151,7 @@ class ChoicePolicy(MaskableActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         extractor = cast("ChoiceExtractor", self.features_extractor)
         k = int(cast("spaces.Discrete", self.action_space).n)
-        self.mlp_extractor = _Whole(extractor.features_dim)  # type: ignore[assignment]
+        self.mlp_extractor = PassedOn(extractor.features_dim)  # type: ignore[assignment]
         self.action_net = _Head(extractor.network, k, value=False)
         self.value_net = _Head(extractor.network, k, value=True)  # type: ignore[assignment]
         make: Any = self.optimizer_class
