@@ -35,7 +35,7 @@ _SENSOR = SensorModel()
 CANDIDATE = (
     "way", "distance", "ahead", "left", "target_ahead", "target_left", "normal_ahead", "normal_left",
     "area_near", "area_far", "extent", "cells", "clearance", "current", "worth", "rank", "turn", "corners",
-    "walls", "sigma_left", "pieces",
+    "walls", "sigma_left", "pieces", "tour_first", "tour_place", "tour_loss",
 )  # fmt: skip
 """Columns of a candidate's row."""
 
@@ -65,6 +65,15 @@ class ChoiceConfig:
 
 
 @dataclass(frozen=True, eq=False)
+class TourPlan:
+    """The best tour found over n view points, and what it takes to begin with another of them."""
+
+    cells: NDArray[np.int64]  # (n, 2) row, column of the view points
+    order: NDArray[np.int64]  # (k,) those on the tour, in its order
+    losses_m: Array  # (n,) of beginning with each: how much later all is seen, on average
+
+
+@dataclass(frozen=True, eq=False)
 class Choice:
     """A choice, described: m candidates, cheapest first. Pieces of frontier that share a view point are one."""
 
@@ -77,7 +86,7 @@ class Choice:
 
 
 def describe(
-    found: Candidates, belief: Belief, config: ChoiceConfig, *, lidar: LidarConfig, time_s: float
+    found: Candidates, belief: Belief, config: ChoiceConfig, *, lidar: LidarConfig, time_s: float, plan: TourPlan
 ) -> Choice:
     """Return what there is to choose from, described; at least one candidate has a finite cost.
 
@@ -93,6 +102,8 @@ def describe(
         The sensor; it is counted on to see as far as 0.8 of its range.
     time_s
         Since the episode began.
+    plan
+        The tour over the candidates' view points.
     """
     index, pieces, views_found = _apart(found, config.most)
     cost_map, cells, costs = found.cost_map, found.cells[index], found.costs[index]
@@ -121,6 +132,7 @@ def describe(
         _first_turns(found.travel.step, cells, pose[2], _FIRST_LEG_M / cost_map.resolution) / math.pi,
         *(_landmarks_left(belief, cost_map, views, lidar) if config.uncertainty else np.zeros((3, len(index)))),
         pieces / 3.0,
+        *_in_tour(plan, cells),
     ])  # fmt: skip
     patches = np.zeros((len(index), 4, config.patch_cells, config.patch_cells), dtype=np.uint8)
     frame = np.array([*cost_map.origin, cost_map.resolution])
@@ -141,6 +153,23 @@ def describe(
     ])  # fmt: skip
     as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
     return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Return for each view point ``(m, 2)`` whether the tour begins there, when it comes by, and the loss else.
+
+    Those that the tour was not planned over, the farthest, come last and cost most.
+    """
+    m, most = len(cells), float(plan.losses_m.max(initial=0.0))
+    when, losses = np.full(m, len(plan.order) + 1.0), np.full(m, most)
+    place = {(int(row), int(col)): i for i, (row, col) in enumerate(plan.cells)}
+    position = {int(i): k for k, i in enumerate(plan.order)}
+    for c in range(m):
+        i = place.get((int(cells[c, 0]), int(cells[c, 1])))
+        if i is not None:
+            losses[c] = plan.losses_m[i]
+            when[c] = position.get(i, len(plan.order))
+    return (when == 0.0).astype(np.float64), when / 10.0, losses / 5.0
 
 
 def _sigmas(cov: Array) -> tuple[float, float]:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from agents.choice import Choice, ChoiceConfig, describe
-from agents.explorer import Candidates, Explorer, ExplorerConfig
+from agents.choice import Choice, ChoiceConfig, TourPlan, describe
+from agents.explorer import Candidates
+from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping
 from slam.types import Belief
@@ -18,13 +19,13 @@ __all__ = ["Chooser", "ChooserConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChooserConfig(ExplorerConfig):
-    """The parts of the explorer, and how a choice is described."""
+class ChooserConfig(TourConfig):
+    """The parts of the explorer, the tour that is shown with the choice, and how a choice is described."""
 
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
 
-class Chooser(Explorer):
+class Chooser(Tour):
     """Describes each choice that is due, and drives to what was chosen.
 
     :meth:`due` says when a choice is due; :meth:`survey` describes it; :meth:`take` makes it.
@@ -58,7 +59,9 @@ class Chooser(Explorer):
         self._found = super()._candidates(belief)
         if not np.isfinite(self._found.costs).any():
             return None
-        choice = describe(self._found, belief, self.config.choice, lidar=self._lidar, time_s=self._time)
+        choice = describe(
+            self._found, belief, self.config.choice, lidar=self._lidar, time_s=self._time, plan=self._plan()
+        )
         self._last = choice, self._found
         return choice
 
@@ -68,6 +71,12 @@ class Chooser(Explorer):
         if self._last is None:
             raise RuntimeError("there was nothing to choose from yet")
         return self._last
+
+    def _plan(self) -> TourPlan:
+        """Return what the tour over all that is left makes of the choice."""
+        outlook = self._outlook
+        assert outlook is not None and self._found is not None
+        return TourPlan(self._found.cells[outlook.pieces], self._order[1:] - 1, outlook.losses_m(self._order))
 
     def take(self, choice: Choice, k: int) -> None:
         """Choose candidate ``k`` of the survey; the next :meth:`act` sets off for it."""

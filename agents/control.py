@@ -35,6 +35,7 @@ class ControlConfig:
     turn_rate_rad_s: float = 0.8
     turn_gain: float = 2.0  # turn rate per heading error [1/s]
     turn_acceleration_rad_s2: float = 3.0
+    any_side: bool = False  # whichever side leads is quickest; for lidars that see all round
     lag_s: float = 0.2  # a step and the motors' lag: how long a twist is held before braking shows
     look_ahead_s: float = 0.7
     min_look_ahead_m: float = 0.25
@@ -51,7 +52,8 @@ class ControlConfig:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"ControlConfig.{f.name} must be > 0, got {value}")
+            good = f.name == "any_side" or (math.isfinite(value) and value > 0)
+            require(good, f"ControlConfig.{f.name} must be > 0, got {value}")
         require(self.speed_share <= 1, f"ControlConfig.speed_share must be ≤ 1, got {self.speed_share}")
 
 
@@ -99,6 +101,9 @@ class PathFollower:
             # A sensor that sees all round can as well be driven backwards out of a narrow place.
             reversible=self._lidar.field_of_view_deg >= 270.0,
             turn_within_m=self._turn_within_m,
+            any_side=config.any_side and self._lidar.field_of_view_deg >= 360.0,
+            lever_m=robot.lever_m,
+            spare_m=robot.circumscribed_radius_m - self._half_across(),
         )
         self._motors = Motors(
             step_s=self._step_s,
@@ -115,6 +120,11 @@ class PathFollower:
             turn_braking_rad_s2=2.0 * config.turn_acceleration_rad_s2,
             scan_gap_m=config.scan_gap_m,
         )
+
+    def _half_across(self) -> float:
+        """Return what the body takes up to either side of the way [m] where a long side leads, and askew."""
+        askew = self.config.align_rad
+        return float(self._half[0] * math.cos(askew) + self._half[1] * math.sin(askew))
 
     def reset(self) -> None:
         """Stand still, with no path."""

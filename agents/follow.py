@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 
 WINDOW_M = 2.0  # half side of the map that the follower looks at
 _SPACING_M = 0.1  # between the points of a path, about
-_TIGHT_POINTS = 13  # of the path ahead that are searched for a tight passage
+_PIECE_M = 0.2  # of the path ahead that the heading is chosen for …
+_PIECES = 15  # … so many at most
+_TIGHT_POINTS = 13  # of the path ahead that are searched for a tight passage, where it is turned to the path
 
 
 class Pace(NamedTuple):
@@ -46,6 +48,9 @@ class Pace(NamedTuple):
     arrived_rad: float
     half_length_m: float  # of the body
     reversible: bool  # whether it may be driven backwards out of a narrow place
+    any_side: bool  # whether any side of the body may lead
+    lever_m: float
+    spare_m: float  # what the body takes up less, to either side of the way, when a long side leads than turning
     turn_within_m: float  # of the goal: from there on it turns to the goal's heading, even beside a wall
 
 
@@ -274,7 +279,7 @@ def _wanted_heading(
 ) -> tuple[float, float]:
     """Return the heading [rad] to turn to, NaN for none, and the distance [m] to a tight passage, inf for none."""
     wanted, tight_in = np.nan, np.inf
-    for k in range(min(_TIGHT_POINTS, len(spot.room_m))):
+    for k in range(len(spot.room_m) if pace.any_side else min(_TIGHT_POINTS, len(spot.room_m))):
         if spot.room_m[k] >= turning_room + 0.02:
             continue
         middle = arc[spot.nearest + k]
@@ -282,13 +287,51 @@ def _wanted_heading(
         if math.hypot(dx, dy) > 0.05:
             wanted, tight_in = math.atan2(dy, dx), max(0.0, middle - spot.at_m)
             back = abs(wrap_scalar(wanted - heading)) > 0.5 * math.pi
-            if pace.reversible and spot.here_m < turning_room and back:
+            if pace.any_side:
+                sideways = spot.room_m[k:].min() >= turning_room - pace.spare_m
+                wanted = _nearest_axis(heading, wanted, 4 if sideways else 2)
+            elif pace.reversible and spot.here_m < turning_room and back:
                 wanted = wrap_scalar(wanted + math.pi)
         break
     if math.isnan(wanted):
         if spot.remaining_m < 0.4:
             wanted = goal_heading
+        elif pace.any_side:
+            wanted = _soonest_heading(heading, path, arc, spot, pace.lever_m)
         else:
             dx, dy = _step_between(path, arc, spot.at_m + 0.1, spot.at_m + 0.7)
             wanted = math.atan2(dy, dx)
     return goal_heading if spot.remaining_m < pace.turn_within_m else wanted, tight_in
+
+
+@njit(cache=True, nogil=True)
+def _nearest_axis(heading: float, along: float, axes: int) -> float:
+    """Return the heading nearest to the present one in which one of the body's axes lies along a direction."""
+    apart = 2.0 * math.pi / axes
+    off = along - heading
+    return heading + off - apart * math.floor(off / apart + 0.5)
+
+
+@njit(cache=True, nogil=True)
+def _soonest_heading(heading: float, path: Array, arc: Array, spot: _Spot, lever_m: float) -> float:
+    """Return the heading, kept from now on, with which the path ahead takes least time, turning to it included.
+
+    A mecanum wheel's rim moves at |vx| + |vy| + lever |ω| at most, so that time is what the rims cover: along
+    the path Σ ds (|cos φ| + |sin φ|), φ between path and heading, and lever · |turn|. Between kinks this is
+    concave: least at the present heading or where an axis of the body lies along a piece of the path.
+    """
+    pieces = min(max(int((arc[-1] - spot.at_m) / _PIECE_M), 1), _PIECES)
+    along = np.empty(pieces)
+    for k in range(pieces):
+        dx, dy = _step_between(path, arc, spot.at_m + k * _PIECE_M, spot.at_m + (k + 1) * _PIECE_M)
+        along[k] = math.atan2(dy, dx) if math.hypot(dx, dy) > 1e-6 else heading
+    best, least = heading, np.inf
+    for j in range(-1, pieces):
+        wanted = heading if j < 0 else _nearest_axis(heading, along[j], 4)
+        covered = lever_m * abs(wanted - heading)
+        for k in range(pieces):
+            off = along[k] - wanted
+            covered += _PIECE_M * (abs(math.cos(off)) + abs(math.sin(off)))
+        if covered < least - 1e-9:
+            best, least = wanted, covered
+    return best

@@ -104,12 +104,16 @@ class PlainFollower(PathFollower):
     def _wanted_heading(
         self, pose: Array, near: LocalMap, at: float, room: Array, turning_room: float
     ) -> tuple[float | None, float | None]:
-        tight = np.flatnonzero(room[:13] < turning_room + 0.02)
+        tight = np.flatnonzero(room[: None if self._any_side() else 13] < turning_room + 0.02)
         if len(tight) and self._arc[-1] > 0.0:
             middle = float(self._arc[self._index + int(tight[0])])
             along = self._point(middle + 0.3) - self._point(max(middle - 0.2, 0.0))
             if np.hypot(*along) > 0.05:
                 wanted = math.atan2(along[1], along[0])
+                if self._any_side():
+                    spare = self._robot.circumscribed_radius_m - self._half_across()
+                    sideways = room[tight[0] :].min() >= turning_room - spare
+                    return nearest_axis(pose[2], wanted, 4 if sideways else 2), max(0.0, middle - at)
                 enclosed = float(near.at(pose[None, :2])[0]) < turning_room
                 back = abs(geometry.wrap_scalar(wanted - pose[2])) > 0.5 * math.pi
                 if self._lidar.field_of_view_deg >= 270.0 and enclosed and back:
@@ -117,8 +121,24 @@ class PlainFollower(PathFollower):
                 return wanted, max(0.0, middle - at)
         if self.remaining_m < 0.4:
             return self._heading, None
+        if self._any_side():
+            return self._soonest_heading(float(pose[2]), at), None
         along = self._point(at + 0.7) - self._point(at + 0.1)
         return math.atan2(along[1], along[0]), None
+
+    def _any_side(self) -> bool:
+        return self.config.any_side and self._lidar.field_of_view_deg >= 360.0
+
+    def _soonest_heading(self, heading: float, at: float) -> float:
+        pieces = int(np.clip(int((self._arc[-1] - at) / 0.2), 1, 15))
+        steps = [self._point(at + 0.2 * (k + 1)) - self._point(at + 0.2 * k) for k in range(pieces)]
+        along = np.array([math.atan2(s[1], s[0]) if np.hypot(*s) > 1e-6 else heading for s in steps])
+        best, least = heading, math.inf
+        for wanted in [heading, *(nearest_axis(heading, a, 4) for a in along)]:
+            covered = rims_cover(along, wanted, 0.2) + self._robot.lever_m * abs(wanted - heading)
+            if covered < least - 1e-9:
+                best, least = wanted, covered
+        return best
 
     def _send(self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, seen: Array) -> Array:
         config = self.config
@@ -159,6 +179,17 @@ class PlainFollower(PathFollower):
         clear_of_map = map_ahead >= min(gap, map_now - 0.002)
         clear_of_scan = scan_ahead >= min(self.config.scan_gap_m, scan_now - 0.002)
         return bool(clear_of_map and clear_of_scan)
+
+
+def nearest_axis(heading: float, along: float, axes: int) -> float:
+    """Return the nearest heading in which one of so many axes of the body lies along a direction."""
+    choices = along + 2.0 * math.pi / axes * np.arange(-2 * axes, 2 * axes)
+    return float(choices[np.argmin(np.abs(choices - heading))])
+
+
+def rims_cover(along: Array, heading: float, piece_m: float) -> float:
+    """Return the way [m] of the busiest wheel's rim along pieces of a path, at one heading."""
+    return piece_m * float((np.abs(np.cos(along - heading)) + np.abs(np.sin(along - heading))).sum())
 
 
 def hits(observation: Mapping[str, Any] | None, lidar: LidarConfig, within_m: float = 2.0) -> Array:

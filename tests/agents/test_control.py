@@ -20,10 +20,10 @@ def follower(config: ControlConfig | None = None, lidar: LidarConfig = LIDAR) ->
     return PathFollower(config or ControlConfig(), robot=ROBOT, lidar=lidar, step_s=0.1)
 
 
-def follow(classes, pose, path, *, heading=None, steps=300, observation=None, sigma=0.01):
+def follow(classes, pose, path, *, heading=None, steps=300, observation=None, sigma=0.01, config=None):
     """Drive a kinematic robot along a path; return its poses and the twists."""
     pose = np.array(pose, dtype=np.float64)
-    control = follower()
+    control = follower(config)
     control.set_path(resample(np.array(path, dtype=np.float64), 0.1), heading)
     limits = np.array([0.8, 0.8, 1.5])
     poses, twists = [pose], []
@@ -63,10 +63,12 @@ def test_ends_with_the_heading_asked_for():
     assert abs(geometry.wrap(poses[-1, 2] - 2.5)) <= 0.2
 
 
-@pytest.mark.parametrize(("door_m", "start"), [(0.9, 0.0), (0.7, 1.4), (0.7, -2.5)])
-def test_passes_a_door_without_touching(door_m, start):
-    classes = two_rooms(door_m)
-    poses, _, control = follow(classes, (1.2, 2.0, start), [(1.2, 2.0), (6.0, 2.0)], steps=500)
+@pytest.mark.parametrize("any_side", [False, True])
+@pytest.mark.parametrize(("door_m", "start"), [(0.9, 0.0), (0.9, 1.5), (0.7, 1.4), (0.7, -2.5)])
+def test_passes_a_door_without_touching(door_m, start, any_side):
+    classes, config = two_rooms(door_m), ControlConfig(any_side=any_side)
+    way = [(1.2, 2.0), (6.0, 2.0)]
+    poses, _, control = follow(classes, (1.2, 2.0, start), way, steps=500, config=config)
     assert control.arrived
     assert min(body_gap(classes, p, ROBOT) for p in poses) > 0.02
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import agents.explore_and_return as homing
+from agents import follow
 from agents.control import ControlConfig, PathFollower
 from agents.planning import resample
 from agents.safety import local_map
 from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
 from slam.occupancy import OCCUPIED, UNKNOWN
-from tests.agents.follow_oracle import PlainFollower
+from tests.agents.follow_oracle import PlainFollower, rims_cover
 from tests.agents.grids import belief_of, drive, fill, room, two_rooms
 
 ROBOT, LIDAR = RobotConfig(), LidarConfig()
@@ -61,9 +62,8 @@ def test_every_step_is_that_of_the_plain_one(seed):
     rng = np.random.default_rng(seed)
     kinds = [(PathFollower, PlainFollower), (homing._HomeFollower, _PlainHomeFollower)]
     lidar = LIDAR if rng.random() < 0.8 else LIDAR_PRESETS["cavity"]
-    follower, plain = (
-        kind(ControlConfig(), robot=ROBOT, lidar=lidar, step_s=0.1) for kind in kinds[rng.integers(2)]
-    )
+    config = ControlConfig(any_side=bool(rng.random() < 0.5))
+    follower, plain = (kind(config, robot=ROBOT, lidar=lidar, step_s=0.1) for kind in kinds[rng.integers(2)])
     classes, pose = cluttered(rng), np.append(rng.uniform((0.4, 0.4), (7.0, 3.6)), rng.uniform(-3.1, 3.1))
     path, heading = path_from(rng, pose[:2]), rng.uniform(-3.0, 3.0) if rng.random() < 0.5 else None
     for each in (follower, plain):
@@ -75,6 +75,36 @@ def test_every_step_is_that_of_the_plain_one(seed):
         np.testing.assert_allclose(twist, plain.follow(seen, belief), rtol=0, atol=1e-9)
         assert_alike(follower, plain)
         pose = drive(pose, twist / np.array([0.8, 0.8, 1.5]), ROBOT)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_other_heading_kept_gets_to_the_paths_end_sooner(seed):
+    rng = np.random.default_rng(seed)
+    path = path_from(rng, rng.uniform((0.5, 0.5), (7.5, 3.5)))
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    heading, spot = rng.uniform(-3.0, 3.0), follow._Spot(0, 0.0, arc[-1], 1.0, np.ones(1))
+    pieces = min(max(int(arc[-1] / 0.2), 1), 15)
+    along = np.array(
+        [math.atan2(*follow._step_between(path, arc, 0.2 * k, 0.2 * k + 0.2)[::-1]) for k in range(pieces)]
+    )
+
+    def cost(wanted):
+        return rims_cover(along, wanted, 0.2) + ROBOT.lever_m * abs(wanted - heading)
+
+    chosen = follow._soonest_heading(heading, path, arc, spot, ROBOT.lever_m)
+    if arc[-1] > 0.2:
+        assert cost(chosen) <= min(map(cost, heading + np.linspace(-math.pi, math.pi, 2001))) + 1e-9
+
+
+def test_whichever_side_leads_it_keeps_its_heading_where_turning_does_not_pay():
+    straight = ControlConfig(any_side=True)
+    for direction in (0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi):
+        follower = PathFollower(straight, robot=ROBOT, lidar=LIDAR, step_s=0.1)
+        end = np.array([4.0, 4.0]) + 2.0 * np.array([math.cos(direction), math.sin(direction)])
+        follower.set_path(resample(np.vstack([(4.0, 4.0), end]), 0.1), None)
+        twist = follower.follow(None, belief_of(room(8.0, 8.0), (4.0, 4.0, 0.0)))
+        assert twist[2] == pytest.approx(0.0, abs=1e-9)
+        assert math.hypot(*twist[:2]) == pytest.approx(0.12)
 
 
 @pytest.mark.parametrize("seed", range(10))
