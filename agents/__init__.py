@@ -25,6 +25,7 @@ _REGISTRY = {
     "nearest-frontier": "agents.frontier:NearestFrontier",
     "next-best-view": "agents.next_best_view:NextBestView",
     "ppo": "agents.drive_policy:Ppo",
+    "ppo-frontier": "agents.policy:PpoFrontier",
     "random": "agents.random:RandomAgent",
     "rrt": "agents.rrt:Rrt",
     "tour": "agents.tour:Tour",

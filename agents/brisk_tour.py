@@ -13,8 +13,9 @@ from slam.settings import from_mapping
 
 __all__ = ["BRISK", "BriskTour", "BriskTourConfig"]
 
-BRISK = ControlConfig(near_wall_m_s=0.76, lateral_m_s2=2.0, acceleration_m_s2=2.0)
-"""No slower beside walls than elsewhere, and quick in turns: the check of the braking distance is what is left."""
+BRISK = ControlConfig(any_side=True, speed_share=1.0, near_wall_m_s=0.8, lateral_m_s2=2.0, acceleration_m_s2=2.0)
+"""Whichever side leads, no slower beside walls than elsewhere, quick in turns: what is left is the check of the
+braking distance."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from slam.occupancy import FREE, OCCUPIED
 from slam.settings import require
 from slam.types import Belief
 
-__all__ = ["CANDIDATE", "STATE", "Choice", "ChoiceConfig", "describe"]
+__all__ = ["CANDIDATE", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -38,6 +38,9 @@ CANDIDATE = (
     "walls", "sigma_left", "pieces", "tour_first", "tour_place", "tour_loss",
 )  # fmt: skip
 """Columns of a candidate's row."""
+
+TOUR_LOSS_M = 5.0
+"""One unit of the column ``tour_loss`` [weighted m]."""
 
 STATE = ("time", "known_m2", "candidates", "sigma_m", "sigma_rad", "share_visited", "area_m2", "nearest")
 """What there is to say about the choice as a whole."""
@@ -169,7 +172,7 @@ def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Ar
         if i is not None:
             losses[c] = plan.losses_m[i]
             when[c] = position.get(i, len(plan.order))
-    return (when == 0.0).astype(np.float64), when / 10.0, losses / 5.0
+    return (when == 0.0).astype(np.float64), when / 10.0, losses / TOUR_LOSS_M
 
 
 def _sigmas(cov: Array) -> tuple[float, float]:

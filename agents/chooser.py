@@ -12,7 +12,7 @@ from agents.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.explorer import Candidates
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.settings import from_mapping
+from slam.settings import from_mapping, require
 from slam.types import Belief
 
 __all__ = ["Chooser", "ChooserConfig"]
@@ -23,6 +23,10 @@ class ChooserConfig(TourConfig):
     """The parts of the explorer, the tour that is shown with the choice, and how a choice is described."""
 
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.stations.spacing_m == 0, "ChooserConfig.stations.spacing_m must be 0: it drives anywhere")
 
 
 class Chooser(Tour):

@@ -15,22 +15,20 @@ from agents.choice_network import ChoiceNetwork
 from agents.chooser import Chooser, ChooserConfig
 from agents.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.settings import from_mapping, require
+from slam.settings import from_mapping
 from slam.types import Belief
 
 __all__ = ["PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
 
 _FORMAT = "mecanum-slam choice policy 1"
+SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
 class PpoFrontierConfig:
     """Which policy."""
 
-    policy: str = ""  # path of a .safetensors file, the .json file beside it
-
-    def __post_init__(self) -> None:
-        require(self.policy != "", "PpoFrontierConfig.policy must be the path of a .safetensors file")
+    policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
 
 
 def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
@@ -73,7 +71,7 @@ class PpoFrontier(Chooser):
         step_s: float = 0.1,
     ) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
-        self._network, driver, self.about = load_choice_policy(Path(settings.policy))
+        self._network, driver, self.about = load_choice_policy(Path(settings.policy or SHIPPED))
         super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
 
     def choose(self, belief: Belief) -> Goal | None:

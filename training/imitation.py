@@ -1,9 +1,10 @@
 """The warm start: to choose as a teacher does, learned from what each candidate would have cost.
 
-The teacher is ``hindsight``, which prices every candidate by the truth (``training/hindsight.py``), or a
-heuristic, whose choice costs nothing and every other one alike. In the first round a heuristic drives; in later
-ones what was learned from the rounds before, so that it learns from the states that it gets into (DAgger: Ross,
-Gordon and Bagnell, AISTATS 2011; with costs of all actions, AggreVaTe: Ross and Bagnell, 2014).
+The teacher is ``hindsight``, which prices every candidate by the truth (``training/hindsight.py``), or ``tour``,
+which prices them by how much later all would be seen by the best tour that begins there, or another heuristic,
+whose choice costs nothing and every other one alike. In the first round a heuristic drives; in later ones what was
+learned from the rounds before, so that it learns from the states that it gets into (DAgger: Ross, Gordon and
+Bagnell, AISTATS 2011; with costs of all actions, AggreVaTe: Ross and Bagnell, 2014).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from agents import choice_network
-from agents.choice import CANDIDATE
+from agents.choice import CANDIDATE, TOUR_LOSS_M
 from slam.formats import replacing
 from training.choice_world import Families, Teacher, make_world
 from training.networks import ChoiceNetwork
@@ -101,7 +102,7 @@ def _episode(job: tuple[TrainConfig, int, Weights | None]) -> Lessons:
         asked = network is None or imitation.teacher != "hindsight"
         wanted = int(heuristic()) if asked else -1
         seen.append(observation)
-        prices.append(_prices(world, wanted, hindsight=imitation.teacher == "hindsight"))
+        prices.append(_prices(world, observation, wanted, imitation.teacher))
         action = wanted if network is None else int(np.argmax(network.scores(world.env.agent.described[0])))
         if rng.random() < imitation.astray:
             action = int(rng.integers(observation["present"].sum()))
@@ -117,12 +118,16 @@ def _episode(job: tuple[TrainConfig, int, Weights | None]) -> Lessons:
     return Lessons({key: np.stack([o[key] for o in seen]) for key in seen[0]}, np.array(prices), returns)
 
 
-def _prices(world: Families, wanted: int, *, hindsight: bool) -> NDArray[np.float32]:
+def _prices(
+    world: Families, observation: dict[str, NDArray[Any]], wanted: int, teacher: str
+) -> NDArray[np.float32]:
     """Return each action's price ``(K,)``, inf where it stands for no candidate."""
     masks = world.action_masks()
     prices = np.full(len(masks), np.inf, dtype=np.float32)
-    if hindsight:
+    if teacher == "hindsight":
         prices[masks] = world.prices()
+    elif teacher == "tour":
+        prices[masks] = TOUR_LOSS_M * observation["candidates"][masks, CANDIDATE.index("tour_loss")]
     else:
         prices[masks] = _METRES
         prices[wanted] = 0.0
@@ -144,7 +149,7 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
     for epoch in range(imitation.epochs):
         losses = []
         for rows in np.array_split(rng.permutation(train), batches):
-            loss, _ = _loss(network, lessons, rows, mirror=rng.random(len(rows)) < 0.5)
+            loss, _ = _loss(network, lessons, rows, imitation.temperature_m, mirror=rng.random(len(rows)) < 0.5)
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -153,7 +158,10 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
             losses.append(float(loss.detach()))
         with torch.no_grad():
             tests = np.array_split(np.flatnonzero(kept), max(n // 2560, 1))
-            parts = [_loss(network, lessons, r, mirror=np.zeros(len(r), np.bool_)) for r in tests]
+            parts = [
+                _loss(network, lessons, r, imitation.temperature_m, mirror=np.zeros(len(r), np.bool_))
+                for r in tests
+            ]
         yield {
             "epoch": epoch + 1,
             "loss": float(np.mean(losses)),
@@ -163,7 +171,12 @@ def learn(network: ChoiceNetwork, lessons: Lessons, config: TrainConfig) -> Iter
 
 
 def _loss(
-    network: ChoiceNetwork, lessons: Lessons, rows: NDArray[np.int64], *, mirror: NDArray[np.bool_]
+    network: ChoiceNetwork,
+    lessons: Lessons,
+    rows: NDArray[np.int64],
+    temperature_m: float,
+    *,
+    mirror: NDArray[np.bool_],
 ) -> tuple[torch.Tensor, float]:
     """Return the loss, and what the choice with the highest score costs above the cheapest."""
     shown = {key: torch.as_tensor(value[rows]) for key, value in lessons.observations.items()}
@@ -173,8 +186,10 @@ def _loss(
     above = torch.where(present, prices - prices.amin(dim=1, keepdim=True), 0.0)
     tokens = network.tokens(observation)
     scores = network.scores(tokens).masked_fill(~present, -1e9)
-    # What choosing by these scores costs on average: least where it is the choice of the lowest mean price.
-    choice = (scores.softmax(dim=1) * above).sum(dim=1).mean() / _METRES
+    # What choosing by these scores costs on average: least where it is the choice of the lowest mean price. With
+    # a temperature, less the choice's entropy: least at chances of exp(−price / temperature).
+    chances, log_chances = scores.softmax(dim=1), scores.log_softmax(dim=1)
+    choice = (chances * (above + temperature_m * log_chances)).sum(dim=1).mean() / _METRES
     returns = torch.as_tensor(lessons.returns[rows])
     worth = nn.functional.mse_loss(network.value(tokens, observation["present"])[:, 0], returns)
     best = scores.argmax(dim=1, keepdim=True)

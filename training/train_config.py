@@ -53,6 +53,7 @@ class ImitationConfig:
     epochs: int = 8
     batch: int = 256
     rate: float = 1e-3
+    temperature_m: float = 0.0  # choices that cost so much more are left to chance: what PPO explores from
     astray: float = 0.1  # share of the choices that are made at random, so that more than its own ways are seen
 
     def __post_init__(self) -> None:
@@ -60,6 +61,9 @@ class ImitationConfig:
             raise unknown_name("[imitation] teacher", self.teacher, TEACHERS)
         require(self.episodes >= 0, "[imitation] needs episodes ≥ 0")
         require(self.rounds >= 1 and self.epochs >= 1, "[imitation] needs rounds ≥ 1 and epochs ≥ 1")
+        require(
+            math.isfinite(self.temperature_m) and self.temperature_m >= 0, "[imitation] temperature_m must be ≥ 0"
+        )
         require(0 <= self.astray < 1, "[imitation] astray must be in [0, 1)")
 
 

@@ -11,6 +11,7 @@ import agents
 import mecanum_env  # noqa: F401 - registers
 from agents.choice import CANDIDATE, STATE
 from agents.frontier_env import ExploreFrontierEnv
+from training.choice_world import Teacher
 
 ID = "mecanum_env:mecanum_env/ExploreFrontier-v0"
 TIME_ALONE = {"area": 0.0, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": 0.0, "effort": 0.0, "time": -1.0}
@@ -83,6 +84,22 @@ def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
             assert current.sum() == 1.0
         env.step(len(cells) // 2)
     assert shared > 0
+
+
+def test_the_tour_that_is_shown_is_that_of_the_agent_tour():
+    env = gymnasium.make(ID, rooms="apartment").unwrapped
+    observation, _ = env.reset(seed=0)
+    teacher = Teacher("tour", env)
+    teacher.begin()
+    first, place, loss = (CANDIDATE.index(f"tour_{name}") for name in ("first", "place", "loss"))
+    for _ in range(12):
+        rows = observation["candidates"][observation["present"] > 0.5]
+        assert rows[:, first].sum() == 1.0 and (rows[:, place] >= 0.0).all()
+        np.testing.assert_array_equal(rows[:, first] == 1.0, rows[:, place] == 0.0)
+        assert rows[np.argmax(rows[:, first]), loss] == 0.0
+        action = int(teacher())
+        assert rows[action, first] == 1.0
+        observation, *_ = env.step(action)
 
 
 def test_without_uncertainty_nothing_is_shown_of_it_and_all_else_is_the_same():

@@ -13,7 +13,7 @@ import agents
 from agents import cost_map as cost_maps
 from agents.cost_map import PlannerConfig
 from agents.planning import travel_costs
-from agents.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost
+from agents.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost, tours_begun_with
 from agents.stations import count_in_sight, in_sight, join, line_is_free, ways
 from agents.tour import Outlook, TourConfig
 from agents.travel import between
@@ -96,6 +96,33 @@ def test_the_delay_of_a_tour_that_begins_somewhere_against_all_that_do(seed, n):
         assert best - 1e-9 <= delay <= 1.15 * best + 1e-9
     order, cost = outlook.tour(2)
     assert outlook.delay_m(int(order[1]), 2) * (1.0 + weight.sum()) == pytest.approx(cost, rel=0.15)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds, n=st.integers(2, 6))
+def test_what_a_tour_loses_by_beginning_somewhere_else_against_all_that_do(seed, n):
+    rng = np.random.default_rng(seed)
+    distance, weight = places(seed, n), rng.uniform(0.0, 1.0, n)
+    sight = np.eye(n, dtype=bool)  # each alone sees a piece: all are on every tour
+    sight[0] = False
+    outlook = Outlook(np.arange(n - 1), sight, distance, weight)
+    order, _ = outlook.tour(2)
+    costs = tours_begun_with(sight, distance, weight, order)
+    for place in range(1, n):
+        others = [i for i in range(1, n) if i != place]
+        best = min(order_cost(distance, weight, np.array((0, place, *rest))) for rest in permutations(others))
+        assert best - 1e-9 <= costs[place] <= 1.15 * best + 1e-9
+    losses = outlook.losses_m(order)
+    assert losses[order[1] - 1] == 0.0
+    np.testing.assert_allclose(losses * (1.0 + weight.sum()), costs[1:] - costs[order[1]], atol=1e-9)
+
+
+def test_a_place_that_is_put_first_makes_those_idle_that_see_no_more_than_it():
+    sight = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=bool)
+    distance = 3.0 * (1.0 - np.eye(4))
+    order = np.array([0, 1, 2])
+    # By 1 or 2 first the other is left to see; from 3 there is nothing left.
+    assert tours_begun_with(sight, distance, np.zeros(4), order).tolist() == [0.0, 6.0, 6.0, 3.0]
 
 
 def test_a_tour_can_be_made_to_begin_with_a_place_that_it_does_not_need():
