@@ -23,7 +23,7 @@ __all__ = ["Families", "Teacher", "make_world"]
 
 
 class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Draws a family of rooms and one of its training seeds for each episode.
+    """Draws a family of rooms and one of its training seeds, for as many episodes as ``world.repeats`` says.
 
     A seed given to ``reset`` is where the drawing starts; ``options={"rooms": name, "room_seed": n}`` sets both.
     """
@@ -36,6 +36,7 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._world = world
         self._rng = np.random.default_rng(0)
+        self._room, self._episodes = ("", -1), 0  # the room drawn last, and how many episodes there were in it
         self._places: dict[tuple[str, int], TruePlaces] = {}
 
     def reset(
@@ -43,10 +44,14 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in rooms of the next draw."""
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
-        low, high = self._world.seeds
-        name = str(self._rng.choice(list(self._world.rooms)))
-        room_seed = int(self._rng.integers(low, high + 1))
+            self._rng, self._episodes = np.random.default_rng(seed), 0
+        if self._episodes % self._world.repeats == 0:
+            low, high = self._world.seeds
+            name = str(self._rng.choice(list(self._world.rooms)))
+            room_seed = int(self._rng.integers(low, high + 1))
+        else:
+            name, room_seed = self._room
+        self._episodes += 1
         episode_seed = int(self._rng.integers(2**31))
         if options:
             name, room_seed = options["rooms"], options["room_seed"]
@@ -80,6 +85,7 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
             return self._priced[1]
         if self._hindsight is None:
             if self._room not in self._places:
+                self._places.clear()  # rooms drawn before hardly ever come again
                 self._places[self._room] = TruePlaces(
                     env.base.truth.ground, env.driver.planner, robot=env.config.robot, lidar=env.config.lidar
                 )

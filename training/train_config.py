@@ -23,6 +23,7 @@ class WorldConfig:
     rooms: tuple[str, ...] = ("apartment",)
     noises: tuple[str, ...] = ("nominal",)
     seeds: tuple[int, int] = (0, 999)  # of the rooms, both included
+    repeats: int = 1  # episodes, of other noise, in a room before the next is drawn: rooms take time to price
     slam: str = "invariant-ekf"
     time_limit_s: float = 300.0
     time_1_s: float = -1.0 / 30.0  # reward per second
@@ -39,6 +40,7 @@ class WorldConfig:
         for name in self.noises:
             if name not in NOISE_PRESETS:
                 raise unknown_name("noise preset", name, NOISE_PRESETS)
+        require(self.repeats >= 1, f"[world] repeats must be at least 1, got {self.repeats}")
         low, high = self.seeds
         require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
 

@@ -87,11 +87,8 @@ class TruePlaces:
         corner = np.array(ground.lattice_origin[::-1]) * ground.resolution
         eyes = (self.map.to_points(self.cells) - corner) / ground.resolution
         reach = _NEARER * lidar.range_max_m / ground.resolution
-        sight = np.zeros((len(eyes), whole.size), dtype=np.bool_)
-        for i, eye in enumerate(eyes):
-            part = cells_per_tile(_in_view(ground.mappable, eye, reach))
-            sight[i] = ((part > _MOST * whole) & (whole >= TILE)).ravel()
-        return sight
+        part = _tiles_in_view(ground.mappable, eyes, reach)
+        return (part > _MOST * whole.ravel()) & (whole.ravel() >= TILE)
 
 
 def _true_cost_map(ground: GroundTruth, planner: PlannerConfig, robot: RobotConfig) -> CostMap:
@@ -118,17 +115,23 @@ def cells_per_tile(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 @njit(cache=True, nogil=True)
-def _in_view(free: NDArray[np.bool_], eye: Array, reach: float) -> NDArray[np.bool_]:
-    """Return the free cells that rays from an eye ``(2,)`` (x, y in cells) cross."""
-    view = np.zeros(free.shape, dtype=np.bool_)
-    for k in range(_RAYS):
-        angle = 2.0 * math.pi * k / _RAYS
-        dx, dy = math.cos(angle), math.sin(angle)
-        away = 0.0
-        while away < reach:
-            row, col = math.floor(eye[1] + away * dy), math.floor(eye[0] + away * dx)
-            if not (0 <= row < free.shape[0] and 0 <= col < free.shape[1]) or not free[row, col]:
-                break
-            view[row, col] = True
-            away += 0.7
-    return view
+def _tiles_in_view(free: NDArray[np.bool_], eyes: Array, reach: float) -> NDArray[np.int64]:
+    """Return how many free cells of each tile ``(eyes, tiles)`` rays from each eye (x, y in cells) cross."""
+    rows, cols = free.shape
+    across = -(-cols // TILE)
+    seen = np.zeros((len(eyes), -(-rows // TILE) * across), dtype=np.int64)
+    last = np.full(free.shape, -1, dtype=np.int32)  # the eye that saw each cell last
+    for i in range(len(eyes)):
+        for k in range(_RAYS):
+            angle = 2.0 * math.pi * k / _RAYS
+            dx, dy = math.cos(angle), math.sin(angle)
+            away = 0.0
+            while away < reach:
+                row, col = math.floor(eyes[i, 1] + away * dy), math.floor(eyes[i, 0] + away * dx)
+                if not (0 <= row < rows and 0 <= col < cols) or not free[row, col]:
+                    break
+                if last[row, col] != i:
+                    last[row, col] = i
+                    seen[i, (row // TILE) * across + col // TILE] += 1
+                away += 0.7
+    return seen
