@@ -14,8 +14,11 @@ from agents import choice_network  # noqa: E402
 from agents.choice import CANDIDATE, STATE, Choice  # noqa: E402
 from agents.chooser import ChooserConfig  # noqa: E402
 from agents.frontier_env import as_observation, choice_space  # noqa: E402
+from training.choice_world import make_world  # noqa: E402
+from training.imitation import Lessons, learn  # noqa: E402
 from training.networks import ChoiceNetwork  # noqa: E402
 from training.semi_markov import SemiMarkovBuffer  # noqa: E402
+from training.train_config import ImitationConfig, TrainConfig, WorldConfig  # noqa: E402
 
 CONFIG = ChooserConfig()
 
@@ -107,3 +110,40 @@ def test_advantages_against_the_sums_they_stand_for():
                     if last:
                         break
                 assert buffer.advantages[t, e] == pytest.approx(total, abs=1e-4)
+
+
+def test_what_costs_hardly_more_is_left_to_chance():
+    """With a temperature T the warm start ends at chances of exp(−price / T)."""
+    rng, n, k, t = np.random.default_rng(0), 2000, 4, 0.5
+    losses = rng.choice([0.0, 0.3, 0.8], (n, k)).astype(np.float32)
+    rows = np.zeros((n, k, len(CANDIDATE)), np.float32)
+    rows[..., CANDIDATE.index("tour_loss")] = losses
+    observations = {
+        "candidates": rows, "distances": np.zeros((n, k, k), np.float32),
+        "patches": np.zeros((n, k, 4, 2, 2), np.uint8), "present": np.ones((n, k), np.float32),
+        "state": np.zeros((n, len(STATE)), np.float32),
+    }  # fmt: skip
+    torch.manual_seed(0)
+    network = ChoiceNetwork(len(CANDIDATE), 16, len(STATE), width=16, heads=2, layers=1)
+    imitation = ImitationConfig(temperature_m=t, epochs=12, batch=100, rate=3e-3)
+    lessons = Lessons(observations, losses, np.zeros(n, np.float32))
+    *_, last = learn(network, lessons, TrainConfig(imitation=imitation))
+    assert last["regret_m"] < 0.01
+    with torch.no_grad():
+        shown = {key: torch.as_tensor(value[:200]) for key, value in observations.items()}
+        chances = network.scores(network.tokens(shown)).softmax(dim=1).numpy()
+    wanted = np.exp(-losses[:200] / t)
+    np.testing.assert_allclose(chances, wanted / wanted.sum(axis=1, keepdims=True), atol=0.05)
+
+
+def test_a_room_serves_as_many_episodes_as_it_is_told_to():
+    world = make_world(WorldConfig(rooms=("rectangular",), repeats=2))
+    starts = [world.reset(seed=3 if k == 0 else None)[0]["candidates"] for k in range(4)]
+    rooms = []
+    for k in range(3):
+        world.reset(seed=3 if k == 0 else None)
+        rooms.append(world._room)
+    assert rooms[0] == rooms[1] != rooms[2]
+    # The same room, but not the same noise; and from the same seed all of it again.
+    assert not np.array_equal(starts[0], starts[1])
+    np.testing.assert_array_equal(world.reset(seed=3)[0]["candidates"], starts[0])
