@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ class PpoFrontierConfig:
     """Which policy."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
+    driver: Mapping[str, Any] = field(default_factory=dict)  # laid over the ChooserConfig that it was trained with
 
 
 def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
@@ -72,6 +73,7 @@ class PpoFrontier(Chooser):
     ) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
         self._network, driver, self.about = load_choice_policy(Path(settings.policy or SHIPPED))
+        driver = from_mapping(ChooserConfig, settings.driver, base=driver)
         super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
 
     def choose(self, belief: Belief) -> Goal | None:
