@@ -79,7 +79,7 @@ monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the test seeds
 	$(BIN)/python -m training.evaluate --workers $(WORKERS) --out out/evaluate
 
-benchmark: $(VENV)/core.stamp ## BENCHMARK.md: every agent on every suite (hours; goes on where it was broken off)
+benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (hours; goes on where it was broken off)
 	$(BIN)/mecanum benchmark --suite all --agents $(AGENTS) --workers $(WORKERS) --out out/benchmark --report
 	$(BIN)/python -m training.leaderboard out/benchmark BENCHMARK.md
 

@@ -18,7 +18,7 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping
 from slam.types import Belief
 
-__all__ = ["PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
+__all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
 
 _FORMAT = "mecanum-slam choice policy 1"
 SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"

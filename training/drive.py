@@ -25,7 +25,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 from agents.drive_network import PlanSettings
 from slam.formats import atomic_write
-from slam.settings import to_mapping
 from training.campaign import worker_pool
 from training.drive_config import DriveConfig
 from training.drive_learning import learn_control, learn_maps
@@ -33,6 +32,7 @@ from training.drive_networks import ControlNetwork, PlanNetwork
 from training.drive_ppo import DrivePolicy, make_drive_world, make_model
 from training.drive_rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
 from training.ppo import Log
+from training.running import progress_of_run
 
 __all__ = ["DriveRun", "summary"]
 
@@ -55,15 +55,9 @@ class DriveRun:
 
     def __init__(self, config: DriveConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
-        settings = json.loads(json.dumps(to_mapping(config)))
-        self._progress: dict[str, Any] = {
-            "command": command, "config": settings, "round": 0, "chunk": 0, "steps": 0, "best": None,
-            "wall_s": 0.0,
-        }  # fmt: skip
-        if (out / "progress.json").exists():
-            self._progress = json.loads((out / "progress.json").read_text(encoding="utf-8"))
-            if self._progress["config"] != settings:
-                raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+        self._progress = progress_of_run(
+            out, config, command=command, round=0, chunk=0, steps=0, best=None, wall_s=0.0
+        )
         self._plan, self._control = PlanNetwork(), ControlNetwork()
 
     def train(self) -> None:

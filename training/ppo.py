@@ -26,11 +26,11 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
 from agents.choice_network import ChoiceNetwork
 from slam.formats import atomic_write
-from slam.settings import to_mapping
 from training.campaign import one_thread_each, start_worker, worker_pool
 from training.choice_world import Families, make_world
 from training.imitation import Lessons, give_lessons, learn
 from training.networks import ChoicePolicy
+from training.running import progress_of_run
 from training.semi_markov import Durations, SemiMarkovBuffer
 from training.train_config import TrainConfig, WorldConfig
 
@@ -57,20 +57,15 @@ class Run:
 
     def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
-        settings = json.loads(json.dumps(to_mapping(config)))
-        self._progress: dict[str, Any] = {
-            "command": command, "config": settings, "chunk": 0, "steps": 0, "best_s": None, "wall_s": 0.0,
-        }  # fmt: skip
-        if (out / "progress.json").exists():
-            self._progress = json.loads((out / "progress.json").read_text(encoding="utf-8"))
-            if self._progress["config"] != settings:
-                raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+        self._progress = progress_of_run(out, config, command=command, chunk=0, steps=0, best_s=None, wall_s=0.0)
 
     def train(self) -> None:
         """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
         torch.set_num_threads(1)
         self.out.mkdir(parents=True, exist_ok=True)
         ppo, progress = self.config.ppo, self._progress
+        # From the first: the lessons in the folder are of this configuration and no other.
+        atomic_write(self.out / "progress.json", json.dumps(progress))
         makers = [partial(_world_of_worker, self.config.world, k) for k in range(ppo.environments)]
         with one_thread_each():
             env = VecMonitor(SubprocVecEnv(makers, start_method="spawn"))  # type: ignore[arg-type]

@@ -12,6 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 import agents
 from agents.base import Agent, Goal
+from agents.brisk_tour import BRISK
+from agents.policy import SHIPPED, load_choice_policy
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from slam.types import Belief, Scan
@@ -298,3 +300,8 @@ def test_explores_two_rooms_without_touching(preset):
     mapped = belief.grid.classes()[tuple(cells[inside].T)] == FREE
     assert mapped.sum() / len(free) >= 0.97
     assert min(gaps) > 0.0
+
+
+def test_the_policy_over_view_points_is_driven_as_the_tour_that_it_is_compared_with():
+    _, driver, _ = load_choice_policy(SHIPPED)
+    assert driver.control == BRISK

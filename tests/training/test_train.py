@@ -30,23 +30,33 @@ class Killed(Exception):
     pass
 
 
-def run(out: Path, *, kill_after: int | None = None) -> list[str]:
+def run(out: Path, *, kill_after: str | None = None) -> list[str]:
     said: list[str] = []
 
     def log(text: str) -> None:
         said.append(text)
-        if kill_after is not None and text.startswith(f"chunk {kill_after} "):
+        if kill_after is not None and text.startswith(kill_after):
             raise Killed
 
     Run(from_mapping(TrainConfig, SMALL), out, workers=2, log=log).train()
     return said
 
 
+def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_with_its_lessons(tmp_path):
+    with pytest.raises(Killed):
+        run(tmp_path, kill_after="round 1")
+    given = (tmp_path / "lessons-1.npz").read_bytes()
+    with pytest.raises(ValueError, match="another configuration"):
+        Run(from_mapping(TrainConfig, SMALL | {"seed": 2}), tmp_path, workers=1, log=print)
+    assert any(text.startswith("chunk 3 of 3") for text in run(tmp_path))
+    assert (tmp_path / "lessons-1.npz").read_bytes() == given
+
+
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
     said = run(tmp_path / "whole")
     assert any(text.startswith("imitation 2: epoch 1") for text in said)
     with pytest.raises(Killed):
-        run(tmp_path / "parts", kill_after=2)
+        run(tmp_path / "parts", kill_after="chunk 2 ")
     again = run(tmp_path / "parts")
     assert not any(text.startswith(("imitation", "chunk 1 ", "chunk 2 ")) for text in again)
     one, other = (read_zip(tmp_path / name / "checkpoint.zip") for name in ("whole", "parts"))
