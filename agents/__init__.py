@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from slam.settings import unknown_name
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from agents.base import Agent
     from mecanum_env.config import LidarConfig, RobotConfig
 
-__all__ = ["make", "names"]
+__all__ = ["check", "make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
@@ -35,6 +36,10 @@ GROUP = "mecanum_slam.agents"
 """Entry points of this group, ``name = "module:class"``, are agents, too: so other packages add theirs."""
 
 
+_POLICIES = {"mecanum-slam choice policy 1": "ppo-frontier", "mecanum-slam drive policy 1": "ppo"}
+"""The formats of trained policies, and the agents that read them."""
+
+
 @cache
 def _installed() -> dict[str, str]:
     """Return every agent's entry point: other packages' ones, then ours, which none of them replaces."""
@@ -44,6 +49,23 @@ def _installed() -> dict[str, str]:
 def names() -> tuple[str, ...]:
     """Return the names that :func:`make` takes, sorted."""
     return tuple(sorted(_installed()))
+
+
+def check(name: str, *others: str) -> None:
+    """Raise ``ValueError`` in one line unless :func:`make` takes the name, or it is one of the others."""
+    if name.endswith(".safetensors"):
+        _reader(name)
+    elif name not in (valid := (*names(), *others)):
+        raise unknown_name("agent", name, valid)
+
+
+def _reader(policy: str) -> str:
+    from agents.policy_files import policy_format
+
+    found = policy_format(Path(policy))
+    if found not in _POLICIES:
+        raise ValueError(f"policy {policy}: its format {found!r} is none of {', '.join(_POLICIES)}")
+    return _POLICIES[found]
 
 
 def make(
@@ -59,9 +81,9 @@ def make(
     Parameters
     ----------
     name : str
-        One of :func:`names`.
+        One of :func:`names`, or the path of a trained policy's ``.safetensors`` file, its ``.json`` beside it.
     config : dataclass or mapping, optional
-        The agent's own configuration, ``agents.<module>.<Agent>Config``.
+        The agent's own configuration, ``agents.<module>.<Agent>Config``; a mapping where a policy is named.
     robot, lidar : config, mapping or preset name, optional
         The body it drives and the sensor it looks with; the youBot's by default.
     step_s : float
@@ -72,9 +94,10 @@ def make(
     ValueError
         For a name or key that is not known; the message lists the valid ones.
     """
-    known = _installed()
-    if name not in known:
-        raise unknown_name("agent", name, known)
-    module, _, attribute = known[name].partition(":")
+    check(name)
+    if name.endswith(".safetensors"):
+        config = {"policy": name, **(config or {})}
+        name = _reader(name)
+    module, _, attribute = _installed()[name].partition(":")
     agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)
     return agent

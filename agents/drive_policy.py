@@ -74,7 +74,8 @@ class Ppo(Agent):
     ) -> None:
         super().__init__(robot=robot, lidar=lidar, step_s=step_s)
         settings = from_mapping(PpoConfig, config)
-        self._network, self.about = load_drive_policy(Path(settings.policy) if settings.policy else SHIPPED)
+        self.policy_path = Path(settings.policy or SHIPPED)
+        self._network, self.about = load_drive_policy(self.policy_path)
         self._settings = settings
         self._forget()
 

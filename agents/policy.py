@@ -59,6 +59,8 @@ class PpoFrontier(Chooser):
 
     Attributes
     ----------
+    policy_path : Path
+        The weights; what belongs to them lies beside, with the suffix ``.json``.
     about : dict
         What the policy's JSON file says of its training: command, configuration, steps, hours, curve.
     """
@@ -72,7 +74,8 @@ class PpoFrontier(Chooser):
         step_s: float = 0.1,
     ) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
-        self._network, driver, self.about = load_choice_policy(Path(settings.policy or SHIPPED))
+        self.policy_path = Path(settings.policy or SHIPPED)
+        self._network, driver, self.about = load_choice_policy(self.policy_path)
         driver = from_mapping(ChooserConfig, settings.driver, base=driver)
         super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
 

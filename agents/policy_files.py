@@ -11,7 +11,26 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file
 
-__all__ = ["read_policy"]
+__all__ = ["policy_format", "read_policy"]
+
+
+def policy_format(path: Path) -> str:
+    """Return the format that the JSON file beside a policy's weights names.
+
+    Raises
+    ------
+    ValueError
+        Where one of the two files is missing, or the JSON file cannot be read.
+    """
+    about = path.with_suffix(".json")
+    for file in (path, about):
+        if not file.is_file():
+            raise ValueError(f"policy {path}: {file} is missing; both files are needed")
+    try:
+        described = json.loads(about.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"policy {path} cannot be read: {error}") from error
+    return str(described.get("format")) if isinstance(described, dict) else ""
 
 
 def read_policy(path: Path, wanted: str) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:

@@ -119,17 +119,18 @@ class BenchmarkPlan:
         BadInput
             For an agent that cannot be made without settings of its own.
         """
-        modules = {name: _module_of_agent(name) for name in self.agents}
+        made = {name: _behind_agent(name) for name in self.agents}
         modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
         common = json.dumps(self.settings(), sort_keys=True)
         out = {}
         for agent in self.agents:
             for backend in self.backends:
-                code = code_digest(_EPISODE, modules[agent], modules_of_backends[backend])
+                module, policy = made[agent]
+                code = code_digest(_EPISODE, module, modules_of_backends[backend])
                 for suite in self.suites:
                     config = _config_text(suite, backend)
                     for place in suite.places:
-                        parts = (code, common, config, place.name, place.digest)
+                        parts = (code, policy, common, config, place.name, place.digest)
                         out[suite.name, place.name, agent, backend] = short_digest(p.encode() for p in parts)
         return out
 
@@ -219,23 +220,25 @@ def _groups(plan: BenchmarkPlan, store: benchmark_store.Store) -> list[Group]:
 
 def _agent_names(text: str) -> tuple[str, ...]:
     chosen = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
-    valid = (*agents.names(), KNOWN_MAP)
     for name in chosen:
-        if name not in valid:
-            raise unknown_name("agent", name, valid)
+        agents.check(name, KNOWN_MAP)
     return chosen
 
 
-def _module_of_agent(name: str) -> str:
+def _behind_agent(name: str) -> tuple[str, str]:
+    """Return an agent's module, and a digest of the trained policy that it reads, if it does."""
     if name == KNOWN_MAP:
-        return KnownMap.__module__
+        return KnownMap.__module__, ""
     try:
         with bad_input():
-            return type(agents.make(name)).__module__
+            agent = agents.make(name)
     except (ImportError, AttributeError) as error:  # another package's, or one that needs what is not installed
         raise BadInput(
             f"cannot load agent {name} ({one_line(error)}); install what it needs, or leave it out"
         ) from error
+    policy: Path | None = getattr(agent, "policy_path", None)
+    files = [] if policy is None else [policy, policy.with_suffix(".json")]
+    return type(agent).__module__, short_digest(file.read_bytes() for file in files)
 
 
 def _config_text(suite: Suite, backend: str) -> str:

@@ -75,7 +75,7 @@ def _root(
 @app.command()
 def explore(
     agent: Annotated[
-        str | None, typer.Option(help="Who decides where to go.  [default: nearest-frontier]")
+        str | None, typer.Option(help="Who decides where to go, or a policy file.  [default: nearest-frontier]")
     ] = None,
     rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
     slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,

@@ -6,7 +6,7 @@ import os
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -89,18 +89,38 @@ def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
     from training.drive_config import DriveConfig
     from training.train_config import TrainConfig
 
+    values = _tables(config)
+    if "base" in values:
+        base = _tables(str(values.pop("base")))
+        if "base" in base:
+            raise BadInput(f"{config}: the base of a configuration has none itself")
+        values = _laid_over(base, values)
+    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
+    with bad_input():
+        return from_mapping(kind, values if seed is None else values | {"seed": seed})
+
+
+def _tables(config: str) -> dict[str, Any]:
+    """Read a configuration by its name in the package, or from a file."""
     shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
     path = CONFIGS / f"{config}.toml" if config in shipped else Path(config)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         hint = suggestion(config, shipped)
         raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"cannot read {path}: {error}") from error
-    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
-    with bad_input():
-        return from_mapping(kind, values if seed is None else values | {"seed": seed})
+
+
+def _laid_over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return the base's tables with what the values say instead, table by table."""
+    tables = {
+        key: _laid_over(base[key], value)
+        for key, value in values.items()
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+    }
+    return base | values | tables
 
 
 def _say(text: str) -> None:

@@ -28,7 +28,7 @@ from training.campaign import check_settings, installed_version, run_all, write_
 from training.dungeon_bound import known_map_path
 from training.dungeon_episode import NEAREST, SCANS, explore
 from training.dungeon_world import Dungeon, load
-from training.errors import BadInput, Interrupted
+from training.errors import BadInput, Interrupted, bad_input
 
 __all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
 
@@ -76,10 +76,9 @@ def run_dungeons(
     BadInput
         In one line: which option, file or name is wrong, and what to do.
     """
-    valid = (*agents.names(), KNOWN_MAP, NEAREST)
-    for name in agent_names:
-        if name not in valid:
-            raise BadInput(str(unknown_name("agent", name, valid)))
+    with bad_input():
+        for name in agent_names:
+            agents.check(name, KNOWN_MAP, NEAREST)
     if scan not in SCANS:
         raise BadInput(str(unknown_name("--scan", scan, SCANS)))
     if workers < 1:

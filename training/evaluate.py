@@ -202,9 +202,9 @@ def _check_names(options: argparse.Namespace) -> None:
         check_rooms(rooms)
     for backend in options.slam.split(","):
         config_type(backend)
-    for what, name, valid in (("agent", options.agent, agents.names()), ("noise", options.noise, NOISE_PRESETS)):
-        if name not in valid:
-            raise unknown_name(what, name, valid)
+    agents.check(options.agent)
+    if options.noise not in NOISE_PRESETS:
+        raise unknown_name("noise preset", options.noise, NOISE_PRESETS)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -29,7 +29,7 @@ from mecanum_env.pictures import draw_map, draw_truth, episode_view
 from mecanum_env.rooms import FloorPlan
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
-from slam.settings import to_mapping, unknown_name
+from slam.settings import to_mapping
 from training.errors import BadInput, bad_input, check_writable
 from training.known_map import NAME as KNOWN_MAP
 from training.known_map import KnownMap
@@ -136,8 +136,7 @@ def prepare(options: ExploreOptions) -> Episode:
             # Other rooms: neither the start nor the step limit is meant for them.
             past = {name: value for name, value in past.items() if name in _DEFAULTS}
         run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
-        if run["agent"] not in (*agents.names(), KNOWN_MAP):
-            raise unknown_name("agent", run["agent"], agents.names())
+        agents.check(run["agent"], KNOWN_MAP)
         config = make_config(
             config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
             noise=options.noise, floor_plan=options.floor_plan,

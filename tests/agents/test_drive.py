@@ -120,6 +120,25 @@ def test_the_policy_says_where_it_comes_from():
     assert SHIPPED.stat().st_size < 2_000_000
 
 
+def test_a_policys_file_is_an_agents_name(tmp_path):
+    for name in ("ppo", "ppo-frontier"):
+        shipped = agents.make(name).policy_path
+        mine = tmp_path / shipped.name
+        for suffix in (".safetensors", ".json"):
+            mine.with_suffix(suffix).write_bytes(shipped.with_suffix(suffix).read_bytes())
+        agent = agents.make(str(mine))
+        assert type(agent) is type(agents.make(name)) and agent.policy_path == mine
+    mine.with_suffix(".json").write_text('{"format": "of another"}')
+    with pytest.raises(ValueError, match="'of another' is none of"):
+        agents.make(str(mine))
+    mine.unlink()
+    with pytest.raises(ValueError, match="safetensors is missing"):
+        agents.check(str(mine))
+    with pytest.raises(ValueError, match="unknown agent 'pppo'"):
+        agents.check("pppo", "known-map")
+    agents.check("known-map", "known-map")
+
+
 def test_files_that_are_no_policy_are_named(tmp_path):
     path = tmp_path / "mine.safetensors"
     with pytest.raises(ValueError, match="is missing"):

@@ -173,6 +173,21 @@ def test_the_planner_that_knows_the_map_stands_beside_the_agents(
 
 
 @pytest.mark.usefixtures("here")
+def test_a_policy_of_ones_own_runs_and_its_rows_are_not_mixed_with_those_of_other_weights(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped, mine = agents.make("ppo-frontier").policy_path, tmp_path / "mine.safetensors"  # type: ignore[attr-defined]
+    mine.write_bytes(shipped.read_bytes())
+    about = json.loads(shipped.with_suffix(".json").read_text("utf-8"))
+    mine.with_suffix(".json").write_text(json.dumps(about), "utf-8")
+    command = small(tmp_path / "out", "--agents", str(mine), seeds="0")
+    assert measure(command, capsys)["rooms"].keys() == {str(mine)}
+    about["driver"]["control"]["speed_share"] = 0.5
+    mine.with_suffix(".json").write_text(json.dumps(about), "utf-8")
+    assert "choose another --out" in refused(command, capsys)
+
+
+@pytest.mark.usefixtures("here")
 def test_config_toml_explores_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     measure(small(tmp_path, seeds="0"), capsys)
     argv = ["explore", "--config", str(tmp_path / "config.toml"), "--max-steps", "5", "--out", str(tmp_path / "e")]

@@ -76,6 +76,14 @@ def test_the_configurations_that_come_with_the_package_are_valid(path):
     _read(path.stem, None)
 
 
+def test_a_configuration_is_laid_over_the_base_it_names(tmp_path):
+    (tmp_path / "mine.toml").write_text('base = "ppo-frontier"\n[world.driver.control]\nspeed_share = 0.5\n')
+    base, mine = _read("ppo-frontier", None), _read(str(tmp_path / "mine.toml"), 7)
+    assert (mine.seed, mine.ppo, mine.imitation) == (7, base.ppo, base.imitation)
+    assert mine.world.driver["control"] == base.world.driver["control"] | {"speed_share": 0.5}
+    assert mine.world.driver["patience"] == base.world.driver["patience"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -83,12 +91,16 @@ def test_the_configurations_that_come_with_the_package_are_valid(path):
         (["--config", "{folder}/bad.toml"], "cannot read"),
         (["--config", "{folder}/wrong.toml"], "unknown key of TrainConfig"),
         (["--config", "{folder}/seeds.toml"], "training seeds"),
+        (["--config", "{folder}/based.toml"], "no configuration 'nowhere'"),
+        (["--config", "{folder}/twice.toml"], "the base of a configuration has none itself"),
         (["--resume"], "holds no run to go on with"),
     ],
 )
 def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     (tmp_path / "bad.toml").write_text("seed = ")
     (tmp_path / "wrong.toml").write_text("sede = 1")
+    (tmp_path / "based.toml").write_text('base = "nowhere"')
+    (tmp_path / "twice.toml").write_text('base = "ppo-frontier-without-warm-start"')
     (tmp_path / "seeds.toml").write_text("[world]\nseeds = [0, 10000]")
     arguments = [a.format(folder=tmp_path) for a in arguments]
     assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 2
