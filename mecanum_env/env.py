@@ -40,6 +40,7 @@ from mecanum_env.robot import WheelTargets
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensors import FilteredEncoders, Lidar, WheelEncoders
+from mecanum_env.window import make_viewer
 from mecanum_env.world import World
 from slam.backend import Backend
 from slam.dead_reckoning import TruthSlam
@@ -140,7 +141,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     config, rooms, slam, robot, lidar, noise, reward, floor_plan, odometry_filter
         See :func:`make_config`.
     render_mode : str, optional
-        ``"rgb_array"``: truth beside belief.
+        ``"rgb_array"``: truth beside belief. ``"human"``: the same in a window, shown by ``reset`` and ``step``.
 
     Notes
     -----
@@ -150,7 +151,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - declared so by gymnasium.Env
-        "render_modes": ["rgb_array"],
+        "render_modes": ["rgb_array", "human"],
         "render_fps": 10,
     }
 
@@ -187,6 +188,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._knows_truth = isinstance(self.backend, TruthSlam)
         self.lidar = Lidar(self.config.lidar, self.config.noise)
         self._filter = make_odometry_filter(self.config.odometry_filter, self.config.odometry_filter_config)
+        self._viewer = make_viewer(render_mode)
         self._ready = False
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
@@ -233,6 +235,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
         self._remember()
         info = self._info(self._coverage.update(self.backend.grid), np.zeros(3))
+        self._viewer.show(self)
         return self._observe(), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -264,16 +267,22 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
             info["is_success"] = bool(success)
             info["episode_metrics"] = self.episode_metrics()
+        self._viewer.show(self)
         return self._observe(), float(sum(terms.values())), bool(terminated), False, info
 
     def render(self) -> Any:
-        """Return truth beside belief as an RGB image ``(h, w, 3)``."""
+        """Return truth beside belief as an RGB image ``(h, w, 3)``; with ``"human"`` None: it is shown already."""
         if self.render_mode is None:
-            gymnasium.logger.warn('render() needs render_mode="rgb_array" in gym.make')
+            gymnasium.logger.warn('render() needs render_mode="rgb_array" or "human" in gym.make')
+        if self.render_mode != "rgb_array":
             return None
         from mecanum_env.render import render_frame
 
         return render_frame(self)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._viewer.close()
 
     # ---- what others may read ------------------------------------------------------------------------------
 
@@ -286,6 +295,14 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def odometry(self) -> Odometry:
         """The wheels' account of the last step, as the backend was given it."""
         return self._odometry
+
+    @property
+    def map_changes(self) -> NDArray[np.int32] | None:
+        """Cells of the belief's grid whose class the last step changed, or None where the whole map was redrawn.
+
+        Rows of ``(n, 4)``: lattice row, lattice column, class before, class now.
+        """
+        return self._coverage.changes
 
     def episode_metrics(self) -> dict[str, float | int | None]:
         """Return the metrics of the episode so far (see :class:`mecanum_env.episode.EpisodeRecord`)."""

@@ -134,7 +134,15 @@ class GroundTruth:
 
 
 class Coverage:
-    """Share of the mappable cells that a belief's grid rightly has as free, kept up from its changes."""
+    """Share of the mappable cells that a belief's grid rightly has as free, kept up from its changes.
+
+    Attributes
+    ----------
+    changes : NDArray[np.int32] or None
+        What the last update was told of, as :meth:`OccupancyGrid.take_changes` has it; None after a redraw.
+    """
+
+    changes: NDArray[np.int32] | None
 
     def __init__(self, truth: GroundTruth) -> None:
         self._truth = truth
@@ -145,8 +153,9 @@ class Coverage:
         """Return the coverage in [0, 1] after the grid's latest changes."""
         row0, col0 = self._truth.lattice_origin
         changes = grid.take_changes()
+        self.changes = changes
         if grid.revision != self._revision:
-            self._revision = grid.revision
+            self._revision, self.changes = grid.revision, None
             self._right = int(np.count_nonzero(self._overlap(grid)))
         else:
             self._right += _count_right(changes, self._truth.mappable, row0, col0)

@@ -106,7 +106,12 @@ def render_frame(env: ExploreEnv, *, planned_path: Array | None = None) -> Image
         belief.pose[None, :2], belief.pose_cov[None, :2, :2], LANDMARK, sigmas=SIGMAS, least_px=1.0, px=2
     )
     error = float(np.hypot(*(true_poses[-1, :2] - estimates[-1, :2])))
-    _write_caption(frame, env, coverage=float(record.coverage[-1]), time_s=float(record.times[-1]), error=error)
+    # The longer half axis of the ellipse that is drawn.
+    bound = SIGMAS * math.sqrt(max(float(np.linalg.eigvalsh(belief.pose_cov[:2, :2])[-1]), 0.0))
+    _write_caption(
+        frame, env, coverage=float(record.coverage[-1]), time_s=float(record.times[-1]),
+        error=f"{100.0 * error:.1f} cm, {SIGMAS:g}σ {100.0 * bound:.1f} cm",
+    )  # fmt: skip
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -179,17 +184,17 @@ def _paint_grid(canvas: Canvas, grid: OccupancyGrid) -> None:
     canvas.squares(cells, FRONTIER, px=max(2, math.ceil(grid.resolution * view.scale)))
 
 
-def _write_caption(frame: Image, env: ExploreEnv, *, coverage: float, time_s: float, error: float) -> None:
+def _write_caption(frame: Image, env: ExploreEnv, *, coverage: float, time_s: float, error: str) -> None:
     at = _RIGHT + text_width("Belief", size=19, bold=True) + 12
     put_text(frame, env.config.slam, (at, 30), INK, size=17)
     height, width = FRAME_SHAPE
     y = height - 24
     entries = (
         ("time", f"{time_s:.1f} s", 0),
-        ("coverage", f"{100.0 * coverage:.1f} %", 190),
-        ("path", f"{env.truth.record.path_length_m:.1f} m", 420),
-        ("collisions", f"{env.truth.record.collisions}", 632),
-        ("position error", f"{100.0 * error:.1f} cm", 830),
+        ("coverage", f"{100.0 * coverage:.1f} %", 163),
+        ("path", f"{env.truth.record.path_length_m:.1f} m", 352),
+        ("collisions", f"{env.truth.record.collisions}", 505),
+        ("position error", error, 632),
         ("landmarks", f"{env.backend.landmark_count}", 1100),
     )
     for name, value, x in entries:

@@ -107,8 +107,8 @@ def explore(
     """Explore rooms for one episode, until the agent has nothing left to explore.
 
     Writes into --out: map.png, truth.png, map.pgm + map.yaml (ROS map_server), trajectory_true.tum and
-    trajectory_estimate.tum, landmarks.db (SQLite), config.toml and metrics.json. Ctrl-C ends the episode and
-    keeps it as far as it came.
+    trajectory_estimate.tum, landmarks.db (SQLite), config.toml, metrics.json and report.html, which replays the
+    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came.
 
     \b
     Examples:
@@ -122,15 +122,17 @@ def explore(
     if coverage_target is not None and not 0 < coverage_target <= 1:
         raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
     from training import explore as task
+    from training.episode_files import write_episode
+    from training.recording import Recorder
 
     options = task.ExploreOptions(
         out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
         start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
     )  # fmt: skip
-    episode = task.prepare(options)
+    episode, recorder = task.prepare(options), Recorder()
     with ExitStack() as stack:
-        task.run(episode, _progress(stack))
-    metrics = task.write_episode(episode)
+        task.run(episode, _progress(stack), [recorder])
+    metrics = write_episode(episode, recorder.recording())
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:

@@ -1,45 +1,36 @@
-"""``mecanum explore``: one episode, from the options to the files."""
+"""``mecanum explore``: one episode, from the options to its end; :mod:`training.episode_files` writes the rest."""
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
 import statistics
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any, Protocol
 
-import cv2
 import gymnasium
 import numpy as np
-import tomli_w
 
 import agents
 from agents.base import ENDINGS as AGENT_ENDINGS
-from agents.base import Agent
+from agents.base import Agent, Goal
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv, make_config
-from mecanum_env.pictures import draw_map, draw_truth, episode_view
 from mecanum_env.rooms import FloorPlan
-from slam.formats import atomic_write, write_map_server, write_tum
-from slam.landmark_map import write_landmark_map
-from slam.settings import to_mapping
 from training.errors import BadInput, bad_input, check_writable
 from training.known_map import NAME as KNOWN_MAP
 from training.known_map import KnownMap
-from training.running import interrupt_flag, plain, versions
+from training.running import interrupt_flag, plain
 
-__all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "prepare", "run", "write_episode"]
+__all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "Witness", "prepare", "run"]
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
-    "landmarks.db", "config.toml", "metrics.json",
+    "landmarks.db", "config.toml", "report.html", "metrics.json",
 )  # fmt: skip
 """What an episode writes, ``metrics.json`` last: where it is, the others are."""
 
@@ -81,6 +72,13 @@ class Progress(Protocol):
 
     def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
         """Show it, or do not."""
+
+
+class Witness(Protocol):
+    """Sees an episode's start and every step of it."""
+
+    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+        """Take down the environment as it is now, and where the agent means to go."""
 
 
 @dataclass(eq=False)
@@ -206,11 +204,13 @@ def _read_run_table(path: Path) -> dict[str, Any]:
 # ---- the episode -----------------------------------------------------------------------------------------------
 
 
-def run(episode: Episode, progress: Progress) -> None:
+def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ()) -> None:
     """Let the agent explore until it is done, the steps are used up, or Ctrl-C is pressed between two steps."""
     env, agent, step = episode.env, episode.agent, episode.wrapped.step
     patience = math.ceil(_DONE_AFTER_S / episode.config.step_s)
     observation, goal, idle, max_steps = episode.observation, agent.goal, 0, episode.run["max_steps"]
+    for witness in witnesses:
+        witness.take(env, goal)
     began = time.perf_counter()
     with interrupt_flag() as interrupted:
         for steps in range(1, max_steps + 1):
@@ -221,6 +221,8 @@ def run(episode: Episode, progress: Progress) -> None:
                 episode.decisions_ms.append(1e3 * (time.perf_counter() - asked))
                 goal = agent.goal
             observation, _, terminated, truncated, info = step(action)
+            for witness in witnesses:
+                witness.take(env, goal)
             progress(coverage=info["coverage"], time_s=info["time_s"], steps=steps, max_steps=max_steps)
             idle = idle + 1 if goal is None else 0
             if interrupted.is_set():
@@ -233,68 +235,3 @@ def run(episode: Episode, progress: Progress) -> None:
                 continue
             break
     episode.wall_time_s = time.perf_counter() - began
-
-
-# ---- after -----------------------------------------------------------------------------------------------------
-
-
-def write_episode(episode: Episode) -> dict[str, Any]:
-    """Write every file of an episode and return its metrics.
-
-    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
-    while writing leaves the results of an earlier one as they were.
-    """
-    out = episode.out
-    out.mkdir(parents=True, exist_ok=True)
-    folder = Path(mkdtemp(prefix=".writing-", dir=out))
-    try:
-        with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
-            metrics = _write_into(folder, episode)
-            for name in FILES:
-                (folder / name).replace(out / name)
-        return metrics
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _write_into(folder: Path, episode: Episode) -> dict[str, Any]:
-    env, record = episode.env, episode.env.truth.record
-    belief, times = env.belief, record.times
-    true_poses, estimates = record.true_poses, record.estimates
-    write_map_server(folder / "map", belief.grid)
-    write_tum(folder / "trajectory_true.tum", times, true_poses)
-    write_tum(folder / "trajectory_estimate.tum", times, estimates)
-    seen, angles = env.backend.landmark_details()
-    write_landmark_map(
-        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
-        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
-        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
-        backend=episode.config.slam,
-    )  # fmt: skip
-    view = episode_view(env.truth.ground, belief)
-    robot, where = episode.config.robot, _place(episode)
-    pictures = {
-        "map.png": draw_map(
-            belief, estimates, view=view, robot=robot,
-            title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
-        ),
-        "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
-    }  # fmt: skip
-    for name, picture in pictures.items():
-        atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
-    atomic_write(folder / "config.toml", config_text(episode))
-    metrics = episode.metrics()
-    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
-    return metrics
-
-
-def config_text(episode: Episode) -> str:
-    """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
-    run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
-    run["versions"] = versions()
-    return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
-
-
-def _place(episode: Episode) -> str:
-    plan = episode.config.floor_plan
-    return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"

@@ -1,0 +1,91 @@
+"""What an episode leaves behind: maps, trajectories, landmarks, configuration, metrics, and its report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import cv2
+import tomli_w
+
+from mecanum_env.pictures import draw_map, draw_truth, episode_view
+from slam.formats import atomic_write, write_map_server, write_tum
+from slam.landmark_map import write_landmark_map
+from slam.settings import to_mapping
+from training.episode_report import episode_page
+from training.explore import ENDINGS, FILES, Episode
+from training.recording import Recording
+from training.running import interrupt_flag, versions
+
+__all__ = ["config_text", "write_episode"]
+
+
+def write_episode(episode: Episode, recording: Recording) -> dict[str, Any]:
+    """Write every file of an episode and return its metrics.
+
+    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
+    while writing leaves the results of an earlier one as they were.
+    """
+    out = episode.out
+    out.mkdir(parents=True, exist_ok=True)
+    folder = Path(mkdtemp(prefix=".writing-", dir=out))
+    try:
+        with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
+            metrics = _write_into(folder, episode, recording)
+            for name in FILES:
+                (folder / name).replace(out / name)
+        return metrics
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_into(folder: Path, episode: Episode, recording: Recording) -> dict[str, Any]:
+    env, record = episode.env, episode.env.truth.record
+    belief, times = env.belief, record.times
+    true_poses, estimates = record.true_poses, record.estimates
+    write_map_server(folder / "map", belief.grid)
+    write_tum(folder / "trajectory_true.tum", times, true_poses)
+    write_tum(folder / "trajectory_estimate.tum", times, estimates)
+    seen, angles = env.backend.landmark_details()
+    write_landmark_map(
+        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
+        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+        backend=episode.config.slam,
+    )  # fmt: skip
+    view = episode_view(env.truth.ground, belief)
+    robot, where = episode.config.robot, _place(episode)
+    pictures = {
+        "map.png": draw_map(
+            belief, estimates, view=view, robot=robot,
+            title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
+        ),
+        "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
+    }  # fmt: skip
+    for name, picture in pictures.items():
+        atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+    config, metrics = config_text(episode), episode.metrics()
+    atomic_write(folder / "config.toml", config)
+    page = episode_page(
+        env, recording, title=f"{where}: {episode.run['agent']} on {episode.config.slam}",
+        metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
+        command="mecanum explore --config config.toml --out again",
+    )  # fmt: skip
+    atomic_write(folder / "report.html", page)
+    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    return metrics
+
+
+def config_text(episode: Episode) -> str:
+    """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
+    run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
+    run["versions"] = versions()
+    return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
+
+
+def _place(episode: Episode) -> str:
+    plan = episode.config.floor_plan
+    return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"
