@@ -243,7 +243,7 @@ def _truth_png(env: ExploreEnv, view: View) -> str:
     image = np.empty((view.height, view.width, 3), np.uint8)
     ground = env.truth.ground
     paint_plan(Canvas(image, view), ground.plan, inverse(ground.start))
-    return base64.b64encode(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()).decode()
+    return base64.b64encode(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()).decode()
 
 
 def _asset(name: str) -> str:

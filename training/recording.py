@@ -136,6 +136,9 @@ class _Notes:
         self._values: list[NDArray[np.generic]] = []
 
     def add(self, step: int, value: NDArray[np.generic]) -> None:
+        if self._steps and self._steps[-1] == step:  # the last row, asked for twice
+            self._steps.pop()
+            self._values.pop()
         self._steps.append(step)
         self._values.append(value)
 
