@@ -64,6 +64,8 @@ def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
 class _Beneath(ExploreEnv):
     """The environment that the driver drives in: it looks at the scan alone."""
 
+    planned_path: NDArray[np.float64] | None = None  # the driver's, for the frames
+
     def _observe(self) -> Any:
         share = self.scan.ranges / self.scan.range_max
         return {"scan": np.where(share < 1.0, share, 1.0).astype(np.float32)}
@@ -89,7 +91,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         Of the reward, per control step of the environment beneath: a step here adds up Σ discountⁿ rₙ, and
         ``info["duration_s"]`` says how long it took, so that what follows it can be discounted alike.
     render_mode, **kwargs
-        As for ``mecanum_env/Explore-v0``.
+        As for ``mecanum_env/Explore-v0``; ``"human"`` shows every 0.1 s of the drive.
 
     Attributes
     ----------
@@ -106,7 +108,10 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     (``info["end"]`` says why). ``truncated``: after ``time_limit_s`` of the configuration.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 1}  # noqa: RUF012 - so in gymnasium
+    metadata: dict[str, Any] = {  # noqa: RUF012 - declared so by gymnasium.Env
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": 1,
+    }
 
     def __init__(
         self,
@@ -152,6 +157,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
+        self.base.planned_path = None
         self._seen, info = self._limited.reset(seed=seed, options=options)
         belief = self.base.outline
         self._agent.reset(belief, 0 if seed is None else int(seed))
@@ -171,6 +177,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         belief = self.base.outline
         while True:
             act = agent.act(self._seen, belief)
+            self.base.planned_path = None if agent.goal is None else agent.goal.path
             self._seen, reward, terminated, truncated, info = self._limited.step(act)
             total += weight * float(reward)
             weight *= self.discount
@@ -199,7 +206,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         return as_observation(self._choice, self.driver), total, bool(terminated), bool(truncated), info
 
     def render(self) -> Any:
-        """Return truth beside belief as an RGB image ``(h, w, 3)``."""
+        """Return truth beside belief as an RGB image ``(h, w, 3)``; with ``"human"`` None: it is shown already."""
         return self.base.render()
 
     def close(self) -> None:

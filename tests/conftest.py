@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
 from hypothesis import settings
+
+# Gymnasium's check_env tries every render mode: windows are drawn to memory, wherever the tests run.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 # A first call compiles its Numba kernel: a deadline would measure that.
 settings.register_profile("mecanum", deadline=None, derandomize=True, max_examples=60)

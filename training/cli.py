@@ -18,6 +18,7 @@ import typer
 
 from training.cli_benchmark import benchmark
 from training.cli_options import Json
+from training.cli_play import play
 from training.cli_policy import policy
 from training.cli_train import train
 from training.errors import BadInput, Interrupted, bad_input, one_line, suggestion
@@ -323,6 +324,7 @@ def replay(
 
 app.command()(benchmark)
 app.command()(train)
+app.command()(play)
 app.command()(policy)
 
 

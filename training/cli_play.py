@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
 from typing import Annotated
 
 import typer
@@ -11,6 +15,8 @@ import typer
 from training.errors import BadInput
 
 __all__ = ["play"]
+
+_PATIENCE_S = 4.0
 
 
 def play(
@@ -35,7 +41,8 @@ def play(
     """Drive the robot yourself in a window, and watch what it believes.
 
     W A S D drive and strafe, Q E turn, Space lets an agent drive, Tab takes the next SLAM backend, N the next
-    room, F1 shows all keys, Esc quits. A gamepad drives, too. Needs the extra `human`; docs/play.md has the details.
+    room, F1 shows all keys, Esc quits. A gamepad drives, too. Needs the extra `human`. docs/play.md has the
+    details.
 
     \b
     Examples:
@@ -49,14 +56,27 @@ def play(
     from training.play import PlayOptions, Session
     from training.play_game import Game, open_window
 
-    session = Session(
-        PlayOptions(
-            agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
-        )
-    )  # fmt: skip
+    options = PlayOptions(
+        agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
+    )
+    with _said_where_it_takes_long():
+        session = Session(options)
     window = open_window()
     try:
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()
     print(session.summary())
+
+
+@contextmanager
+def _said_where_it_takes_long() -> Iterator[None]:
+    """Say on standard error what there is to wait for, before there is a window, where that is some seconds."""
+    text = "mecanum play: compiling; the first time on a computer that can take minutes"
+    timer = Timer(_PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
