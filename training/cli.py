@@ -103,6 +103,14 @@ def explore(
     coverage_target: Annotated[
         float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
     ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Also film it: episode.mp4, at true speed.")] = False,
+    video_substeps: Annotated[
+        bool, typer.Option("--video-substeps", help="The same, a frame for every substep of the physics.")
+    ] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Also write episode.mcap, ROS 2 messages for Foxglove and RViz.")
+    ] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Also write episode.rrd, for Rerun.")] = False,
     as_json: Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
@@ -118,26 +126,37 @@ def explore(
       mecanum explore --floor-plan office.yaml --start 2.5,1.0,0 --out out/office
       mecanum explore --config out/seed3/config.toml --out out/again
       mecanum explore --rooms rectangular --noise slippery --json
+      mecanum explore --agent brisk-tour --video --mcap
     """  # noqa: D301
     pose = _parse_start(start)
     if coverage_target is not None and not 0 < coverage_target <= 1:
         raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
     from training import explore as task
-    from training.episode_files import write_episode
+    from training.episode_files import check_extras, write_episode
     from training.recording import Recorder
+    from training.video import film_episode
 
     options = task.ExploreOptions(
         out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
         start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
     )  # fmt: skip
+    asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
+    extras = [name for name, wanted in asked.items() if wanted]
+    check_extras(extras)
     episode, recorder = task.prepare(options), Recorder()
+    witnesses: list[task.Witness] = [recorder]
     with ExitStack() as stack:
-        task.run(episode, _progress(stack), [recorder])
-    metrics = write_episode(episode, recorder.recording())
+        if "video" in extras:
+            out.mkdir(parents=True, exist_ok=True)
+            film = film_episode(out / task.EXTRAS["video"], episode.config, substeps=video_substeps)
+            witnesses.append(stack.enter_context(film))
+        task.run(episode, _progress(stack), witnesses)
+    metrics = write_episode(episode, recorder.recording(), extras=extras)
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:
-        print(_summary(metrics, out, task.FILES, task.ENDINGS[metrics["end"]]))
+        files = (*task.FILES, *(task.EXTRAS[name] for name in extras))
+        print(_summary(metrics, out, files, task.ENDINGS[metrics["end"]]))
     if episode.interrupted:
         raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Collection
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
@@ -16,15 +17,31 @@ from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmark_map import write_landmark_map
 from slam.settings import to_mapping
 from training.episode_report import episode_page
-from training.explore import ENDINGS, FILES, Episode
+from training.explore import ENDINGS, EXTRAS, Episode
+from training.export_mcap import check_mcap, write_mcap
+from training.export_rerun import check_rerun, write_rerun
 from training.recording import Recording
 from training.running import interrupt_flag, versions
+from training.video import check_video
 
-__all__ = ["config_text", "write_episode"]
+__all__ = ["check_extras", "config_text", "write_episode"]
 
 
-def write_episode(episode: Episode, recording: Recording) -> dict[str, Any]:
+def check_extras(extras: Collection[str]) -> None:
+    """Raise :class:`training.errors.BadInput` where what one of them needs is not installed."""
+    if "video" in extras:
+        check_video()
+    if "mcap" in extras:
+        check_mcap()
+    if "rerun" in extras:
+        check_rerun()
+
+
+def write_episode(episode: Episode, recording: Recording, *, extras: Collection[str] = ()) -> dict[str, Any]:
     """Write every file of an episode and return its metrics.
+
+    Of the extras those are written that need no more than the recording; a film was made while it ran. Those not
+    asked for are taken away: they would be another episode's.
 
     The files are made in a folder beside their place and then renamed, one after the other: a run that fails
     while writing leaves the results of an earlier one as they were.
@@ -34,15 +51,18 @@ def write_episode(episode: Episode, recording: Recording) -> dict[str, Any]:
     folder = Path(mkdtemp(prefix=".writing-", dir=out))
     try:
         with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
-            metrics = _write_into(folder, episode, recording)
-            for name in FILES:
-                (folder / name).replace(out / name)
+            metrics = _write_into(folder, episode, recording, extras)
+            for path in sorted(folder.iterdir(), key=lambda path: path.name == "metrics.json"):
+                path.replace(out / path.name)
+            for name, file in EXTRAS.items():
+                if name not in extras:
+                    (out / file).unlink(missing_ok=True)
         return metrics
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _write_into(folder: Path, episode: Episode, recording: Recording) -> dict[str, Any]:
+def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:
     env, record = episode.env, episode.env.truth.record
     belief, times = env.belief, record.times
     true_poses, estimates = record.true_poses, record.estimates
@@ -75,6 +95,12 @@ def _write_into(folder: Path, episode: Episode, recording: Recording) -> dict[st
         command="mecanum explore --config config.toml --out again",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
+    title = f"{where}, {episode.run['agent']} on {episode.config.slam}"
+    if "mcap" in extras:
+        about = {"title": title, "config.toml": config}
+        write_mcap(recording, folder / EXTRAS["mcap"], robot=robot, lidar=episode.config.lidar, about=about)
+    if "rerun" in extras:
+        write_rerun(recording, folder / EXTRAS["rerun"], robot=robot, lidar=episode.config.lidar, name=title)
     atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
     return metrics
 

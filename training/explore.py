@@ -26,13 +26,16 @@ from training.known_map import NAME as KNOWN_MAP
 from training.known_map import KnownMap
 from training.running import interrupt_flag, plain
 
-__all__ = ["ENDINGS", "FILES", "Episode", "ExploreOptions", "Progress", "Witness", "prepare", "run"]
+__all__ = ["ENDINGS", "EXTRAS", "FILES", "Episode", "ExploreOptions", "Progress", "Witness", "prepare", "run"]
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
     "landmarks.db", "config.toml", "report.html", "metrics.json",
 )  # fmt: skip
 """What an episode writes, ``metrics.json`` last: where it is, the others are."""
+
+EXTRAS = {"video": "episode.mp4", "mcap": "episode.mcap", "rerun": "episode.rrd"}
+"""What it writes besides when asked to, by the option."""
 
 LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
 """The step limit where none is given: so many, or so many a square metre of free space."""
@@ -145,7 +148,7 @@ def prepare(options: ExploreOptions) -> Episode:
             config = replace(config, floor_plan=str(Path(config.floor_plan).absolute()))
         if options.coverage_target is not None:
             config = replace(config, coverage_target=options.coverage_target)
-        check_writable(options.out, FILES)
+        check_writable(options.out, [*FILES, *EXTRAS.values()])
         plan = _make_plan(config, run["seed"])
         # An agent maps all that it can reach; what counts as success is judged at the end.
         limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))

@@ -23,7 +23,7 @@ from slam.landmark_map import read_landmark_map
 from slam.occupancy import FREE, OCCUPIED
 from tests.training.plans import write_room
 from training.cli import main
-from training.explore import FILES
+from training.explore import EXTRAS, FILES
 from training.running import plain
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -237,3 +237,32 @@ def test_help_shows_runnable_examples(command: str, capsys: pytest.CaptureFixtur
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("mecanum-slam")
+
+
+def test_what_is_asked_for_besides_is_written_and_what_is_left_of_another_episode_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in ("imageio_ffmpeg", "mcap", "rerun"):
+        pytest.importorskip(module)
+    out = tmp_path / "out"
+    command = ["explore", "--rooms", "rectangular", "--max-steps", "12", "--out", str(out)]
+    assert main([*command, "--video", "--mcap", "--rerun"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in EXTRAS.values())
+    assert sorted(p.name for p in out.iterdir()) == sorted([*FILES, *EXTRAS.values()])
+    assert all((out / name).stat().st_size > 1000 for name in EXTRAS.values())
+    assert main([*command, "--mcap"]) == 0
+    assert sorted(p.name for p in out.iterdir()) == sorted([*FILES, "episode.mcap"])
+
+
+def test_an_extra_that_is_not_installed_is_named_before_the_episode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module, option, extra in (
+        ("imageio_ffmpeg", "--video", "video"), ("mcap.writer", "--mcap", "ros"), ("rerun", "--rerun", "rerun"),
+    ):  # fmt: skip
+        monkeypatch.setitem(sys.modules, module, None)
+        assert main(["explore", option, "--out", str(tmp_path / "out")]) == 2
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1 and f"pip install 'mecanum-slam[{extra}]'" in line
+    assert not (tmp_path / "out").exists()
