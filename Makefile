@@ -19,7 +19,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium rllib monte-carlo evaluate benchmark speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium rllib monte-carlo evaluate benchmark docs speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -82,6 +82,9 @@ evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the
 benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (hours; goes on where it was broken off)
 	$(BIN)/mecanum benchmark --suite all --agents $(AGENTS) --workers $(WORKERS) --out out/benchmark --report
 	$(BIN)/python -m training.leaderboard out/benchmark BENCHMARK.md
+
+docs: $(VENV)/test.stamp ## the documentation as a site, in out/site
+	$(BIN)/python -m mkdocs build --strict --site-dir out/site
 
 speed: $(VENV)/core.stamp ## steps per second, and where the time goes
 	$(BIN)/mecanum speed

@@ -9,7 +9,7 @@ Nothing here knows of a simulator: the same backends run on the logs of real rob
     backend.belief.pose
 """
 
-from slam.registry import config_type, make, names
+from slam.registry import config_type, make, names, register
 from slam.types import CONCAVE, CONVEX, LINE, Belief, Observations, Odometry, Scan
 
 __all__ = [
@@ -23,4 +23,5 @@ __all__ = [
     "config_type",
     "make",
     "names",
+    "register",
 ]

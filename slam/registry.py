@@ -14,7 +14,7 @@ from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
 from slam.invariant import InvariantEkfConfig, InvariantEkfSlam
 from slam.settings import from_mapping, unknown_name
 
-__all__ = ["config_type", "make", "names"]
+__all__ = ["config_type", "make", "names", "register"]
 
 _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "odometry": (OdometrySlam, EkfConfig),
@@ -27,6 +27,19 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "fastslam2": (FastSlam2, FastSlamConfig),
     "dp-slam": (DpSlam, DpSlamConfig),
 }
+
+
+def register(name: str, backend: type[Backend], config_type: type[BackendConfig]) -> None:
+    """Make a backend known under a name, with the frozen dataclass that configures it.
+
+    Raises
+    ------
+    ValueError
+        If another backend has the name.
+    """
+    if _BACKENDS.get(name, (backend, config_type)) != (backend, config_type):
+        raise ValueError(f"SLAM backend {name!r} is registered already; choose another name")
+    _BACKENDS[name] = (backend, config_type)
 
 
 def names() -> tuple[str, ...]:

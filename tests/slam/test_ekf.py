@@ -359,3 +359,15 @@ def test_the_pose_nees_is_that_of_pose_and_covariance(name: str) -> None:
         backend.update(room_scan(np.array([2.0 + 0.03 * k, 2.0, 0.02 * k])))
     true = backend.pose + np.array([1e-3, -2e-3, 1e-3])
     assert backend.pose_nees(true) == nees_pose(backend.pose, backend.pose_cov, true)
+
+
+def test_a_backend_of_ones_own_is_registered_once_under_its_name(monkeypatch):
+    from slam import registry
+    from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
+
+    monkeypatch.setattr(registry, "_BACKENDS", dict(registry._BACKENDS))
+    slam.register("mine", EkfSlam, EkfConfig)
+    slam.register("mine", EkfSlam, EkfConfig)  # the same again is no quarrel
+    assert "mine" in slam.names() and isinstance(slam.make("mine"), EkfSlam)
+    with pytest.raises(ValueError, match="'ekf' is registered already"):
+        slam.register("ekf", EkfSlam, EkfLinesConfig)
