@@ -50,7 +50,7 @@ install: $(VENV)/core.stamp ## install the core into .venv
 
 explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and mapped (SEED, OUT)
 	$(BIN)/mecanum explore --agent nearest-frontier --rooms apartment --slam ekf --seed $(SEED) --out $(OUT)
-	@echo "Look at $(OUT)/map.png beside $(OUT)/truth.png; the figures are in $(OUT)/metrics.json."
+	@echo "Open $(OUT)/report.html in a browser: it replays the episode. The figures are in $(OUT)/metrics.json."
 
 test: lint types pytest other-gymnasium ## everything CI checks (WORKERS)
 
