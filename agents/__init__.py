@@ -96,7 +96,9 @@ def make(
     """
     check(name)
     if name.endswith(".safetensors"):
-        config = {"policy": name, **(config or {})}
+        if not isinstance(config, Mapping | None):
+            raise ValueError(f"with a policy's file {name} the agent's configuration is a mapping, or none")
+        config = {**(config or {}), "policy": name}
         name = _reader(name)
     module, _, attribute = _installed()[name].partition(":")
     agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)

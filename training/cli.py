@@ -134,7 +134,8 @@ def explore(
     from training import explore as task
     from training.episode_files import check_extras, write_episode
     from training.recording import Recorder
-    from training.video import film_episode
+    from training.running import interrupt_flag
+    from training.video import filmed
 
     options = task.ExploreOptions(
         out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
@@ -144,20 +145,25 @@ def explore(
     extras = [name for name, wanted in asked.items() if wanted]
     check_extras(extras)
     episode, recorder = task.prepare(options), Recorder()
-    witnesses: list[task.Witness] = [recorder]
-    with ExitStack() as stack:
-        if "video" in extras:
-            out.mkdir(parents=True, exist_ok=True)
-            film = film_episode(out / task.EXTRAS["video"], episode.config, substeps=video_substeps)
-            witnesses.append(stack.enter_context(film))
-        task.run(episode, _progress(stack), witnesses)
-    metrics = write_episode(episode, recorder.recording(), extras=extras)
+    # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
+    with interrupt_flag() as late, ExitStack() as stack:
+        witnesses: list[task.Witness] = [recorder]
+        film = stack.enter_context(filmed(out, episode.config, video_substeps)) if "video" in extras else None
+        witnesses += [film] if film is not None else []
+        with ExitStack() as progress:
+            task.run(episode, _progress(progress), witnesses)
+        path = film.finish() if film is not None else None
+        if path is None and film is not None:
+            extras.remove("video")
+        metrics = write_episode(episode, recorder.recording(), extras=extras, film=path)
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:
         files = (*task.FILES, *(task.EXTRAS[name] for name in extras))
         print(_summary(metrics, out, files, task.ENDINGS[metrics["end"]]))
-    if episode.interrupted:
+    if film is not None and film.failure is not None:
+        raise OSError(f"{one_line(film.failure)}; all but the film is in {out}")
+    if episode.interrupted or late.is_set():
         raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
 
 

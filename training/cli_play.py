@@ -59,10 +59,10 @@ def play(
     options = PlayOptions(
         agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
     )
-    with _said_where_it_takes_long():
-        session = Session(options)
     window = open_window()
     try:
+        with _said_where_it_takes_long():
+            session = Session(options)
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()
@@ -71,7 +71,7 @@ def play(
 
 @contextmanager
 def _said_where_it_takes_long() -> Iterator[None]:
-    """Say on standard error what there is to wait for, before there is a window, where that is some seconds."""
+    """Say on standard error what there is to wait for, while the window is empty, where that is some seconds."""
     text = "mecanum play: compiling; the first time on a computer that can take minutes"
     timer = Timer(_PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
     timer.daemon = True

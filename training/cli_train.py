@@ -91,13 +91,24 @@ def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
 
     values = _tables(config)
     if "base" in values:
-        base = _tables(str(values.pop("base")))
-        if "base" in base:
-            raise BadInput(f"{config}: the base of a configuration has none itself")
-        values = _laid_over(base, values)
+        values = _laid_over(_base(config, values.pop("base")), values)
     kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
     with bad_input():
         return from_mapping(kind, values if seed is None else values | {"seed": seed})
+
+
+def _base(config: str, name: object) -> dict[str, Any]:
+    """Read the configuration that another one names as its base: of the package, or a file beside it."""
+    if not isinstance(name, str):
+        raise BadInput(f"{config}: base is the name of a configuration or a file, not {name!r}")
+    beside = Path(config).parent / name
+    try:
+        base = _tables(str(beside) if beside.is_file() else name)
+    except BadInput as error:
+        raise BadInput(f"{config}: base: {error}") from error
+    if "base" in base:
+        raise BadInput(f"{config}: the base of a configuration has none itself")
+    return base
 
 
 def _tables(config: str) -> dict[str, Any]:

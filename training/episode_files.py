@@ -37,14 +37,16 @@ def check_extras(extras: Collection[str]) -> None:
         check_rerun()
 
 
-def write_episode(episode: Episode, recording: Recording, *, extras: Collection[str] = ()) -> dict[str, Any]:
+def write_episode(
+    episode: Episode, recording: Recording, *, extras: Collection[str] = (), film: Path | None = None
+) -> dict[str, Any]:
     """Write every file of an episode and return its metrics.
 
-    Of the extras those are written that need no more than the recording; a film was made while it ran. Those not
-    asked for are taken away: they would be another episode's.
+    Of the extras those are written that need no more than the recording; the film, made while it ran, is moved to
+    its place. Extras not asked for are taken away: they would be another episode's.
 
-    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
-    while writing leaves the results of an earlier one as they were.
+    The files are made in a folder beside their place and then renamed, one after the other, ``metrics.json`` last:
+    a run that fails while writing leaves the results of an earlier one as they were.
     """
     out = episode.out
     out.mkdir(parents=True, exist_ok=True)
@@ -52,11 +54,12 @@ def write_episode(episode: Episode, recording: Recording, *, extras: Collection[
     try:
         with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
             metrics = _write_into(folder, episode, recording, extras)
+            if film is not None:
+                film.replace(folder / EXTRAS["video"])
+            for name in ("metrics.json", *(file for extra, file in EXTRAS.items() if extra not in extras)):
+                (out / name).unlink(missing_ok=True)
             for path in sorted(folder.iterdir(), key=lambda path: path.name == "metrics.json"):
                 path.replace(out / path.name)
-            for name, file in EXTRAS.items():
-                if name not in extras:
-                    (out / file).unlink(missing_ok=True)
         return metrics
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -78,10 +81,11 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     )  # fmt: skip
     view = episode_view(env.truth.ground, belief)
     robot, where = episode.config.robot, _place(episode)
+    who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
     pictures = {
         "map.png": draw_map(
             belief, estimates, view=view, robot=robot,
-            title=f"{where}   {episode.config.slam}, {episode.run['agent']}",
+            title=f"{where}   {episode.config.slam}, {who}",
         ),
         "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
     }  # fmt: skip
@@ -90,12 +94,12 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     config, metrics = config_text(episode), episode.metrics()
     atomic_write(folder / "config.toml", config)
     page = episode_page(
-        env, recording, title=f"{where}: {episode.run['agent']} on {episode.config.slam}",
+        env, recording, title=f"{where}: {who} on {episode.config.slam}",
         metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
         command="mecanum explore --config config.toml --out again",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
-    title = f"{where}, {episode.run['agent']} on {episode.config.slam}"
+    title = f"{where}, {who} on {episode.config.slam}"
     if "mcap" in extras:
         about = {"title": title, "config.toml": config}
         write_mcap(recording, folder / EXTRAS["mcap"], robot=robot, lidar=episode.config.lidar, about=about)

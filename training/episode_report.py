@@ -174,9 +174,9 @@ def _padded(size: int) -> int:
 
 
 def _thinned(recorded: Recorded, most: int) -> Recorded:
-    """Return every second, third, … note, so that there are not more than so many; the last is among them."""
-    stride = max(math.ceil(len(recorded.steps) / most), 1)
-    kept = range(len(recorded.steps) - 1, -1, -stride)[::-1]
+    """Return every second, third, … note, so that there are not more than so many; both ends stay."""
+    stride = max(math.ceil(len(recorded.steps) / (most - 1)), 1)
+    kept = sorted({0, *range(len(recorded.steps) - 1, -1, -stride)}) if len(recorded.steps) else []
     return Recorded(recorded.steps[kept], tuple(recorded.values[k] for k in kept))
 
 

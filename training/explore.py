@@ -138,6 +138,8 @@ def prepare(options: ExploreOptions) -> Episode:
             past = {name: value for name, value in past.items() if name in _DEFAULTS}
         run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
         agents.check(run["agent"], KNOWN_MAP)
+        if run["agent"].endswith(".safetensors"):
+            run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
         config = make_config(
             config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
             noise=options.noise, floor_plan=options.floor_plan,

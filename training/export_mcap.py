@@ -74,7 +74,9 @@ def check_mcap() -> None:
     try:
         import mcap.writer  # noqa: F401
     except ModuleNotFoundError as error:
-        raise BadInput(f"--mcap needs {error.name}; install it with pip install 'mecanum-slam[ros]'") from error
+        raise BadInput(
+            f"--mcap needs mcap, and {error.name} is missing; install it with pip install 'mecanum-slam[ros]'"
+        ) from error
 
 
 def write_mcap(

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from slam.formats import replacing
 from training import explore
-from training.errors import BadInput
+from training.errors import BadInput, Interrupted
 from training.video import Camera, check_video
 
 __all__ = ["main", "moving_picture"]
 
-_FPS = 10
 _STOPS_S = 2.5  # shown at the end before it begins anew
 # One palette for all frames; without dithering what does not move costs nothing.
 _FILTER = (
@@ -34,7 +33,12 @@ def moving_picture(options: explore.ExploreOptions, path: Path, *, speed: int, w
     """Write an animated GIF of an episode until its coverage is ``until``; return the number of frames."""
     frames: list[NDArray[np.uint8]] = []
     episode = explore.prepare(options)
-    camera = Camera(frames.append, speed=speed)
+
+    def keep(frame: NDArray[np.uint8]) -> None:
+        height = 2 * round(width * frame.shape[0] / frame.shape[1] / 2)
+        frames.append(np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), np.uint8))
+
+    camera = Camera(keep, speed=speed)
 
     def stop_there(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
         if coverage >= until:
@@ -42,16 +46,17 @@ def moving_picture(options: explore.ExploreOptions, path: Path, *, speed: int, w
 
     with suppress(_Enough):
         explore.run(episode, stop_there, [camera])
-    frames += frames[-1:] * round(_STOPS_S * _FPS)
-    height = 2 * round(width * frames[0].shape[0] / frames[0].shape[1] / 2)
+    if episode.interrupted:
+        raise Interrupted("interrupted; no picture was written")
+    fps = 1.0 / episode.config.step_s
+    frames += frames[-1:] * round(_STOPS_S * fps)
     with replacing(path) as temporary:
         command = [
             check_video(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-            "-video_size", f"{width}x{height}", "-framerate", str(_FPS), "-i", "pipe:0", "-vf", _FILTER,
-            "-loop", "0", f"file:{temporary}",
+            "-video_size", f"{width}x{frames[0].shape[0]}", "-framerate", f"{fps:g}", "-i", "pipe:0",
+            "-vf", _FILTER, "-loop", "0", f"file:{temporary}",
         ]  # fmt: skip
-        small = (cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA).tobytes() for frame in frames)
-        subprocess.run(command, input=b"".join(small), check=True)
+        subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), check=True)
     return len(frames)
 
 
@@ -76,9 +81,12 @@ def main(argv: list[str] | None = None) -> int:
             out=options.out.parent, agent=options.agent, rooms=options.rooms, seed=options.seed
         )
         count = moving_picture(given, options.out, speed=options.speed, width=options.width, until=options.until)
-    except (BadInput, ValueError, OSError) as error:
+    except (BadInput, ValueError, OSError, subprocess.CalledProcessError) as error:
         print(f"moving_picture: {error}", file=sys.stderr)
         return 2
+    except (Interrupted, KeyboardInterrupt) as error:
+        print(f"moving_picture: {error or 'interrupted'}", file=sys.stderr)
+        return 130
     print(f"{options.out}: {count} frames, {options.out.stat().st_size / 1e6:.1f} MB")
     return 0
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from training import explore
 from training.episode_report import episode_page
-from training.errors import BadInput, bad_input
+from training.errors import BadInput, Interrupted, bad_input
 from training.recording import Recorder
 from training.rooms_command import parse_seeds
 
@@ -31,6 +31,8 @@ def measure(options: explore.ExploreOptions) -> dict[str, Any]:
         began = time.process_time()
         explore.run(episode, lambda **_: None, [recorder] if recorded else [])
         spent[recorded].append(time.process_time() - began)
+        if episode.interrupted:
+            raise Interrupted("interrupted; nothing was kept")
         if recorded:
             kept, recording = episode, recorder.recording()
     began = time.process_time()
@@ -65,9 +67,9 @@ def main(argv: list[str] | None = None) -> int:
                 explore.run(explore.prepare(given), lambda **_: None, [Recorder()])  # compile first
             rows.append(measure(given))
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    except BadInput as error:
-        print(f"recording_cost: {error}", file=sys.stderr)
-        return 2
+    except (BadInput, Interrupted, KeyboardInterrupt) as error:
+        print(f"recording_cost: {error or 'interrupted'}", file=sys.stderr)
+        return 2 if isinstance(error, BadInput) else 130
     medians = {key: statistics.median(row[key] for row in rows) for key in rows[0] if key != "seed"}
     print(json.dumps({"episodes": len(rows), "median": medians, "worst_ratio": max(r["ratio"] for r in rows)}))
     return 0

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig
     from mecanum_env.env import ExploreEnv
 
-__all__ = ["Camera", "check_video", "film", "film_episode"]
+__all__ = ["Camera", "Film", "check_video", "film", "film_episode", "filmed"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -96,6 +98,49 @@ def film_episode(
         yield Camera(write, speed=speed, substeps=per_step)
 
 
+class Film:
+    """A camera whose film may fail: then it films no more, and what it was told of the episode goes on."""
+
+    def __init__(self, path: Path, config: EnvConfig, *, substeps: bool) -> None:
+        self._path = path
+        self.failure: OSError | None = None
+        self._open = ExitStack()
+        self._camera = self._open.enter_context(film_episode(path, config, substeps=substeps))
+
+    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+        """Film the environment as it is after ``reset`` or a step."""
+        if self.failure is None:
+            try:
+                self._camera.take(env, goal)
+            except OSError as error:
+                self.failure = error
+
+    def finish(self) -> Path | None:
+        """Return where the film is, or ``None`` where there is none: see ``failure``."""
+        try:
+            self._open.close()
+        except OSError as error:
+            self.failure = self.failure or error
+        return self._path if self.failure is None else None
+
+    def give_up(self, *error: Any) -> None:
+        """Leave nothing of a film that is not finished, for an error as ``__exit__`` is told of it."""
+        self._open.__exit__(*error)
+
+
+@contextmanager
+def filmed(out: Path, config: EnvConfig, substeps: bool) -> Iterator[Film]:
+    """Give a :class:`Film` that is made in a folder within ``out``, which goes when the block ends."""
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder:
+        made = Film(Path(folder) / "episode.mp4", config, substeps=substeps)
+        try:
+            yield made
+        except BaseException:
+            made.give_up(*sys.exc_info())
+            raise
+
+
 @contextmanager
 def film(path: str | Path, *, fps: float) -> Iterator[Write]:
     """Give a function that takes a film's frames; the film is at ``path`` when the block ends.
@@ -138,11 +183,14 @@ def check_video() -> str:
     try:
         import imageio_ffmpeg
 
-        return str(imageio_ffmpeg.get_ffmpeg_exe())
+        program = str(imageio_ffmpeg.get_ffmpeg_exe())
     except ModuleNotFoundError as error:
-        raise BadInput(f"--video needs {error.name}; install it with pip install 'mecanum-slam[video]'") from error
+        raise BadInput(f"a film needs {error.name}; install it with pip install 'mecanum-slam[video]'") from error
     except RuntimeError as error:
-        raise BadInput(f"--video needs ffmpeg, and there is none for this machine: {error}") from error
+        raise BadInput(f"a film needs ffmpeg, and there is none for this machine: {error}") from error
+    if shutil.which(program) is None:
+        raise BadInput(f"a film needs ffmpeg, and {program} is none; see IMAGEIO_FFMPEG_EXE")
+    return program
 
 
 class _Encoder:
@@ -152,6 +200,7 @@ class _Encoder:
         self._program, self._path = program, path
         self._rate = Fraction(fps).limit_denominator(1001)
         self._shape: tuple[int, ...] = ()
+        self._error: OSError | None = None
 
     @property
     def started(self) -> bool:
@@ -196,6 +245,8 @@ class _Encoder:
         """Wait for the film to be whole."""
         if not self.started:
             raise ValueError("a film has at least one frame")
+        if self._error is not None:
+            raise self._error
         try:
             self._pipe.close()
             failed = self._process.wait() != 0
@@ -221,7 +272,8 @@ class _Encoder:
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
         self.kill()
-        return OSError(f"cannot write the film: ffmpeg: {lines[-1] if lines else 'ended without a word'}")
+        self._error = OSError(f"cannot write the film: ffmpeg: {lines[-1] if lines else 'ended without a word'}")
+        return self._error
 
 
 def _frame_between(env: ExploreEnv, share: float, before: Image) -> Image:

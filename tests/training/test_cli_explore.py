@@ -266,3 +266,38 @@ def test_an_extra_that_is_not_installed_is_named_before_the_episode(
         line = capsys.readouterr().err
         assert line.count("\n") == 1 and f"pip install 'mecanum-slam[{extra}]'" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_a_film_that_fails_costs_the_film_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    broken = tmp_path / "ffmpeg"
+    broken.write_text("#!/bin/sh\necho no space left on device >&2\nexit 1\n")
+    broken.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(broken))
+    out = tmp_path / "out"
+    command = ["explore", "--rooms", "rectangular", "--max-steps", "12", "--out", str(out), "--video"]
+    assert main(command) == 1
+    assert "no space left on device; all but the film is in" in capsys.readouterr().err
+    assert sorted(p.name for p in out.iterdir()) == sorted(FILES)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(tmp_path / "none"))
+    assert main(command) == 2
+    assert "a film needs ffmpeg" in capsys.readouterr().err
+
+
+def test_an_error_while_filming_leaves_the_episode_before_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "out"
+    command = ["explore", "--rooms", "rectangular", "--max-steps", "12", "--out", str(out), "--video"]
+    assert main(command) == 0
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+
+    def failing(*_: Any, **__: Any) -> Any:
+        raise RuntimeError("of a test")
+
+    monkeypatch.setattr("training.episode_files.episode_page", failing)
+    assert main(command) == 1
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before

@@ -18,8 +18,9 @@ from mecanum_env.env import ExploreEnv
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from training import explore
 from training.episode_files import write_episode
-from training.episode_report import LOST, NO_RETURN, pack, unpack
+from training.episode_report import LOST, NO_RETURN, _thinned, pack, unpack
 from training.explore import ExploreOptions
+from training.recording import Recorded as Recording_
 from training.recording import Recorder, Recording, _MapFollower
 
 STEPS = 120
@@ -187,6 +188,12 @@ def test_names_from_outside_cannot_leave_their_place(tmp_path: Path) -> None:
     assert page_data(page)[0]["rows"] == episode.env.truth.record.times.size
 
 
+def test_of_many_notes_the_first_and_the_last_stay() -> None:
+    many = Recording_(np.arange(0, 3000, 10, dtype=np.int32), tuple(np.zeros((k, 5)) for k in range(300)))
+    kept = _thinned(many, 240)
+    assert kept.steps[0] == 0 and kept.steps[-1] == 2990 and len(kept.steps) <= 240
+
+
 def test_a_recorder_is_ready_for_an_episode_of_no_step(tmp_path: Path) -> None:
     episode = explore.prepare(ExploreOptions(out=tmp_path, rooms="rectangular"))
     recorder = Recorder()
@@ -267,6 +274,7 @@ def test_keys_and_buttons_drive_the_replay(browser: Any, episode: Recorded) -> N
     for key, expected in ((Keys.HOME, 0), (Keys.ARROW_RIGHT, 10), (Keys.ARROW_RIGHT, 20), (Keys.ARROW_LEFT, 10)):
         body.send_keys(key)
         assert browser.execute_script(row) == expected
+    browser.execute_script("document.getElementById('speed').value = 1")
     browser.find_element("id", "play").click()
     assert browser.execute_script("return replay.playing")
     WebDriverWait(browser, 10).until(lambda b: b.execute_script(row) > 15)
@@ -278,6 +286,27 @@ def test_keys_and_buttons_drive_the_replay(browser: Any, episode: Recorded) -> N
     browser.find_element("css selector", "[data-layer=landmarks]").click()
     settled(browser)
     assert browser.execute_script(picture) != before
+
+
+def test_it_plays_from_the_end_whenever_it_is_pressed(browser: Any, episode: Recorded) -> None:
+    opened(browser, episode)
+    for _ in range(12):
+        browser.execute_script("replay.seek(replay.header.rows - 1)")
+        settled(browser)
+        browser.find_element("id", "play").click()
+        settled(browser)
+        assert browser.execute_script("return replay.playing && replay.k >= 0")
+        browser.execute_script("replay.pause()")
+    assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+def test_a_layer_is_switched_by_keys_too(browser: Any, episode: Recorded) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    opened(browser, episode)
+    browser.find_element("id", "speed").send_keys(Keys.TAB + Keys.SPACE)
+    assert not browser.find_element("css selector", "[data-layer=scan]").is_selected()
+    assert not browser.execute_script("return replay.playing")
 
 
 def test_the_belief_is_drawn_where_it_is(browser: Any, episode: Recorded) -> None:

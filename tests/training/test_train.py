@@ -82,6 +82,10 @@ def test_a_configuration_is_laid_over_the_base_it_names(tmp_path):
     assert (mine.seed, mine.ppo, mine.imitation) == (7, base.ppo, base.imitation)
     assert mine.world.driver["control"] == base.world.driver["control"] | {"speed_share": 0.5}
     assert mine.world.driver["patience"] == base.world.driver["patience"]
+    (tmp_path / "below").mkdir()
+    (tmp_path / "below" / "other.toml").write_text("seed = 5\n")
+    (tmp_path / "below" / "upon.toml").write_text('base = "other.toml"\n')
+    assert _read(str(tmp_path / "below" / "upon.toml"), None).seed == 5, "beside the file that names it"
 
 
 @pytest.mark.parametrize(
@@ -92,6 +96,7 @@ def test_a_configuration_is_laid_over_the_base_it_names(tmp_path):
         (["--config", "{folder}/wrong.toml"], "unknown key of TrainConfig"),
         (["--config", "{folder}/seeds.toml"], "training seeds"),
         (["--config", "{folder}/based.toml"], "no configuration 'nowhere'"),
+        (["--config", "{folder}/five.toml"], "base is the name of a configuration"),
         (["--config", "{folder}/twice.toml"], "the base of a configuration has none itself"),
         (["--resume"], "holds no run to go on with"),
     ],
@@ -100,6 +105,7 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     (tmp_path / "bad.toml").write_text("seed = ")
     (tmp_path / "wrong.toml").write_text("sede = 1")
     (tmp_path / "based.toml").write_text('base = "nowhere"')
+    (tmp_path / "five.toml").write_text("base = 5")
     (tmp_path / "twice.toml").write_text('base = "ppo-frontier-without-warm-start"')
     (tmp_path / "seeds.toml").write_text("[world]\nseeds = [0, 10000]")
     arguments = [a.format(folder=tmp_path) for a in arguments]

@@ -69,7 +69,7 @@
     const image = context.createImageData(cols, rows), pixels = new Uint32Array(image.data.buffer);
     const classes = new Uint8Array(rows * cols); // 0 unknown, 1 free, 101 occupied
     const shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 };
-    let done = 0, gap = 0, cell = 0;
+    let done = 0, gap = 0, cell = 0, edge = null;
     function clear() {
       done = gap = cell = 0;
       classes.fill(0);
@@ -91,10 +91,12 @@
         }
       }
       context.putImageData(image, 0, 0);
+      edge = null;
     }
     // Free cells beside unknown ones, as a path of squares on a canvas whose unit is the cell.
     function frontiers() {
-      const path = new Path2D();
+      if (edge) return edge;
+      const path = edge = new Path2D();
       for (let row = 1; row < rows - 1; row++) {
         for (let i = row * cols + 1; i < (row + 1) * cols - 1; i++) {
           if (classes[i] !== 1) continue;
@@ -134,7 +136,8 @@
     return { c, w, h, ratio };
   }
 
-  function begin(canvas) {
+  // `poses`: of the robot that is followed, where one is.
+  function begin(canvas, poses) {
     const width = canvas.clientWidth;
     const stacked = wide || window.innerWidth < 640;
     const most = Math.max((stacked ? 0.36 : 0.72) * window.innerHeight, 220);
@@ -143,7 +146,8 @@
     c.fillStyle = "#dee1e4";
     c.fillRect(0, 0, w, h);
     const scale = Math.min(w / box.w, h / box.h) * view.zoom;
-    c.setTransform(scale, 0, 0, -scale, w / 2 - view.x * scale, h / 2 + view.y * scale);
+    const [x, y] = layers.follow ? [poses[3 * k], poses[3 * k + 1]] : [view.x, view.y];
+    c.setTransform(scale, 0, 0, -scale, w / 2 - x * scale, h / 2 + y * scale);
     canvas.scale = scale / ratio;
     return { c, px: ratio / scale }; // px: a pixel of the page in metres
   }
@@ -214,7 +218,7 @@
   }
 
   function drawWorld(k) {
-    const { c, px } = begin(canvases[0]);
+    const { c, px } = begin(canvases[0], data.true);
     image(c, truth, box.x, box.y, box.w, box.h, true);
     if (layers.scan) scan(c, k, px);
     if (layers.paths) path(c, data.true, k, colours.truth, px);
@@ -222,11 +226,11 @@
   }
 
   function drawBelief(k) {
-    const { c, px } = begin(canvases[1]);
+    const { c, px } = begin(canvases[1], data.estimate);
     const m = header.map, left = m.col0 * m.resolution, top = (m.row0 + m.rows) * m.resolution;
     map.show(k);
     image(c, map.canvas, left, top, m.cols * m.resolution, m.rows * m.resolution, canvases[1].scale * m.resolution < 2);
-    if (layers.frontiers && m.rows * m.cols < 1.5e6) {
+    if (layers.frontiers) {
       c.save();
       c.translate(left, top);
       c.scale(m.resolution, -m.resolution);
@@ -352,22 +356,20 @@
     for (const second of seconds) c.fillText(`${+second.toPrecision(3)} s`, Math.min(x(second / step), right - 10), height - 7);
     // More rows than pixels: of each pixel's rows the highest, so that no spike is lost.
     const stride = Math.max(1, Math.floor(n / (2 * width)));
-    function line(values, sign) {
+    function peaks(values) {
+      const found = [];
       for (let row = 0; row < n; row += stride) {
         let value = values[row];
         for (let j = row + 1; j < Math.min(row + stride, n); j++) if (Math.abs(values[j]) > Math.abs(value)) value = values[j];
-        if (Number.isFinite(value)) c.lineTo(x(row), y(sign * value));
+        if (Number.isFinite(value)) found.push([row, value]);
       }
+      return found;
     }
     if (curve.band) {
+      const upper = peaks(curve.band);
       c.beginPath();
-      line(curve.band, 1);
-      if (curve.signed) {
-        for (let row = n - 1; row >= 0; row -= stride) c.lineTo(x(row), y(-curve.band[row]));
-      } else {
-        c.lineTo(x(n - 1), y(0));
-        c.lineTo(x(0), y(0));
-      }
+      for (const [row, value] of upper) c.lineTo(x(row), y(value));
+      for (const [row, value] of upper.reverse()) c.lineTo(x(row), y(curve.signed ? -value : 0));
       c.globalAlpha = 0.16;
       c.fillStyle = tone(curve.colour);
       c.fill();
@@ -383,7 +385,7 @@
       c.setLineDash([]);
     }
     c.beginPath();
-    line(curve.values, 1);
+    for (const [row, value] of peaks(curve.values)) c.lineTo(x(row), y(value));
     Object.assign(c, { strokeStyle: tone(curve.colour), lineWidth: 1.6, lineJoin: "round" });
     c.stroke();
     Object.assign(c, { strokeStyle: tone("--goal"), lineWidth: 1.5 });
@@ -414,7 +416,6 @@
 
   function draw() {
     due = false;
-    if (layers.follow) { view.x = data.estimate[3 * k]; view.y = data.estimate[3 * k + 1]; }
     drawWorld(k);
     drawBelief(k);
     for (const curve of curves) drawCurve(curve, k);
@@ -439,14 +440,15 @@
   function play() {
     if (k >= n - 1) seek(0);
     playing = true;
-    last = performance.now();
+    last = undefined;
     button.textContent = "❚❚";
     button.setAttribute("aria-label", "Pause");
     requestAnimationFrame(tick);
   }
   function tick(now) {
     if (!playing) return;
-    exact = Math.min(exact + ((now - last) / 1e3 / step) * Number(speed.value), n - 1);
+    const passed = last === undefined ? 0 : Math.max(now - last, 0);
+    exact = Math.min(exact + (passed / 1e3 / step) * Number(speed.value), n - 1);
     last = now;
     if (Math.floor(exact) !== k) { k = Math.floor(exact); draw(); }
     if (exact >= n - 1) pause(); else requestAnimationFrame(tick);
@@ -459,7 +461,7 @@
       layers[input.dataset.layer] = input.checked;
       if (input.dataset.layer === "follow") {
         if (input.checked && view.zoom < 2) zoom(3 / view.zoom);
-        if (!input.checked) whole();
+        else if (!input.checked) whole();
       }
       redraw();
     });
@@ -470,11 +472,12 @@
       " ": () => (playing ? pause() : play()),
       ArrowLeft: () => { pause(); seek(k - second); },
       ArrowRight: () => { pause(); seek(k + second); },
-      Home: () => seek(0),
+      Home: () => { pause(); seek(0); },
       End: () => { pause(); seek(n - 1); },
     }[event.key];
     if (!does || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select, summary")) return;
-    if (event.key === " " && event.target === button) return; // the button does so itself
+    // The button does so itself, and so does a box that was reached by keys.
+    if (event.key === " " && event.target.matches("#play, input[type=checkbox]:focus-visible")) return;
     event.preventDefault();
     does();
   });
@@ -482,24 +485,28 @@
   // ---- zooming, both views alike ---------------------------------------------------------------------------------
 
   function zoom(factor) {
+    if (!(factor > 0)) return; // two fingers on one spot
     view.zoom = Math.min(Math.max(view.zoom * factor, 1), 40);
-    if (view.zoom === 1) whole();
+    if (view.zoom === 1 && !layers.follow) whole();
     for (const canvas of canvases) canvas.classList.toggle("zoomed", view.zoom > 1);
     redraw();
   }
   function whole() {
     Object.assign(view, { zoom: 1, x: box.x + box.w / 2, y: box.y - box.h / 2 });
+    layers.follow = document.querySelector("[data-layer=follow]").checked = false;
     for (const canvas of canvases) canvas.classList.remove("zoomed");
     redraw();
   }
   for (const canvas of canvases) {
     const touching = new Map();
+    let meant = false; // the wheel: a click in the view says so, leaving it takes that back
+    canvas.addEventListener("pointerleave", () => { meant = false; });
     const spread = () => {
       const [a, b] = [...touching.values()];
       return Math.hypot(a.x - b.x, a.y - b.y);
     };
     canvas.addEventListener("wheel", (event) => {
-      if (view.zoom === 1 && event.deltaY > 0) return; // the page scrolls on
+      if (!event.ctrlKey && !meant && view.zoom === 1) return; // the page scrolls on
       event.preventDefault();
       const factor = Math.exp(-0.0016 * event.deltaY);
       const dx = (event.offsetX - canvas.clientWidth / 2) / canvas.scale;
@@ -509,6 +516,7 @@
     }, { passive: false });
     canvas.addEventListener("pointerdown", (event) => {
       touching.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      meant = true;
     });
     canvas.addEventListener("pointermove", (event) => {
       const before = touching.get(event.pointerId);
@@ -532,7 +540,11 @@
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   drawMarks();
   // report.html#t=12.5 opens at that time; otherwise the whole path and map are shown first.
-  const asked = /#t=([\d.]+)/.exec(location.hash);
-  seek(asked ? Math.round(Number(asked[1]) / step) : n - 1);
+  function asked() {
+    const time = Number(/#t=([\d.]+)/.exec(location.hash)?.[1] ?? NaN);
+    return Number.isFinite(time) ? Math.round(time / step) : n - 1;
+  }
+  window.addEventListener("hashchange", () => { pause(); seek(asked()); });
+  seek(asked());
   window.replay = { seek, play, pause, data, header, map, get k() { return k; }, get playing() { return playing; } };
 })();
