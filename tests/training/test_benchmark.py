@@ -305,7 +305,7 @@ def alive(pid: int) -> bool:
 def test_the_documented_agent_is_found_by_its_entry_point(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = (Path(__file__).resolve().parents[2] / "docs" / "benchmark.md").read_text("utf-8")
+    text = (Path(__file__).resolve().parents[2] / "BENCHMARK.md").read_text("utf-8")
     code = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     assert len(code.splitlines()) <= 20
     toml = tomllib.loads(re.findall(r"```toml\n(.*?)```", text, re.DOTALL)[0])
@@ -319,15 +319,15 @@ def test_the_documented_agent_is_found_by_its_entry_point(
     monkeypatch.syspath_prepend(site)
     agents._installed.cache_clear()
     try:
-        result = measure(small(tmp_path / "out", "--agents", "farthest-frontier", seeds="0"), capsys)
-        (info / "entry_points.txt").write_text(f"[{group}]\nfarthest-frontier = nowhere:Agent\n")
+        result = measure(small(tmp_path / "out", "--agents", "most-area-per-metre", seeds="0"), capsys)
+        (info / "entry_points.txt").write_text(f"[{group}]\nmost-area-per-metre = nowhere:Agent\n")
         agents._installed.cache_clear()
-        line = refused(small(tmp_path / "out", "--agents", "farthest-frontier"), capsys)
+        line = refused(small(tmp_path / "out", "--agents", "most-area-per-metre"), capsys)
     finally:
         monkeypatch.undo()
         agents._installed.cache_clear()
-    assert result["rooms"]["farthest-frontier"]["coverage"]["value"] > 0.3
-    assert "cannot load agent farthest-frontier" in line and "nowhere" in line
+    assert result["rooms"]["most-area-per-metre"]["coverage"]["value"] > 0.3
+    assert "cannot load agent most-area-per-metre" in line and "nowhere" in line
 
 
 # ---- what is refused -------------------------------------------------------------------------------------------
