@@ -7,7 +7,6 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +22,6 @@ from mecanum_env.window import NoDisplay, Window, _fitted
 ROOT = Path(__file__).resolve().parents[2]
 IDS = ("mecanum_env/Explore-v0", "mecanum_env/ExploreWheels-v0", "mecanum_env/ExploreFrontier-v0")
 FAST = 10_000  # frames a second: tests do not watch
-
-
-@pytest.fixture
-def pygame(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    module = pytest.importorskip("pygame", reason="needs the extra `human`")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    yield module
-    module.display.quit()
 
 
 def make(env_id: str = IDS[0], *, fps: float = FAST, **kwargs: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -141,14 +140,6 @@ def test_what_does_not_fit_is_shortened() -> None:
 
 
 # ---- in a window ---------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def pygame(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    module = pytest.importorskip("pygame", reason="needs the extra `human`")
-    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    yield module
-    module.display.quit()
 
 
 class Player:
