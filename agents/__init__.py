@@ -23,6 +23,7 @@ _REGISTRY = {
     "brisk-tour": "agents.brisk_tour:BriskTour",
     "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
+    "learned-tour": "agents.learned_tour:LearnedTour",
     "nearest-frontier": "agents.frontier:NearestFrontier",
     "next-best-view": "agents.next_best_view:NextBestView",
     "ppo": "agents.drive_policy:Ppo",
@@ -36,7 +37,11 @@ GROUP = "mecanum_slam.agents"
 """Entry points of this group, ``name = "module:class"``, are agents, too: so other packages add theirs."""
 
 
-_POLICIES = {"mecanum-slam choice policy 1": "ppo-frontier", "mecanum-slam drive policy 1": "ppo"}
+_POLICIES = {
+    "mecanum-slam choice policy 1": "ppo-frontier",
+    "mecanum-slam drive policy 1": "ppo",
+    "mecanum-slam station policy 1": "learned-tour",
+}
 """The formats of trained policies, and the agents that read them."""
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.convolution import convolve
 from agents.drive_plan import descend, distances, node_prices
 
 __all__ = [
@@ -70,25 +71,6 @@ class Plan(NamedTuple):
     prices: Floats  # (PATH_POINTS,) log price of a metre at each of the resampled points
     points: Floats  # (PATH_POINTS, 2) the path resampled [m]
     length: float  # of the path within the local map [m]
-
-
-def convolve(x: Floats, weight: Floats, bias: Floats, dilation: int = 1) -> Floats:
-    """Return the convolution ``(out, n, m)`` of ``(in, n, m)``, padded to the same size."""
-    out, channels, k, _ = weight.shape
-    if k == 1:
-        flat = weight.reshape(out, channels) @ x.reshape(channels, -1)
-    else:
-        pad = dilation * (k // 2)
-        rows, cols = x.shape[1:]
-        padded = np.zeros((channels, rows + 2 * pad, cols + 2 * pad), np.float32)
-        padded[:, pad:-pad, pad:-pad] = x
-        c, i, j = padded.strides
-        view = np.lib.stride_tricks.as_strided(
-            padded, (channels, k, k, rows, cols), (c, dilation * i, dilation * j, i, j), writeable=False
-        )
-        flat = weight.reshape(out, -1) @ view.reshape(channels * k * k, rows * cols)
-    flat += bias[:, None]
-    return np.asarray(flat.reshape(out, *x.shape[1:]))
 
 
 def stack(weights: Mapping[str, Floats], name: str, maps: Bytes) -> Floats:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from slam.occupancy import FREE
 
-__all__ = ["count_in_sight", "in_sight", "join", "line_is_free", "ways"]
+__all__ = ["count_in_sight", "edges", "in_sight", "join", "lengths", "line_is_free", "ways"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -109,3 +109,45 @@ def ways(cells: Cells, joined: Cells, start: int) -> tuple[Array, Cells]:
             if total < length[j] - 1e-9 or (total < length[j] + 1e-9 and hops[i] + 1 > hops[j]):
                 length[j], before[j], hops[j] = total, i, hops[i] + 1
     return length, before
+
+
+@njit(cache=True, nogil=True)
+def edges(cells: Cells, joined: Cells) -> tuple[NDArray[np.int32], Array, NDArray[np.int32]]:
+    """Return the hops of :func:`join` without gaps: neighbours ``(n, k)``, distances in cells, their number."""
+    n, most = joined.shape
+    to, length, count = np.empty((n, most), np.int32), np.empty((n, most)), np.zeros(n, np.int32)
+    for i in range(n):
+        for k in range(most):
+            j = joined[i, k]
+            if j >= 0:
+                to[i, count[i]] = j
+                length[i, count[i]] = math.hypot(cells[j, 0] - cells[i, 0], cells[j, 1] - cells[i, 1])
+                count[i] += 1
+    return to, length, count
+
+
+@njit(cache=True, nogil=True)
+def lengths(to: NDArray[np.int32], length: Array, count: NDArray[np.int32], start: int) -> Array:
+    """Return the length of the way from one station to each ``(n,)`` in cells, over :func:`edges`.
+
+    What :func:`ways` returns without the ways themselves, several times as fast: stations are corrected in the
+    order in which they were found (a queue), which on a lattice hardly ever corrects one twice.
+    """
+    n = len(to)
+    found = np.full(n, np.inf)
+    queue, waiting = np.empty(n + 1, np.int32), np.zeros(n, np.bool_)
+    first, beyond = 0, 1
+    queue[0], found[start], waiting[start] = start, 0.0, True
+    while first != beyond:
+        i = queue[first]
+        first = (first + 1) % (n + 1)
+        waiting[i] = False
+        for k in range(count[i]):
+            j, total = to[i, k], found[i] + length[i, k]
+            if total < found[j] - 1e-9:
+                found[j] = total
+                if not waiting[j]:
+                    waiting[j] = True
+                    queue[beyond] = j
+                    beyond = (beyond + 1) % (n + 1)
+    return found

@@ -11,31 +11,32 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.station_survey import HOP, STRIDE, VOXEL
 from agents.stations import count_in_sight, join, ways
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from training.errors import BadInput
 
-__all__ = ["CELL_M", "HOP", "RANGE_M", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "load", "scan"]
+__all__ = [
+    "CELL_M", "HOP", "RANGE_M", "STRIDE", "TREE", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "load",
+    "look", "scan",
+]  # fmt: skip
 
 CELL_M = 0.4
 """Side of a cell [m], two pixels of a map."""
 RANGE_M = 20.0
 """Range of the sensor [m]."""
-STRIDE = 10
-"""Cells between two way-points: 4 m."""
-HOP = 2
-"""Way-points a hop may go along each axis: at most 2 · √2 · 4 m = 11.3 m."""
 
 _SEEN_FROM = 40.0  # cells: frontiers count as in sight of a way-point up to 16 m away
-_VOXEL = 4  # cells: frontier cells within 1.6 m of lattice count as one
 _WORTH = 2  # of these make a way-point worth a visit
 _RAYS = 720
+_UNKNOWN = int(UNKNOWN)
 _WALL_BELOW, _START = 150, 208  # pixel values
 _MOST_PIXELS = 4000  # a side
 
@@ -84,9 +85,13 @@ def dungeon_of(pixels: NDArray[np.uint8], name: str) -> Dungeon:
     return Dungeon(name, pooled > _WALL_BELOW, (int(row), int(col)))
 
 
-def scan(free: NDArray[np.bool_], row: int, col: int, known: NDArray[np.int8]) -> None:
-    """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell."""
-    _scan(free, row, col, RANGE_M / CELL_M, known)
+def scan(free: NDArray[np.bool_], row: int, col: int, known: NDArray[np.int8]) -> NDArray[np.int64]:
+    """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell.
+
+    Returns ``(4,)`` the first and last row and column in which a cell became known; the last ones −1 where none
+    did.
+    """
+    return np.asarray(look(free, row, col, TREE, known))
 
 
 class Lattice:
@@ -148,27 +153,64 @@ def frontier_points(known: NDArray[np.int8]) -> NDArray[np.int64]:
     cells = np.argwhere((known == FREE) & (around > 1.5) & (around < 7.5))
     if not len(cells):
         return np.zeros((0, 2), dtype=np.int64)
-    square = cells // _VOXEL
-    away = np.sum((cells - square * _VOXEL - 0.5 * (_VOXEL - 1)) ** 2, axis=1)
-    key = square[:, 0] * (known.shape[1] // _VOXEL + 1) + square[:, 1]
+    square = cells // VOXEL
+    away = np.sum((cells - square * VOXEL - 0.5 * (VOXEL - 1)) ** 2, axis=1)
+    key = square[:, 0] * (known.shape[1] // VOXEL + 1) + square[:, 1]
     order = np.lexsort((away, key))
     _, first = np.unique(key[order], return_index=True)
     return np.asarray(cells[order[first]])
 
 
-@njit(cache=True, nogil=True)
-def _scan(free: NDArray[np.bool_], row: int, col: int, reach: float, known: NDArray[np.int8]) -> None:
-    rows, cols = free.shape
+def _tree_of_rays() -> NDArray[np.int32]:
+    """Return the rays as one tree ``(n, 3)``, depth first: row and column from the sensor, and where to go on.
+
+    To go on where a wall hides all that is behind. Near the sensor many rays pass the same cells: a third is left.
+    """
+    reach = RANGE_M / CELL_M
+    root: dict[tuple[int, int], Any] = {}
     for k in range(_RAYS):
         angle = 2.0 * math.pi * k / _RAYS
-        dr = math.floor(reach * math.sin(angle) + 0.5)
-        dc = math.floor(reach * math.cos(angle) + 0.5)
-        count = int(max(abs(dr), abs(dc)))
+        dr, dc = math.floor(reach * math.sin(angle) + 0.5), math.floor(reach * math.cos(angle) + 0.5)
+        count = max(abs(dr), abs(dc))
+        node = root
         for i in range(count):
             share = i / count
-            r, c = math.floor(row + share * dr + 0.5), math.floor(col + share * dc + 0.5)
-            if r < 0 or c < 0 or r >= rows or c >= cols or not free[r, c]:
-                break
-            for rr in range(max(r - 1, 0), min(r + 2, rows)):
-                for cc in range(max(c - 1, 0), min(c + 2, cols)):
+            node = node.setdefault((math.floor(share * dr + 0.5), math.floor(share * dc + 0.5)), {})
+    rows: list[list[int]] = []
+
+    def walk(node: dict[tuple[int, int], Any]) -> None:
+        for cell, behind in node.items():
+            own = [*cell, 0]
+            rows.append(own)
+            walk(behind)
+            own[2] = len(rows)
+
+    walk(root)
+    return np.array(rows, dtype=np.int32)
+
+
+TREE = _tree_of_rays()
+"""The sensor's rays, for :func:`look`."""
+
+
+@njit(cache=True, nogil=True)
+def look(
+    free: NDArray[np.bool_], row: int, col: int, tree: NDArray[np.int32], known: NDArray[np.int8]
+) -> NDArray[np.int64]:
+    """Compiled :func:`scan`, with the tree of rays."""
+    rows, cols = free.shape
+    box = np.array([rows, -1, cols, -1])
+    i = 0
+    while i < len(tree):
+        r, c = row + tree[i, 0], col + tree[i, 1]
+        if r < 0 or c < 0 or r >= rows or c >= cols or not free[r, c]:
+            i = tree[i, 2]
+            continue
+        i += 1
+        for rr in range(max(r - 1, 0), min(r + 2, rows)):
+            for cc in range(max(c - 1, 0), min(c + 2, cols)):
+                if known[rr, cc] == _UNKNOWN:
                     known[rr, cc] = FREE if free[rr, cc] else OCCUPIED
+                    box[0], box[1] = min(box[0], rr), max(box[1], rr)
+                    box[2], box[3] = min(box[2], cc), max(box[3], cc)
+    return box

@@ -137,7 +137,7 @@ def test_frontiers_are_counted_by_squares():
 # ---- an episode ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["nearest-frontier", "tour"])
+@pytest.mark.parametrize("name", ["nearest-frontier", "tour", "learned-tour"])
 def test_a_corridor_is_as_long_as_it_is(name):
     """The end, at 54.4 m from the start, comes into sight from 36 m: nine hops of 4 m."""
     dungeon = corridor(55.6)
@@ -272,7 +272,10 @@ def test_the_ratio_is_of_means_and_has_an_interval():
     base = rng.uniform(400, 800, 40)
     rows = [row("nearest-frontier", str(i), v) for i, v in enumerate(base)]
     rows += [row("tour", str(i), 0.9 * v + rng.normal(0, 20)) for i, v in enumerate(base)]
+    assert "to_nearest_way_point" not in summarise(rows)["tour"]
+    rows += [row(NEAREST, str(i), 1.2 * v) for i, v in enumerate(base)]
     own = summarise(rows)["tour"]
+    assert own["to_nearest_way_point"]["ratio"] == pytest.approx(own["ratio"] / 1.2)
     assert own["ratio"] == pytest.approx(0.9, abs=0.02)
     assert own["ratio_low"] < own["ratio"] < own["ratio_high"] < 0.93
 

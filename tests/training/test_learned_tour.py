@@ -1,0 +1,219 @@
+"""Lessons for the learned tour, and what learns from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from agents.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
+from agents.station_survey import begin, find_pieces, first_hop, no_pieces, options
+from slam.occupancy import UNKNOWN
+from training import dungeon_networks
+from training.dungeon_episode import _Run
+from training.dungeon_lessons import LUCK, MOST, REACH, Walk, gather, lessons_of, read_lessons
+from training.dungeon_plans import dungeon_plan, loops
+from training.dungeon_world import CELL_M, Lattice, frontier_points
+from training.learned_tour import TrainingConfig, batch_of, main, train, turned
+
+# ---- plans -----------------------------------------------------------------------------------------------------
+
+
+def test_plans_are_like_the_published_maps():
+    shares, plans = [], [dungeon_plan(seed) for seed in range(12)]
+    for plan in plans:
+        tiles = np.array([[plan.free[int(12.5 * i) + 3, int(12.5 * j) + 3] for j in range(20)] for i in range(20)])
+        assert plan.free.shape == (250, 250) and plan.free[plan.start] and loops(tiles) == 1
+        assert not tiles[[0, -1]].any() and not tiles[:, [0, -1]].any()
+        shares.append(tiles.mean())
+        # All of it can be reached: an episode by the nearest way-point sees every free cell but a few.
+    assert 0.38 < np.mean(shares) < 0.46
+    assert len({plan.start for plan in plans}) > 6
+    again = dungeon_plan(3)
+    np.testing.assert_array_equal(again.free, plans[3].free)
+    assert again.start == plans[3].start
+
+
+# ---- lessons ---------------------------------------------------------------------------------------------------
+
+
+def test_a_walk_sees_and_counts_as_the_protocol_does():
+    """Stations, ways, pieces and what is worth a visit, against the protocol's own count at every stop."""
+    plan = dungeon_plan(4)
+    walk, run = Walk(plan), _Run(plan, continuous=False)
+    for _ in range(12):
+        run.look()
+        found = walk.survey()
+        lattice = Lattice(walk.known, plan.start)
+        np.testing.assert_array_equal(walk.known, run.known)
+        np.testing.assert_array_equal(found.cells, lattice.cells)
+        np.testing.assert_array_equal(found.pieces, frontier_points(walk.known))
+        np.testing.assert_array_equal(found.worth, run.worth)
+        np.testing.assert_allclose(found.way * CELL_M, run._length)
+        np.testing.assert_array_equal(found.before, run._before)
+        target = int(found.places[begin(found, LUCK)])
+        hop = found.cells[first_hop(found.before, found.places[0], target)]
+        walk.hop((int(hop[0]), int(hop[1])))
+        run.hop_towards(target)
+    assert walk.path_m == pytest.approx(run.path_m)
+
+
+def test_the_rest_of_the_tour_is_what_the_tour_takes():
+    walk = Walk(dungeon_plan(2))
+    found = walk.survey()
+    hop = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
+    foreseen = walk.rest_m((int(hop[0]), int(hop[1])))
+    assert walk.path_m == 0.0 and not walk.visited[tuple(hop)]
+    while (found := walk.survey()).worth.any():
+        cell = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
+        walk.hop((int(cell[0]), int(cell[1])))
+    assert walk.path_m == pytest.approx(foreseen)
+    assert (walk.plan.free & (walk.known == UNKNOWN)).sum() <= 25
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """Lessons of two plans to learn from and one to validate on."""
+    out = tmp_path_factory.mktemp("run")
+    gather(out / "lessons", range(2))
+    gather(out / "lessons", range(1000, 1001))
+    return out
+
+
+def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
+    folder = run_folder / "lessons"
+    dates = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+    assert set(dates) == {"000000.npz", "000001.npz", "001000.npz"}
+    gather(folder, range(2))
+    assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == dates
+    lessons, own = read_lessons(folder, range(2)), lessons_of(1)
+    assert len(lessons.planes) > len(own.planes) > 5
+    for field in dataclasses.fields(own):
+        theirs = getattr(lessons, field.name)[-len(own.planes) :]
+        np.testing.assert_array_equal(theirs, getattr(own, field.name))
+    assert np.isfinite(own.path_m[:, :2]).all() and (own.path_m[:, 0] > 0).all()
+    # What lies open in the truth is at least what is known to.
+    assert (own.free.astype(int) * 4 + 1 >= own.planes[:, :4]).all()
+
+
+def test_turning_a_lesson_turns_all_of_it(run_folder):
+    batch = batch_of(read_lessons(run_folder / "lessons", range(1)), np.arange(4))
+    round_again = batch
+    for _ in range(4):
+        round_again = turned(round_again, 1, False)
+    twice = turned(turned(batch, 0, True), 0, True)
+    for field in dataclasses.fields(batch):
+        for other in (round_again, twice):
+            np.testing.assert_array_equal(getattr(other, field.name), getattr(batch, field.name))
+    # The cells themselves, two by two to a pixel: turned as a whole they are turned within each pixel, too.
+    fine = batch.planes[:, :4].reshape(4, 2, 2, SIDE, SIDE).transpose(0, 3, 1, 4, 2).reshape(4, 2 * SIDE, 2 * SIDE)
+    for quarters, mirrored in ((1, False), (3, True)):
+        other = turned(batch, quarters, mirrored)
+        expected = np.rot90(fine, quarters, axes=(1, 2))
+        expected = expected[:, :, ::-1] if mirrored else expected
+        own = (
+            other.planes[:, :4]
+            .reshape(4, 2, 2, SIDE, SIDE)
+            .transpose(0, 3, 1, 4, 2)
+            .reshape(4, 2 * SIDE, 2 * SIDE)
+        )
+        np.testing.assert_array_equal(own, expected)
+        for k in range(4):  # a place keeps what is drawn there
+            before, after = batch.targets[k, 0], other.targets[k, 0]
+            np.testing.assert_array_equal(
+                batch.planes[k, 8:, before[0], before[1]], other.planes[k, 8:, after[0], after[1]]
+            )
+
+
+# ---- the network -----------------------------------------------------------------------------------------------
+
+
+def test_numpy_computes_what_pytorch_does():
+    torch.manual_seed(3)
+    network = dungeon_networks.StationNetwork().to(memory_format=torch.channels_last)
+    weights = {name: np.asarray(value.numpy(), order="C") for name, value in network.state_dict().items()}
+    walk = Walk(dungeon_plan(1))
+    found = walk.survey()
+    openings = options(found, LUCK, most=MOST, most_loss_m=40.0)
+    shown = picture(walk.known, walk.visited, walk.plan.start, CELL_M, found)
+    targets, hops = (pixels(found.cells[at], walk.plan.start, shown) for at in (openings.targets, openings.hops))
+    with torch.no_grad():
+        numbers = torch.tensor(opening_numbers(openings.losses, openings.legs))[None]
+        scores, odds = network(
+            torch.tensor(shown.planes)[None], torch.tensor(targets)[None], torch.tensor(hops)[None], numbers
+        )
+    np.testing.assert_allclose(
+        StationNetwork(weights).costs_m(shown, targets, hops, openings), 20.0 * scores[0].numpy(), atol=1e-4
+    )
+    assert odds.shape == (1, 4, SIDE, SIDE)
+
+
+def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
+    config = TrainingConfig(plans=2, validation_plans=1, epochs=2, batch=8)
+    whole, curve = train(run_folder, config)
+    assert [point["epoch"] for point in curve] == [1, 2] and curve[1]["cost"] < 2.0 * curve[0]["cost"]
+    (tmp_path / "lessons").symlink_to(run_folder / "lessons")
+    from training import learned_tour
+
+    kept = learned_tour._keep
+
+    def stop(*arguments):
+        kept(*arguments)
+        raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(learned_tour, "_keep", stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path, config)
+    again, _ = train(tmp_path, config)
+    for name, value in whole.state_dict().items():
+        np.testing.assert_array_equal(again.state_dict()[name], value, err_msg=name)
+
+
+def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys):
+    import agents
+    from training.dungeon_episode import explore
+
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "lessons").symlink_to(run_folder / "lessons")
+    arguments = ["--out", str(out), "--plans", "2", "--validation-plans", "1", "--epochs", "1", "--batch", "8"]
+    assert main(arguments) == 0
+    path = out / "learned-tour.safetensors"
+    assert capsys.readouterr().out.strip() == str(path)
+    about = json.loads(path.with_suffix(".json").read_text())
+    assert about["config"]["plans"] == 2 and len(about["curve"]) == 1 and "--epochs=1" in about["command"]
+    assert agents.make(str(path)).about == about
+    row = explore(dungeon_plan(5), str(path))
+    assert row["end"] == "covered" and row["coverage"] > 0.99
+    # The same folder for another training is refused.
+    assert main([*arguments[:-1], "16"]) == 2
+    assert "batch" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (["--plans", "0"], "--plans"),
+        (["--plans", "1001"], "1000"),
+        (["--epochs", "0"], "--epochs"),
+        (["--workers", "0"], "--workers"),
+    ],
+)
+def test_bad_input_is_one_line(change, says, tmp_path, capsys):
+    assert main(["--out", str(tmp_path / "out"), *change]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+def test_the_tour_reaches_as_far_as_the_agent_is_told():
+    import agents
+
+    assert agents.make("learned-tour").config.stations.reach_m == pytest.approx(REACH * CELL_M)
+    known = np.full((20, 20), UNKNOWN, np.int8)
+    pieces = no_pieces(known.shape)
+    find_pieces(known, pieces, np.array([0, 19, 0, 19]))
+    assert (pieces < 0).all()
