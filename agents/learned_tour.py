@@ -34,7 +34,6 @@ PRECISION = np.float16
 SHIPPED = Path(__file__).parent / "policies" / "learned-tour.safetensors"
 
 _LUCK = draw_luck(6, 700)
-_MARGIN = 2 * STRIDE * VOXEL  # cells: the squares of frontier lie alike however the grid has grown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +110,7 @@ class LearnedTour(Tour):
         visited = np.zeros(known.shape, dtype=np.bool_)
         for pose in self._stops:
             visited[_cell_of(pose, resolution, corner)] = True
-        first = (-corner[0], -corner[1])  # the frame's origin lies in the first station's cell
+        first = _cell_of(self._start, resolution, corner)
         if any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
             return super().choose(belief)
         pieces = no_pieces(known.shape)
@@ -146,13 +145,13 @@ class LearnedTour(Tour):
 def _aligned(belief: Belief) -> tuple[NDArray[np.int8], tuple[int, int]]:
     """Return the classes of what is known, with a margin, and the lattice row and column of its first cell.
 
-    The corner lies on a multiple of :data:`_MARGIN` whatever the grid's own does.
+    The corner lies on a multiple of :data:`VOXEL`, wherever the grid begins: squares of frontier are the frame's.
     """
     classes = belief.grid.classes()
     rows, cols = (np.flatnonzero((classes != UNKNOWN).any(axis=axis)) for axis in (1, 0))
     row0, col0 = belief.grid.lattice_origin
     low = [row0 + int(rows[0]), col0 + int(cols[0])]
-    corner = [value // _MARGIN * _MARGIN for value in low]
+    corner = [(value - 1) // VOXEL * VOXEL for value in low]  # at least one unknown cell all round
     part = classes[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     pad = [(value - own, STRIDE) for value, own in zip(low, corner, strict=True)]
     return np.pad(part, pad, constant_values=UNKNOWN), (corner[0], corner[1])

@@ -116,7 +116,13 @@ class Tour(Explorer):
         step_s: float = 0.1,
     ) -> None:
         self._index = 0
+        self._start = np.zeros(2)  # [m], a station
         super().__init__(from_mapping(TourConfig, config), robot=robot, lidar=lidar, step_s=step_s)
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; where the robot is now is a station."""
+        super().reset(belief, seed)
+        self._start = np.array(belief.pose[:2], dtype=np.float64)
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of frontier that the tour begins with."""
@@ -185,7 +191,7 @@ class Tour(Explorer):
     def _by_stations(self, found: Candidates, pieces: Cells) -> Candidates:
         """Return the candidates with the tour's first station as the view point of a piece seen from there."""
         config, cost_map = self.config.stations, found.cost_map
-        cells, joined, here = _stations(cost_map, config)
+        cells, joined, here = _stations(cost_map, config, self._start)
         if here < 0:
             return found
         targets = cost_map.to_cells(found.frontiers.targets[pieces])
@@ -219,11 +225,13 @@ class Tour(Explorer):
         return np.asarray(looked[tuple(cells.T)])
 
 
-def _stations(cost_map: CostMap, config: StationsConfig) -> tuple[Cells, Cells, int]:
+def _stations(cost_map: CostMap, config: StationsConfig, start: Array) -> tuple[Cells, Cells, int]:
     """Return the stations known to be free ``(n, 2)``, which hops join them, and the robot's own, −1 off them."""
     stride = max(1, round(config.spacing_m / cost_map.resolution))
     corner = [round(v / cost_map.resolution) for v in cost_map.origin[::-1]]  # lattice row, column of cell (0, 0)
-    first = [-v % stride for v in corner]
+    first = [
+        (math.floor(v / cost_map.resolution) - low) % stride for v, low in zip(start[::-1], corner, strict=True)
+    ]
     picked = cost_map.classes[first[0] :: stride, first[1] :: stride] == FREE
     places = np.argwhere(picked)
     index = np.full(picked.shape, -1, dtype=np.int64)

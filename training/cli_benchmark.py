@@ -75,7 +75,7 @@ def benchmark(
       mecanum benchmark --suite apartments,apartments-slippery --slam ekf,invariant-ekf --workers 2 --out out/two
       mecanum benchmark --suite all --split validation --out out/validation --json
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
-      mecanum benchmark --protocol dungeons --maps dungeons --agents nearest-frontier,tour --out out/dungeons
+      mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
     """  # noqa: D301
     if protocol is not None or maps is not None:
         suites_only = {

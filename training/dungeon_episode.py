@@ -156,12 +156,11 @@ class _Run:
         self.worth = self.lattice.worth_a_visit(np.isfinite(self._length), self._visited)
 
     def belief(self) -> Belief:
-        """Return what the agent may know, in the frame of the start's cell; the grid ends where knowledge does."""
+        """Return what the agent may know, in the map's frame; the grid ends where knowledge does."""
         rows, cols = (np.flatnonzero((self.known != UNKNOWN).any(axis=axis)) for axis in (1, 0))
         low = int(rows[0]), int(cols[0])
         part = self.known[low[0] : int(rows[-1]) + 1, low[1] : int(cols[-1]) + 1]
-        start = self._dungeon.start
-        origin = (low[1] - start[1]) * CELL_M, (low[0] - start[0]) * CELL_M
+        origin = low[1] * CELL_M, low[0] * CELL_M
         return Belief(
             pose=np.array([*self._point(self._cell), self._heading]),
             pose_cov=np.zeros((3, 3)),
@@ -172,9 +171,8 @@ class _Run:
         )
 
     def _point(self, cell: tuple[int, int]) -> Array:
-        """Return the centre (x, y) [m] of a cell in the belief's frame."""
-        start = self._dungeon.start
-        return np.array([cell[1] - start[1] + 0.5, cell[0] - start[0] + 0.5]) * CELL_M
+        """Return the centre (x, y) [m] of a cell."""
+        return np.array([cell[1] + 0.5, cell[0] + 0.5]) * CELL_M
 
     def station_for(self, goal: Goal) -> int:
         """Return the way-point that comes nearest to serving a goal, or −1 when all that could were looked from.
@@ -183,8 +181,8 @@ class _Run:
         is after, and is given the next nearest.
         """
         cells = self.lattice.cells
-        ahead = np.floor(np.asarray(goal.pose[1::-1], dtype=np.float64) / CELL_M).astype(np.int64)
-        target = np.clip(np.asarray(self._dungeon.start) + ahead, 0, np.array(self.known.shape) - 1)
+        at = np.floor(np.asarray(goal.pose[1::-1], dtype=np.float64) / CELL_M).astype(np.int64)
+        target = np.clip(at, 0, np.array(self.known.shape) - 1)
         away = np.hypot(*(cells - target).T) * CELL_M
         for i in range(len(cells)):
             if not line_is_free(self.known, int(target[0]), int(target[1]), int(cells[i, 0]), int(cells[i, 1])):

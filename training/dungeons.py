@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import agents
 from slam.formats import atomic_write
@@ -158,8 +157,8 @@ def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
 def table(summary: dict[str, Any]) -> str:
     """Return our agents and the published ones as one Markdown table."""
     lines = [
-        "| agent | maps | covered | path, mean ± std [m] | to nearest-way-point (95 %) | to nearest-frontier (95 %) "
-        "| decision [ms] |",
+        "| agent | maps | covered | path, mean ± std [m] | to nearest-way-point (95 %) "
+        "| to nearest-frontier (95 %) | decision [ms] |",
         "|---|---|---|---|---|---|---|",
     ]
     for name, own in summary["agents"].items():
