@@ -22,7 +22,7 @@ from agents.station_network import StationNetwork, picture, pixels
 from agents.station_survey import HOP, STRIDE, VOXEL, find_pieces, no_pieces, options, survey
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.occupancy import UNKNOWN
+from slam.occupancy import FREE, UNKNOWN
 from slam.settings import from_mapping
 from slam.types import Belief
 
@@ -107,12 +107,14 @@ class LearnedTour(Tour):
             return super().choose(belief)
         known, corner = _aligned(belief)
         robot = _cell_of(belief.pose, resolution, corner)
+        first = _cell_of(self._start, resolution, corner)
+        if not _is_free(known, robot) or any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
+            return super().choose(belief)  # it stands on no station
         visited = np.zeros(known.shape, dtype=np.bool_)
         for pose in self._stops:
-            visited[_cell_of(pose, resolution, corner)] = True
-        first = _cell_of(self._start, resolution, corner)
-        if any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
-            return super().choose(belief)
+            cell = _cell_of(pose, resolution, corner)
+            if _is_free(known, cell):
+                visited[cell] = True
         pieces = no_pieces(known.shape)
         find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
         reach = self.config.stations.reach_m / resolution
@@ -125,8 +127,8 @@ class LearnedTour(Tour):
             shown = picture(known, visited, first, resolution, found)
             targets, hops = (pixels(found.cells[at], first, shown) for at in (openings.targets, openings.hops))
             best = int(np.argmin(self._network.costs_m(shown, targets, hops, openings)))
-        cell = found.cells[openings.targets[best]]
-        goal = (np.array([cell[1] + corner[1], cell[0] + corner[0]]) + 0.5) * resolution
+        station = found.cells[openings.targets[best]]
+        goal = (np.array([station[1] + corner[1], station[0] + corner[0]]) + 0.5) * resolution
         self._frontiers = (found.pieces[:, ::-1] + np.array([corner[1], corner[0]]) + 0.5) * resolution
         self._status = "driving"
         return Goal(pose=np.array([*goal, belief.pose[2]]), path=np.array([belief.pose[:2], goal]))
@@ -155,6 +157,12 @@ def _aligned(belief: Belief) -> tuple[NDArray[np.int8], tuple[int, int]]:
     part = classes[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
     pad = [(value - own, STRIDE) for value, own in zip(low, corner, strict=True)]
     return np.pad(part, pad, constant_values=UNKNOWN), (corner[0], corner[1])
+
+
+def _is_free(known: NDArray[np.int8], cell: tuple[int, int]) -> bool:
+    """Whether a cell, which may lie beyond what is known, is known to be free."""
+    inside = all(0 <= value < size for value, size in zip(cell, known.shape, strict=True))
+    return inside and bool(known[cell] == FREE)
 
 
 def _cell_of(pose: NDArray[np.float64], resolution: float, corner: tuple[int, int]) -> tuple[int, int]:

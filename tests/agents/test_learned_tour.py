@@ -216,6 +216,23 @@ def test_elsewhere_it_is_the_tour(stations):
     np.testing.assert_array_equal(goals[0].pose, goals[1].pose)
 
 
+def test_off_the_stations_it_is_the_tour():
+    known, start = rooms(1), (65, 65)
+    config = {"stations": STATIONS, "planner": {"resolution_m": 0.4}, "frontiers": {"view_range_m": 12.0}}
+    goals = []
+    for name in ("tour", "learned-tour"):
+        agent = agents.make(name, config=config, robot={"length_m": 0.1, "width_m": 0.8})
+        agent.reset(belief_of(known, start, start), 0)
+        agent.looked(belief_of(known, (65, 65), start))
+        agent.looked(belief_of(known, (-900, 65), start))  # where nothing is known any more
+        goals.append(agent.choose(belief_of(known, (65, 67), start)))
+    assert goals[0] is not None and goals[1] is not None
+    np.testing.assert_array_equal(goals[0].pose, goals[1].pose)
+    agent.reset(belief_of(known, start, start), 0)
+    agent.looked(belief_of(known, (-900, 65), start))
+    assert agent.choose(belief_of(known, start, start)) is not None
+
+
 def test_its_policy_comes_with_where_it_is_from():
     network, about = load_station_policy(SHIPPED)
     assert about["command"].startswith("python -m training.learned_tour") and len(about["curve"]) > 1
