@@ -23,7 +23,7 @@ from agents.station_survey import HOP, STRIDE, VOXEL, find_pieces, no_pieces, op
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.occupancy import FREE, UNKNOWN
-from slam.settings import from_mapping
+from slam.settings import from_mapping, require
 from slam.types import Belief
 
 __all__ = ["FORMAT", "PRECISION", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
@@ -43,6 +43,11 @@ class LearnedTourConfig(TourConfig):
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
     most: int = 5  # openings that are weighed
     most_loss_m: float = 40.0  # what by the tour itself is worse by more is not
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.most >= 1, f"LearnedTourConfig.most must be at least 1, got {self.most}")
+        require(self.most_loss_m >= 0, f"LearnedTourConfig.most_loss_m must be ≥ 0, got {self.most_loss_m}")
 
 
 def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:

@@ -233,6 +233,12 @@ def test_off_the_stations_it_is_the_tour():
     assert agent.choose(belief_of(known, start, start)) is not None
 
 
+def test_settings_are_checked():
+    for bad in ({"most": 0}, {"most_loss_m": -1.0}, {"tries": 0}):
+        with pytest.raises(ValueError, match="must be"):
+            agents.make("learned-tour", config=bad)
+
+
 def test_its_policy_comes_with_where_it_is_from():
     network, about = load_station_policy(SHIPPED)
     assert about["command"].startswith("python -m training.learned_tour") and len(about["curve"]) > 1
