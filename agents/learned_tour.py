@@ -18,17 +18,18 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.policy_files import read_policy
 from agents.routing import draw_luck
-from agents.station_network import StationNetwork, picture, pixels
-from agents.station_survey import HOP, STRIDE, VOXEL, find_pieces, no_pieces, options, survey
+from agents.station_network import StationNetwork, outside, picture, pixels, with_walls
+from agents.station_stop import StationRound, StationStop
+from agents.station_survey import Openings, options
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.occupancy import FREE, UNKNOWN
+from slam.occupancy import UNKNOWN
 from slam.settings import from_mapping, require
 from slam.types import Belief
 
 __all__ = ["FORMAT", "PRECISION", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
 
-FORMAT = "mecanum-slam station policy 1"
+FORMAT = "mecanum-slam station policy 2"
 PRECISION = np.float16
 """Of the weights in the file."""
 SHIPPED = Path(__file__).parent / "policies" / "learned-tour.safetensors"
@@ -41,11 +42,19 @@ class LearnedTourConfig(TourConfig):
     """The tour's, and which experience."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
+    extent: tuple[float, ...] = ()  # x, y of the two corners [m] that all lies between; (): not known
     most: int = 5  # openings that are weighed
     most_loss_m: float = 40.0  # what by the tour itself is worse by more is not
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        require(
+            not self.extent
+            or (
+                len(self.extent) == 4 and all(a < b for a, b in zip(self.extent[:2], self.extent[2:], strict=True))
+            ),
+            f"LearnedTourConfig.extent must be x and y of the lower corner, then of the upper, got {self.extent}",
+        )
         require(self.most >= 1, f"LearnedTourConfig.most must be at least 1, got {self.most}")
         require(self.most_loss_m >= 0, f"LearnedTourConfig.most_loss_m must be ≥ 0, got {self.most_loss_m}")
 
@@ -68,8 +77,9 @@ def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:
 class LearnedTour(Tour):
     """Goes over a lattice of stations as :class:`agents.tour.Tour` does, but begins its tours by experience.
 
-    Where it is told of no stations, or of others than those it learned on (4 m apart, cells of 0.4 m), it is the
-    tour.
+    It may be told the ``extent`` of what there is to explore, as exploration planners commonly are, and then
+    counts on nothing beyond it. Where it is told of no stations, or of others than those it learned on (4 m apart,
+    cells of 0.4 m), it is the tour.
 
     Attributes
     ----------
@@ -92,86 +102,53 @@ class LearnedTour(Tour):
         settings = from_mapping(LearnedTourConfig, config)
         self.policy_path = Path(settings.policy or SHIPPED)
         self._network, self.about = load_station_policy(self.policy_path)
+        self._round: StationRound | None = None
         super().__init__(settings, robot=robot, lidar=lidar, step_s=step_s)
 
     def _forget(self) -> None:
         super()._forget()
         self._known_cells = 0
         self._decided_at: set[tuple[int, int]] = set()  # stations, since anything new was seen
-        self._stops: list[NDArray[np.float64]] = []  # poses that the sensor looked from
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; where the robot is now is a station."""
+        super().reset(belief, seed)
+        self._round = StationRound(belief, self.config.stations)
 
     def looked(self, belief: Belief) -> None:
         """Take note that the sensor looked from the belief's pose."""
         super().looked(belief)
-        self._stops.append(np.asarray(belief.pose, dtype=np.float64))
+        if self._round is not None:
+            self._round.looked(belief)
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the station to go to next, or where the tour goes where there are no stations worth a visit."""
-        stations, resolution = self.config.stations, belief.grid.resolution
-        if round(stations.spacing_m / resolution) != STRIDE or stations.hop != HOP:
+        stop = None if self._round is None else self._round.stop(belief)
+        if stop is None or not stop.found.worth.any():
             return super().choose(belief)
-        known, corner = _aligned(belief)
-        robot = _cell_of(belief.pose, resolution, corner)
-        first = _cell_of(self._start, resolution, corner)
-        if not _is_free(known, robot) or any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
-            return super().choose(belief)  # it stands on no station
-        visited = np.zeros(known.shape, dtype=np.bool_)
-        for pose in self._stops:
-            cell = _cell_of(pose, resolution, corner)
-            if _is_free(known, cell):
-                visited[cell] = True
-        pieces = no_pieces(known.shape)
-        find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-        reach = self.config.stations.reach_m / resolution
-        found = survey(known, pieces, visited, first, robot, resolution, reach)
-        if not found.worth.any():
-            return super().choose(belief)
-        openings = options(found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
+        openings = options(stop.found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
         best = 0
-        if len(openings.targets) > 1 and self._is_news(known, robot):
-            shown = picture(known, visited, first, resolution, found)
-            targets, hops = (pixels(found.cells[at], first, shown) for at in (openings.targets, openings.hops))
-            best = int(np.argmin(self._network.costs_m(shown, targets, hops, openings)))
-        station = found.cells[openings.targets[best]]
-        goal = (np.array([station[1] + corner[1], station[0] + corner[0]]) + 0.5) * resolution
-        self._frontiers = (found.pieces[:, ::-1] + np.array([corner[1], corner[0]]) + 0.5) * resolution
+        if len(openings.targets) > 1 and self._is_news(stop):
+            best = int(np.argmin(self._costs_m(stop, openings)))
+        self._frontiers = stop.frontiers()
         self._status = "driving"
-        return Goal(pose=np.array([*goal, belief.pose[2]]), path=np.array([belief.pose[:2], goal]))
+        return stop.goal(int(openings.targets[best]), belief)
 
-    def _is_news(self, known: NDArray[np.int8], robot: tuple[int, int]) -> bool:
+    def _costs_m(self, stop: StationStop, openings: Openings) -> NDArray[np.float64]:
+        shown = picture(stop.known, stop.visited, stop.first, stop.resolution, stop.found)
+        if self.config.extent:
+            beyond = outside(shown, stop.first, stop.box(self.config.extent))
+            shown = shown._replace(planes=with_walls(shown.planes, beyond))
+        cells = stop.found.cells
+        targets, hops = (pixels(cells[at], stop.first, shown) for at in (openings.targets, openings.hops))
+        return self._network.costs_m(shown, targets, hops, openings)
+
+    def _is_news(self, stop: StationStop) -> bool:
         """Whether it has not yet decided here, knowing no more: deciding alike twice would send it in circles."""
-        count = int(np.count_nonzero(known != UNKNOWN))
+        count = int(np.count_nonzero(stop.known != UNKNOWN))
         if count != self._known_cells:
             self._known_cells = count
             self._decided_at.clear()
-        news = robot not in self._decided_at
-        self._decided_at.add(robot)
+        news = stop.robot not in self._decided_at
+        self._decided_at.add(stop.robot)
         return news
-
-
-def _aligned(belief: Belief) -> tuple[NDArray[np.int8], tuple[int, int]]:
-    """Return the classes of what is known, with a margin, and the lattice row and column of its first cell.
-
-    The corner lies on a multiple of :data:`VOXEL`, wherever the grid begins: squares of frontier are the frame's.
-    """
-    classes = belief.grid.classes()
-    rows, cols = (np.flatnonzero((classes != UNKNOWN).any(axis=axis)) for axis in (1, 0))
-    row0, col0 = belief.grid.lattice_origin
-    low = [row0 + int(rows[0]), col0 + int(cols[0])]
-    corner = [(value - 1) // VOXEL * VOXEL for value in low]  # at least one unknown cell all round
-    part = classes[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    pad = [(value - own, STRIDE) for value, own in zip(low, corner, strict=True)]
-    return np.pad(part, pad, constant_values=UNKNOWN), (corner[0], corner[1])
-
-
-def _is_free(known: NDArray[np.int8], cell: tuple[int, int]) -> bool:
-    """Whether a cell, which may lie beyond what is known, is known to be free."""
-    inside = all(0 <= value < size for value, size in zip(cell, known.shape, strict=True))
-    return inside and bool(known[cell] == FREE)
-
-
-def _cell_of(pose: NDArray[np.float64], resolution: float, corner: tuple[int, int]) -> tuple[int, int]:
-    return (
-        int(np.floor(pose[1] / resolution)) - corner[0],
-        int(np.floor(pose[0] / resolution)) - corner[1],
-    )

@@ -18,7 +18,17 @@ from agents.convolution import convolve
 from agents.station_survey import STRIDE, Openings, Survey
 from slam.occupancy import FREE, UNKNOWN
 
-__all__ = ["PLANES", "SIDE", "Picture", "StationNetwork", "opening_numbers", "picture", "pixels"]
+__all__ = [
+    "PLANES",
+    "SIDE",
+    "Picture",
+    "StationNetwork",
+    "opening_numbers",
+    "outside",
+    "picture",
+    "pixels",
+    "with_walls",
+]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -90,6 +100,31 @@ def picture(
             planes[12, i, j] = 1.0
     planes[13] = 1.0 - planes[:8].sum(axis=0) / 4.0
     return Picture(planes, corner)
+
+
+def outside(shown: Picture, first: tuple[int, int], box: tuple[int, int, int, int]) -> Floats:
+    """Return the share of each quarter of each pixel ``(4, SIDE, SIDE)`` that lies outside of a box of cells.
+
+    ``box`` is the first row and column of it, and the first beyond it, in the cells that ``first`` is one of.
+    """
+    shares = []
+    for axis in (0, 1):
+        half = shown.corner[axis] * 2 + np.arange(2 * SIDE)  # quarters along the axis
+        begin = half * _HALF + first[axis] % STRIDE - _HALF
+        inside = np.minimum(begin + _HALF, box[2 + axis]) - np.maximum(begin, box[axis])
+        shares.append((np.clip(inside, 0, _HALF) / _HALF).reshape(SIDE, 2))
+    rows, cols = shares
+    own = [rows[:, None, q // 2] * cols[None, :, q % 2] for q in range(4)]
+    return np.asarray(1.0 - np.stack(own), dtype=np.float32)
+
+
+def with_walls(planes: Floats, beyond: Floats) -> Floats:
+    """Return planes ``(…, PLANES, n, n)`` that show as occupied what :func:`outside` found to lie there."""
+    planes = planes.copy()
+    free, occupied = planes[..., :4, :, :], planes[..., 4:8, :, :]
+    occupied[...] = np.minimum(occupied + beyond, 1.0 - free)
+    planes[..., 13, :, :] = 1.0 - planes[..., :8, :, :].sum(axis=-3) / 4.0
+    return planes
 
 
 def pixels(cells: Cells, first: tuple[int, int], shown: Picture) -> Cells:

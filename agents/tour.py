@@ -19,6 +19,7 @@ from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.gain import expected_area
 from agents.routing import best_tour, draw_luck, tours_begun_with
+from agents.station_stop import StationsConfig
 from agents.stations import in_sight, join, ways
 from agents.travel import between
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -26,26 +27,12 @@ from slam.occupancy import FREE
 from slam.settings import from_mapping, require
 from slam.types import Belief
 
-__all__ = ["Outlook", "StationsConfig", "Tour", "TourConfig"]
+__all__ = ["Outlook", "Tour", "TourConfig"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 _FAR = 1e6  # [m] farther than anything is
-
-
-@dataclass(frozen=True, kw_only=True)
-class StationsConfig:
-    """The lattice that the robot hops on, where it is no robot that drives anywhere and looks all the while."""
-
-    spacing_m: float = 0.0  # between stations, through the start; 0: there are none
-    hop: int = 2  # stations a hop goes at most along each axis
-    reach_m: float = 12.0  # from which a piece of frontier is looked at
-
-    def __post_init__(self) -> None:
-        require(math.isfinite(self.spacing_m) and self.spacing_m >= 0, "StationsConfig.spacing_m must be ≥ 0")
-        require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
-        require(math.isfinite(self.reach_m) and self.reach_m > 0, "StationsConfig.reach_m must be > 0")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ from slam.occupancy import FREE, UNKNOWN, OccupancyGrid
 from slam.types import Belief
 from training.dungeon_world import CELL_M, HOP, RANGE_M, STRIDE, Dungeon, Lattice, scan
 
-__all__ = ["NEAREST", "SCANS", "explore", "make_agent"]
+__all__ = ["NEAREST", "NEAREST_VIEW", "SCANS", "explore", "make_agent"]
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,13 @@ NEAREST = "nearest-way-point"
 """Stands among the agents' names for a rule that belongs to the protocol: to the nearest way-point worth a visit.
 
 Chosen anew at each way-point. It is what planners of the benchmark's family fall back on, and the simplest
-reading of its "nearest frontier"; our agent of that name goes to the nearest *view* of a frontier instead.
+reading of its "nearest frontier". Our agent of that name, told of the stations, does the same from its belief.
+"""
+
+NEAREST_VIEW = "nearest-view"
+"""Stands among the agents' names for ``nearest-frontier`` that is not told of the way-points.
+
+It goes to the nearest place anywhere from which some frontier can be seen.
 """
 
 _MOST_HOPS = 1000
@@ -68,11 +74,18 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-def make_agent(name: str) -> Agent:
-    """Return an agent set up for this world, with as much of the setting as its configuration has."""
+def make_agent(name: str, extent_m: tuple[float, float] | None = None) -> Agent:
+    """Return an agent set up for this world, with as much of the setting as its configuration has.
+
+    ``extent_m`` is how far the map reaches along x and y from the frame's origin.
+    """
+    told = name != NEAREST_VIEW
+    name = name if told else "nearest-frontier"
     config = getattr(agents.make(name), "config", None)
     known = {f.name for f in fields(config)} if is_dataclass(config) else set()
-    settings = {key: value for key, value in _SETTINGS.items() if key in known}
+    settings = {key: value for key, value in _SETTINGS.items() if key in known and (told or key != "stations")}
+    if extent_m is not None and "extent" in known:
+        settings["extent"] = (0.0, 0.0, *extent_m)
     return agents.make(name, config=settings or None, robot=_ROBOT, lidar=_LIDAR)
 
 
@@ -88,7 +101,7 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         at most 250 free cells were unseen, ``None`` where it never came to that.
     """
     run = _Run(dungeon, continuous=scan == "continuous")
-    agent = None if name == NEAREST else make_agent(name)
+    agent = None if name == NEAREST else make_agent(name, _extent_m(dungeon))
     if agent is not None:
         agent.reset(run.belief(), seed)
     decisions: list[float] = []
@@ -126,6 +139,11 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         "path_to_250_m": run.path_to_250_m,
         "decision_ms_median": statistics.median(decisions) if decisions else None,
     }
+
+
+def _extent_m(dungeon: Dungeon) -> tuple[float, float]:
+    rows, cols = dungeon.free.shape
+    return cols * CELL_M, rows * CELL_M
 
 
 class _Run:

@@ -19,7 +19,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.station_survey import HOP, STRIDE, VOXEL
-from agents.stations import count_in_sight, join, ways
+from agents.stations import count_in_sight, in_sight, join, ways
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from training.errors import BadInput
 
@@ -135,6 +135,10 @@ class Lattice:
         """
         length, before = ways(self.cells, self.joined, start)
         return length * CELL_M, before
+
+    def sight(self, points: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which points ``(m, 2)`` are in sight of each cell ``(n, 2)``, as frontier is: ``(n, m)``."""
+        return np.asarray(in_sight(self._known, cells, points, _SEEN_FROM))
 
     def worth_a_visit(self, reachable: NDArray[np.bool_], visited: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which way-points ``(n,)`` see enough of frontiers, can be reached, and were not looked from."""

@@ -24,8 +24,8 @@ import agents
 from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.campaign import check_settings, installed_version, run_all, write_settings
-from training.dungeon_bound import known_map_path
-from training.dungeon_episode import NEAREST, SCANS, explore
+from training.dungeon_bound import BOUNDS
+from training.dungeon_episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeon_world import Dungeon, load
 from training.errors import BadInput, Interrupted, bad_input
 
@@ -34,8 +34,11 @@ __all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
 Row = dict[str, Any]
 
 BASELINE = "nearest-frontier"
-"""Our agent that the others' ratios are taken to; besides, they are taken to the published rule, as far as it is
-known: the nearest way-point worth a visit."""
+"""The agent that the others' ratios are taken to: the published rule, as far as it is known."""
+
+REFERENCES = (NEAREST_VIEW, "known-walls")
+"""What ratios are taken to besides, where it was run: a nearest frontier that needs less way, and the bound that
+is defined as the published one."""
 
 PUBLISHED: dict[str, tuple[float, float]] = {
     "nearest frontier": (652.0, 76.0),
@@ -47,9 +50,6 @@ PUBLISHED: dict[str, tuple[float, float]] = {
     "known map": (499.0, 61.0),
 }
 """Path length [m], mean and standard deviation, on that benchmark's 100 test maps (DARE, ICRA 2025)."""
-
-KNOWN_MAP = "known-map"
-"""Stands among the agents' names for the bound: a planner that knows the true map."""
 
 _STORE, _CSV, _SUMMARY = "rows.jsonl", "rows.csv", "summary.json"
 _COLUMNS = (
@@ -78,7 +78,7 @@ def run_dungeons(
     """
     with bad_input():
         for name in agent_names:
-            agents.check(name, KNOWN_MAP, NEAREST)
+            agents.check(name, NEAREST, NEAREST_VIEW, *BOUNDS)
     if scan not in SCANS:
         raise BadInput(str(unknown_name("--scan", scan, SCANS)))
     if workers < 1:
@@ -131,8 +131,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Row]:
         }
         if BASELINE in by_agent:
             out[agent] |= _ratio(own, by_agent[BASELINE])
-        if NEAREST in by_agent:
-            out[agent]["to_nearest_way_point"] = _ratio(own, by_agent[NEAREST])
+        out[agent]["to"] = {name: _ratio(own, by_agent[name]) for name in REFERENCES if name in by_agent}
     return out
 
 
@@ -156,21 +155,23 @@ def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
 
 def table(summary: dict[str, Any]) -> str:
     """Return our agents and the published ones as one Markdown table."""
+    references = [name for name in REFERENCES if name in summary["agents"]]
+    further = "".join(f"to {name} (95 %) | " for name in references)
     lines = [
-        "| agent | maps | covered | path, mean ± std [m] | to nearest-way-point (95 %) "
-        "| to nearest-frontier (95 %) | decision [ms] |",
-        "|---|---|---|---|---|---|---|",
+        f"| agent | maps | covered | path, mean ± std [m] | to {BASELINE} (95 %) | {further}decision [ms] |",
+        "|" + "---|" * (6 + len(references)),
     ]
     for name, own in summary["agents"].items():
-        ratios = [_ratio_text(own.get("to_nearest_way_point", {})), _ratio_text(own)]
+        ratios = [_ratio_text(own), *(_ratio_text(own["to"][name]) for name in references)]
         decision = "" if own["decision_ms_median"] is None else f"{own['decision_ms_median']:.1f}"
         lines.append(
             f"| `{name}` | {own['maps']} | {own['covered']} | {own['path_m_mean']:.0f} ± {own['path_m_std']:.0f} "
             f"| {' | '.join(ratios)} | {decision} |"
         )
-    base = PUBLISHED["nearest frontier"][0]
+    base, bound = PUBLISHED["nearest frontier"][0], PUBLISHED["known map"][0]
     for name, (mean, std) in PUBLISHED.items():
-        lines.append(f"| published: {name} | 100 others | | {mean:.0f} ± {std:.0f} | {mean / base:.3f} | | |")
+        ratios = [f"{mean / base:.3f}", *(f"{mean / bound:.3f}" if r in BOUNDS else "" for r in references)]
+        lines.append(f"| published: {name} | 100 others | | {mean:.0f} ± {std:.0f} | {' | '.join(ratios)} | |")
     return "\n".join(lines)
 
 
@@ -192,15 +193,15 @@ def _maps(folder: Path) -> list[Path]:
 
 def _run(job: _Job) -> Row:
     dungeon = load(job.path)
-    row = _bound(dungeon) if job.agent == KNOWN_MAP else explore(dungeon, job.agent, scan=job.scan)
+    row = _bound(dungeon, job.agent) if job.agent in BOUNDS else explore(dungeon, job.agent, scan=job.scan)
     return row | {"digest": job.digest}
 
 
-def _bound(dungeon: Dungeon) -> Row:
+def _bound(dungeon: Dungeon, name: str) -> Row:
     return dict.fromkeys(_COLUMNS) | {
-        "agent": KNOWN_MAP,
+        "agent": name,
         "map": dungeon.name,
-        "path_m": known_map_path(dungeon),
+        "path_m": BOUNDS[name](dungeon),
         "coverage": 1.0,
         "unseen_cells": 0,
         "end": "covered",
@@ -233,8 +234,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--maps", type=Path, required=True, help="folder of PNG maps")
     parser.add_argument(
         "--agents",
-        default=f"{NEAREST},nearest-frontier,tour,learned-tour",
-        help=f"names, separated by commas; {KNOWN_MAP} is the bound, {NEAREST} the published rule",
+        default="nearest-frontier,tour,learned-tour",
+        help=f"names, separated by commas; {' and '.join(BOUNDS)} are bounds, {NEAREST_VIEW} and {NEAREST} rules",
     )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

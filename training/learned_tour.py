@@ -1,8 +1,9 @@
 """Training of ``learned-tour``: lessons on plans like the benchmark's, and a network that foresees them.
 
-``python -m training.learned_tour --out DIR`` gathers what lessons are missing in ``DIR/lessons`` (plans of seeds 0
-…, validated on others from 1000 on), trains, and writes ``learned-tour.safetensors`` and ``.json``. A killed run
-goes on where it stopped: with the next plan, or after the last whole epoch.
+``python -m training.learned_tour --out DIR`` gathers lessons (plans of seeds 0 …, validated on others from 1000
+on) in ``DIR/round-1``, driven by the tour, and trains; in the next round, the network drives. It writes
+``learned-tour.safetensors`` and ``.json``. A killed run goes on where it stopped: with the next plan, or after the
+last whole epoch.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from agents.learned_tour import FORMAT, PRECISION
-from agents.station_network import PLANES, opening_numbers
+from agents.station_network import PLANES, opening_numbers, with_walls
 from slam.formats import atomic_write, replacing
 from training.campaign import check_settings, installed_version, write_settings
 from training.dungeon_episode import explore
@@ -49,12 +50,14 @@ _VALIDATION = 1000  # seed of the first plan that is validated on
 class TrainingConfig:
     """What a training depends on."""
 
+    rounds: int = 2  # of lessons, each driven by what was learned in the one before
     plans: int = 1000  # seeds 0 …
     validation_plans: int = 60  # seeds 1000 …
     epochs: int = 12
     batch: int = 64
     rate: float = 1.5e-3
     weight_decay: float = 1e-2
+    untold: float = 0.125  # share of the lessons that do not tell how far the plan extends
     free_weight: float = 0.3  # of foreseeing what is free, besides what openings cost
     seed: int = 0
 
@@ -72,15 +75,17 @@ class Batch:
     there: Floats  # (b, c) 1 where there is an opening
 
 
-def batch_of(lessons: Lessons, rows: NDArray[np.int64]) -> Batch:
-    """Return some of the lessons as a batch."""
+def batch_of(lessons: Lessons, rows: NDArray[np.int64], told: NDArray[np.bool_] | None = None) -> Batch:
+    """Return some of the lessons as a batch, with walls beyond the plan where ``told`` (everywhere by default)."""
     planes = lessons.planes[rows].astype(np.float32) * np.float32(0.01)
-    unknown = 1.0 - planes[:, :8].sum(axis=1, keepdims=True) / 4.0
+    beyond = lessons.outside[rows].astype(np.float32) * np.float32(0.01)
+    if told is not None:
+        beyond *= told[:, None, None, None]
     paths = lessons.path_m[rows]
     there = np.isfinite(paths)
     mean = np.nanmean(paths, axis=1, keepdims=True)
     return Batch(
-        np.concatenate([planes, unknown], axis=1),
+        with_walls(np.pad(planes, ((0, 0), (0, 1), (0, 0), (0, 0))), beyond),
         lessons.free[rows].astype(np.float32) / np.float32(25.0),
         lessons.targets[rows],
         lessons.hops[rows],
@@ -134,9 +139,11 @@ def _losses(network: StationNetwork, batch: Batch) -> tuple[Tensor, Tensor]:
     """Return how far off the costs of openings are, and what is free where nothing is known yet."""
     there, free = torch.tensor(batch.there), torch.tensor(batch.free)
     planes = torch.tensor(batch.planes).contiguous(memory_format=torch.channels_last)
-    scores, odds = network(
-        planes, torch.tensor(batch.targets), torch.tensor(batch.hops), torch.tensor(batch.numbers)
-    )
+    with torch.autocast("cpu", torch.bfloat16):
+        scores, odds = network(
+            planes, torch.tensor(batch.targets), torch.tensor(batch.hops), torch.tensor(batch.numbers)
+        )
+    scores, odds = scores.float(), odds.float()
     off = nn.functional.smooth_l1_loss(_centred(scores, there), torch.tensor(batch.paths), reduction="sum")
     unknown = (planes[:, -1:] > 0.5).float()
     dark = nn.functional.binary_cross_entropy_with_logits(odds, free, reduction="none")
@@ -178,7 +185,8 @@ def train(out: Path, config: TrainingConfig) -> tuple[StationNetwork, list[dict[
         sums = np.zeros(2)
         for k in range(batches):
             rows = order[k * config.batch : (k + 1) * config.batch]
-            batch = turned(batch_of(lessons, rows), int(rng.integers(4)), bool(rng.integers(2)))
+            told = rng.random(config.batch) >= config.untold
+            batch = turned(batch_of(lessons, rows, told), int(rng.integers(4)), bool(rng.integers(2)))
             share = (epoch * batches + k) / (config.epochs * batches)
             for group in optimiser.param_groups:
                 group["lr"] = config.rate * _rate_at(share)
@@ -244,9 +252,11 @@ def main(argv: list[str] | None = None) -> int:
     options = vars(parser.parse_args(argv))
     out, workers = options.pop("out"), options.pop("workers")
     try:
-        for name in ("plans", "validation_plans", "epochs", "batch"):
+        for name in ("rounds", "plans", "validation_plans", "epochs", "batch"):
             if options[name] < 1:
                 raise BadInput(f"--{name.replace('_', '-')} must be at least 1, got {options[name]}")
+        if not 0 <= options["untold"] <= 1:
+            raise BadInput(f"--untold must be between 0 and 1, got {options['untold']}")
         if options["plans"] > _VALIDATION:
             raise BadInput(f"--plans must be at most {_VALIDATION}: those from there on are validated on")
         if workers < 1:
@@ -262,16 +272,23 @@ def main(argv: list[str] | None = None) -> int:
 def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     """Gather lessons, train and write the policy."""
     settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
-    check_settings(out, settings, [_CHECKPOINT, _WEIGHTS])
+    check_settings(out, settings, [_WEIGHTS])
     write_settings(out, settings)
-    for seeds in (range(config.plans), range(_VALIDATION, _VALIDATION + config.validation_plans)):
-        gather(out / "lessons", seeds, workers=workers)
-    network, curve = train(out, config)
-    weights = {
-        name: np.asarray(value.numpy(), PRECISION, order="C")  # as it lies in memory, channels may come last
-        for name, value in network.state_dict().items()
-        if not name.startswith("free.")
-    }
+    policy: Path | None = None
+    curves = []
+    for number in range(1, config.rounds + 1):
+        folder = out / f"round-{number}"
+        for seeds in (range(config.plans), range(_VALIDATION, _VALIDATION + config.validation_plans)):
+            gather(folder / "lessons", seeds, policy=policy, workers=workers)
+        network, curve = train(folder, config)
+        curves.append(curve)
+        weights = {
+            name: np.asarray(value.numpy(), PRECISION, order="C")  # as it lies in memory, channels may come last
+            for name, value in network.state_dict().items()
+            if not name.startswith("free.")
+        }
+        policy = folder / _WEIGHTS
+        atomic_write(policy, save(weights))
     arguments = [f"--{name.replace('_', '-')}={value}" for name, value in asdict(config).items()]
     last = _VALIDATION + config.validation_plans - 1
     about: dict[str, Any] = {
@@ -279,7 +296,7 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
         "command": shlex.join(["python", "-m", "training.learned_tour", "--out", "OUT", *arguments]),
         "config": asdict(config),
         "seeds": f"plans 0-{config.plans - 1}; validation {_VALIDATION}-{last}",
-        "curve": curve,
+        "curves": curves,
     }
     atomic_write(out / _WEIGHTS, save(weights))
     atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")

@@ -11,7 +11,7 @@ import pytest
 import agents
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
 from agents.routing import draw_luck
-from agents.station_network import PLANES, SIDE, picture, pixels
+from agents.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
 from agents.station_survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
 from agents.stations import edges, join, lengths, ways
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -151,6 +151,31 @@ def test_the_picture_does_not_tell_where_on_the_map_it_is():
     np.testing.assert_allclose(pictures[0][without], pictures[1][without], atol=1e-6)
 
 
+def test_walls_beyond_the_extent_are_drawn_cell_by_cell():
+    """What the shares say is what a grid says whose cells beyond the extent are known to be walls."""
+    known = rooms(2)
+    robot, box = (65, 65), (3, -20, 127, 111)
+    found, visited = stop(known, robot)
+    shown = picture(known, visited, robot, CELL_M, found)
+    beyond = outside(shown, robot, box)
+    for i, j in ((0, 0), (SIDE // 2, SIDE // 2), (7, 20), (8, 19), (20, 22)):
+        for quarter in range(4):
+            row = (shown.corner[0] + i) * STRIDE + robot[0] % STRIDE - 5 + 5 * (quarter // 2)
+            col = (shown.corner[1] + j) * STRIDE + robot[1] % STRIDE - 5 + 5 * (quarter % 2)
+            inside = [
+                box[0] <= r < box[2] and box[1] <= c < box[3]
+                for r in range(row, row + 5)
+                for c in range(col, col + 5)
+            ]
+            assert beyond[quarter, i, j] == pytest.approx(1.0 - np.mean(inside))
+    walled = with_walls(shown.planes, beyond)
+    np.testing.assert_array_equal(walled[:4], shown.planes[:4])
+    np.testing.assert_array_equal(walled[8:13], shown.planes[8:13])
+    assert (walled[4:8] >= shown.planes[4:8] - 1e-6).all() and walled[:8].sum(axis=0).max() <= 4.0 + 1e-5
+    np.testing.assert_allclose(walled[:8].sum(axis=0) / 4.0 + walled[13], 1.0, atol=1e-5)
+    assert 0 < beyond.mean() < 1 and (beyond == 1).any() and (beyond == 0).any()
+
+
 def test_on_a_map_too_large_the_robot_stays_in_the_picture():
     known = np.full((60, 900), FREE, np.int8)
     known[:, 890:] = UNKNOWN
@@ -233,15 +258,37 @@ def test_off_the_stations_it_is_the_tour():
     assert agent.choose(belief_of(known, start, start)) is not None
 
 
+def test_what_is_told_of_the_extent_reaches_the_network(monkeypatch):
+    known, start = rooms(1), (65, 65)
+    seen = []
+    for extent in ((), (-400.0, -400.0, 14.0, 400.0)):
+        agent = LearnedTour({"stations": STATIONS, "extent": extent})
+        monkeypatch.setattr(
+            agent._network,
+            "costs_m",
+            lambda shown, targets, hops, openings: (seen.append(shown), openings.losses)[1],
+        )
+        belief = belief_of(known, start, start, pad=5)
+        agent.reset(belief, 0)
+        agent.looked(belief)
+        assert agent.choose(belief) is not None
+    # The robot stands in cell (0, 0) of the frame: walls begin 35 cells to its right, in the ninth quarter.
+    plain, walled = (shown.planes for shown in seen)
+    own = np.argwhere(plain[12] == 1)[0]
+    changed = np.flatnonzero((walled[4:8] - plain[4:8] > 0.5).any(axis=(0, 1)))
+    assert changed.min() == own[1] + 4 and changed.max() == SIDE - 1
+
+
 def test_settings_are_checked():
-    for bad in ({"most": 0}, {"most_loss_m": -1.0}, {"tries": 0}):
+    bad_extents = ({"extent": (0.0, 0.0, 1.0)}, {"extent": (0.0, 5.0, 9.0, 5.0)})
+    for bad in ({"most": 0}, {"most_loss_m": -1.0}, {"tries": 0}, *bad_extents):
         with pytest.raises(ValueError, match="must be"):
             agents.make("learned-tour", config=bad)
 
 
 def test_its_policy_comes_with_where_it_is_from():
     network, about = load_station_policy(SHIPPED)
-    assert about["command"].startswith("python -m training.learned_tour") and len(about["curve"]) > 1
+    assert about["command"].startswith("python -m training.learned_tour") and min(map(len, about["curves"])) > 1
     known, robot = rooms(1), (65, 65)
     found, visited = stop(known, robot)
     openings = options(found, LUCK, most=5, most_loss_m=40.0)

@@ -14,8 +14,9 @@ from agents.base import Agent, Goal
 from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.slam.logs_on_disk import data_folder
 from training import dungeon_episode
-from training.dungeon_bound import known_map_path
-from training.dungeon_episode import NEAREST, explore, make_agent
+from training.dungeon_bound import known_map_path, known_walls_path
+from training.dungeon_episode import NEAREST, NEAREST_VIEW, explore, make_agent
+from training.dungeon_plans import dungeon_plan
 from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, load, scan
 from training.dungeons import main, run_dungeons, summarise, table
 from training.errors import BadInput
@@ -167,6 +168,23 @@ def test_the_simplest_rule_goes_to_the_nearest_way_point_worth_a_visit(monkeypat
     assert all(length == nearest and worth for length, nearest, worth in hops)
 
 
+@pytest.mark.parametrize("seed", [3, 1003])
+def test_nearest_frontier_on_stations_is_the_published_rule(seed):
+    """From its belief alone, what the protocol says from its own count: the same path, hop for hop."""
+    plan = dungeon_plan(seed)
+    rule, agent, view = (explore(plan, name) for name in (NEAREST, "nearest-frontier", NEAREST_VIEW))
+    assert agent["end"] == view["end"] == "covered"
+    assert (agent["path_m"], agent["hops"]) == (rule["path_m"], rule["hops"]) != (view["path_m"], view["hops"])
+
+
+def test_bounds_see_what_they_say():
+    """A dead end of 30 m: its last wall is in sight of the sensor from farther than from 16 m."""
+    dungeon = corridor(31.6)
+    assert known_map_path(dungeon) == pytest.approx(12.0)
+    assert known_walls_path(dungeon) == pytest.approx(16.0)
+    assert known_walls_path(dungeon_of(hall(), "hall")) == 0.0
+
+
 def test_one_look_is_enough():
     dungeon = dungeon_of(hall(), "hall")
     row = explore(dungeon, "nearest-frontier")
@@ -194,7 +212,7 @@ class Stubborn(Agent):
 
 
 def test_an_agent_that_gets_nowhere_is_stuck(monkeypatch):
-    monkeypatch.setattr(dungeon_episode, "make_agent", lambda name: Stubborn())
+    monkeypatch.setattr(dungeon_episode, "make_agent", lambda name, extent_m: Stubborn())
     row = explore(corridor(95.6), "stubborn")
     assert row["end"] == "stuck" and 0 < row["hops"] < 20
 
@@ -202,6 +220,9 @@ def test_an_agent_that_gets_nowhere_is_stuck(monkeypatch):
 def test_agents_are_set_up_as_far_as_they_can_be():
     assert make_agent("tour").config.stations.spacing_m == 4.0
     assert make_agent("nearest-frontier").config.frontiers.view_range_m == 16.0
+    assert make_agent("nearest-frontier").config.stations.spacing_m == 4.0
+    assert make_agent(NEAREST_VIEW).config.stations.spacing_m == 0.0
+    assert make_agent("learned-tour", (80.0, 60.0)).config.extent == (0.0, 0.0, 80.0, 60.0)
     assert isinstance(make_agent("random"), Agent)
 
 
@@ -272,10 +293,13 @@ def test_the_ratio_is_of_means_and_has_an_interval():
     base = rng.uniform(400, 800, 40)
     rows = [row("nearest-frontier", str(i), v) for i, v in enumerate(base)]
     rows += [row("tour", str(i), 0.9 * v + rng.normal(0, 20)) for i, v in enumerate(base)]
-    assert "to_nearest_way_point" not in summarise(rows)["tour"]
-    rows += [row(NEAREST, str(i), 1.2 * v) for i, v in enumerate(base)]
+    assert summarise(rows)["tour"]["to"] == {}
+    rows += [row("known-walls", str(i), 0.75 * v) for i, v in enumerate(base)]
     own = summarise(rows)["tour"]
-    assert own["to_nearest_way_point"]["ratio"] == pytest.approx(own["ratio"] / 1.2)
+    assert own["to"]["known-walls"]["ratio"] == pytest.approx(own["ratio"] / 0.75)
+    lines = table({"agents": summarise(rows)}).splitlines()
+    assert len({line.count("|") for line in lines}) == 1 and "to known-walls" in lines[0]
+    assert any("nearest frontier" in line and "| 1.307 |" in line for line in lines)
     assert own["ratio"] == pytest.approx(0.9, abs=0.02)
     assert own["ratio_low"] < own["ratio"] < own["ratio_high"] < 0.93
 

@@ -14,8 +14,9 @@ from agents.station_survey import begin, find_pieces, first_hop, no_pieces, opti
 from slam.occupancy import UNKNOWN
 from training import dungeon_networks
 from training.dungeon_episode import _Run
-from training.dungeon_lessons import LUCK, MOST, REACH, Walk, gather, lessons_of, read_lessons
+from training.dungeon_lessons import gather, lessons_of, read_lessons
 from training.dungeon_plans import dungeon_plan, loops
+from training.dungeon_walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
 from training.dungeon_world import CELL_M, Lattice, frontier_points
 from training.learned_tour import TrainingConfig, batch_of, main, train, turned
 
@@ -65,13 +66,41 @@ def test_the_rest_of_the_tour_is_what_the_tour_takes():
     walk = Walk(dungeon_plan(2))
     found = walk.survey()
     hop = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
-    foreseen = walk.rest_m((int(hop[0]), int(hop[1])))
+    (foreseen,) = TourDriver().finish([walk.after((int(hop[0]), int(hop[1])))])
     assert walk.path_m == 0.0 and not walk.visited[tuple(hop)]
     while (found := walk.survey()).worth.any():
         cell = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
         walk.hop((int(cell[0]), int(cell[1])))
     assert walk.path_m == pytest.approx(foreseen)
     assert (walk.plan.free & (walk.known == UNKNOWN)).sum() <= 25
+
+
+def test_robots_driven_together_come_as_far_as_alone():
+    torch.manual_seed(1)
+    driver = LearnedDriver(dungeon_networks.StationNetwork())
+    plans = [dungeon_plan(seed) for seed in range(3)]
+    together = driver.finish([Walk(plan) for plan in plans])
+    for plan, length in zip(plans, together, strict=True):
+        walk = Walk(plan)
+        while (stop := walk.stop()) is not None:
+            (choice,) = driver.choose([stop])
+            walk.hop(stop.hop_cell(choice))
+        # Half precision: where two openings are as good, the batch may decide.
+        assert walk.path_m == pytest.approx(length, rel=0.15)
+        assert (plan.free & (walk.known == UNKNOWN)).sum() <= 25
+
+
+def test_where_nothing_is_news_the_robot_that_goes_on_goes_with_the_tour(monkeypatch):
+    driver = LearnedDriver(dungeon_networks.StationNetwork())
+    walk = Walk(dungeon_plan(0))
+    while len((stop := walk.stop()).openings.targets) < 2:
+        walk.hop(stop.hop_cell(0))
+    worst = torch.tensor([[-float(k) for k in range(MOST)]])
+    monkeypatch.setattr(driver, "_network", lambda *_: (worst, None))
+    other = walk.after(stop.hop_cell(0))  # knows where it decided; what it decides stays its own
+    assert driver.choose([stop]) == [len(stop.openings.targets) - 1]
+    assert driver.choose([stop]) == [0]
+    assert walk.decided_at and other.decided_at is not walk.decided_at and other.path_m > 0 == walk.path_m
 
 
 @pytest.fixture(scope="module")
@@ -89,14 +118,28 @@ def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
     assert set(dates) == {"000000.npz", "000001.npz", "001000.npz"}
     gather(folder, range(2))
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == dates
-    lessons, own = read_lessons(folder, range(2)), lessons_of(1)
+    lessons, own = read_lessons(folder, range(2)), lessons_of(1, TourDriver())
     assert len(lessons.planes) > len(own.planes) > 5
+    assert own.outside.max() == 100 > own.outside.mean() > 0
     for field in dataclasses.fields(own):
         theirs = getattr(lessons, field.name)[-len(own.planes) :]
         np.testing.assert_array_equal(theirs, getattr(own, field.name))
     assert np.isfinite(own.path_m[:, :2]).all() and (own.path_m[:, 0] > 0).all()
     # What lies open in the truth is at least what is known to.
     assert (own.free.astype(int) * 4 + 1 >= own.planes[:, :4]).all()
+
+
+def test_some_lessons_do_not_tell_how_far_the_plan_extends(run_folder):
+    lessons = read_lessons(run_folder / "lessons", range(1))
+    told, untold = batch_of(lessons, np.arange(4)), batch_of(lessons, np.arange(4), np.zeros(4, np.bool_))
+    beyond = lessons.outside[:4] == 100
+    known = lessons.planes[:4, :8].reshape(4, 2, 4, SIDE, SIDE).sum(axis=1) > 0
+    assert (told.planes[:, 4:8][beyond & ~known] == 1).all() and (
+        untold.planes[:, 4:8][beyond & ~known] == 0
+    ).all()
+    np.testing.assert_allclose(untold.planes[:, :13], lessons.planes[:4] / 100.0, atol=1e-6)
+    for batch in (told, untold):
+        np.testing.assert_allclose(batch.planes[:, :8].sum(axis=1) / 4 + batch.planes[:, 13], 1.0, atol=0.06)
 
 
 def test_turning_a_lesson_turns_all_of_it(run_folder):
@@ -181,11 +224,17 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     out.mkdir()
     (out / "lessons").symlink_to(run_folder / "lessons")
     arguments = ["--out", str(out), "--plans", "2", "--validation-plans", "1", "--epochs", "1", "--batch", "8"]
+    (out / "round-1").mkdir()
+    (out / "lessons").rename(out / "round-1" / "lessons")
     assert main(arguments) == 0
     path = out / "learned-tour.safetensors"
     assert capsys.readouterr().out.strip() == str(path)
     about = json.loads(path.with_suffix(".json").read_text())
-    assert about["config"]["plans"] == 2 and len(about["curve"]) == 1 and "--epochs=1" in about["command"]
+    assert about["config"]["plans"] == 2 and "--epochs=1" in about["command"]
+    assert [len(curve) for curve in about["curves"]] == [1, 1]
+    assert set(about["validation_path_m"]) == {"tour", "learned-tour"}
+    first, second = ({p.name for p in (out / name / "lessons").iterdir()} for name in ("round-1", "round-2"))
+    assert first == second  # of the same plans, driven by what the first round learned
     assert agents.make(str(path)).about == about
     row = explore(dungeon_plan(5), str(path))
     assert row["end"] == "covered" and row["coverage"] > 0.99
@@ -200,6 +249,8 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         (["--plans", "0"], "--plans"),
         (["--plans", "1001"], "1000"),
         (["--epochs", "0"], "--epochs"),
+        (["--rounds", "0"], "--rounds"),
+        (["--untold", "1.5"], "--untold"),
         (["--workers", "0"], "--workers"),
     ],
 )
