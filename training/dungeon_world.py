@@ -24,8 +24,8 @@ from slam.occupancy import FREE, OCCUPIED, UNKNOWN
 from training.errors import BadInput
 
 __all__ = [
-    "CELL_M", "HOP", "RANGE_M", "STRIDE", "TREE", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "load",
-    "look", "scan",
+    "CELL_M", "HOP", "RANGE_M", "STRIDE", "TREE", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "layout",
+    "load", "look", "scan",
 ]  # fmt: skip
 
 CELL_M = 0.4
@@ -36,6 +36,7 @@ RANGE_M = 20.0
 _SEEN_FROM = 40.0  # cells: frontiers count as in sight of a way-point up to 16 m away
 _WORTH = 2  # of these make a way-point worth a visit
 _RAYS = 720
+_TILE_M = 5.0  # the benchmark's maps are made of such tiles
 _UNKNOWN = int(UNKNOWN)
 _WALL_BELOW, _START = 150, 208  # pixel values
 _MOST_PIXELS = 4000  # a side
@@ -144,6 +145,14 @@ class Lattice:
         """Return which way-points ``(n,)`` see enough of frontiers, can be reached, and were not looked from."""
         been = visited[tuple(self.cells.T)]
         return np.asarray((self.sees >= _WORTH) & reachable & ~been)
+
+
+def layout(dungeon: Dungeon) -> bytes:
+    """Return what maps of one plan share, turned or mirrored: the least of its ways round, in tiles of 5 m."""
+    rows, cols = (max(round(cells * CELL_M / _TILE_M), 1) for cells in dungeon.free.shape)
+    share = cv2.resize(dungeon.free.astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA)
+    turned = [np.rot90(share > 0.5, quarters) for quarters in range(4)]
+    return min(bytes(tiles.shape) + tiles.tobytes() for own in turned for tiles in (own, own[:, ::-1]))
 
 
 def frontier_points(known: NDArray[np.int8]) -> NDArray[np.int64]:

@@ -26,7 +26,7 @@ from slam.settings import unknown_name
 from training.campaign import check_settings, installed_version, run_all, write_settings
 from training.dungeon_bound import BOUNDS
 from training.dungeon_episode import NEAREST, NEAREST_VIEW, SCANS, explore
-from training.dungeon_world import Dungeon, load
+from training.dungeon_world import Dungeon, layout, load
 from training.errors import BadInput, Interrupted, bad_input
 
 __all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
@@ -53,7 +53,8 @@ PUBLISHED: dict[str, tuple[float, float]] = {
 
 _STORE, _CSV, _SUMMARY = "rows.jsonl", "rows.csv", "summary.json"
 _COLUMNS = (
-    "agent", "map", "path_m", "hops", "coverage", "unseen_cells", "end", "path_to_250_m", "decision_ms_median",
+    "agent", "map", "layout", "path_m", "hops", "coverage", "unseen_cells", "end", "path_to_250_m",
+    "decision_ms_median",
 )  # fmt: skip
 _RESAMPLES = 10_000
 
@@ -87,8 +88,8 @@ def run_dungeons(
     settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
     check_settings(out, settings, [_STORE, _CSV, _SUMMARY])
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
-    for path in paths:
-        load(path)  # a map that cannot be used is found before any work is lost
+    # A map that cannot be used is found before any work is lost.
+    layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
     write_settings(out, settings)
     jobs = [_Job(name, path, digests[path], scan) for path in paths for name in dict.fromkeys(agent_names)]
     done = {(row["agent"], row["digest"]): row for row in _read(out / _STORE)}
@@ -102,7 +103,7 @@ def run_dungeons(
 
         missing = [job for job in jobs if (job.agent, job.digest) not in done]
         run_all(missing, _run, workers=workers, keep=keep, what="episodes")
-    rows = [done[job.agent, job.digest] | {"map": job.path.stem} for job in jobs]
+    rows = [done[job.agent, job.digest] | {"map": job.path.stem, "layout": layouts[job.path]} for job in jobs]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
     atomic_write(out / _CSV, _csv(rows))
     atomic_write(out / _SUMMARY, json.dumps(summary, indent=1) + "\n")
@@ -110,7 +111,10 @@ def run_dungeons(
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Row]:
-    """Return one summary per agent; ratios are of the mean paths over the maps that both have run."""
+    """Return one summary per agent; ratios are of the mean paths over the maps that both have run.
+
+    Their intervals resample layouts: a map turned or mirrored, or moved by less than a tile, is no new one.
+    """
     by_agent: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_agent.setdefault(row["agent"], {})[row["map"]] = row
@@ -120,6 +124,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Row]:
         decisions = [row["decision_ms_median"] for row in own.values() if row["decision_ms_median"] is not None]
         out[agent] = {
             "maps": len(own),
+            "layouts": len({row["layout"] for row in own.values()}),
             "covered": sum(row["end"] == "covered" for row in own.values()),
             "path_m_mean": statistics.fmean(paths),
             "path_m_std": statistics.stdev(paths) if len(paths) > 1 else 0.0,
@@ -141,16 +146,20 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
-    """Return the ratio of the means and its 95 % interval, resampling maps, both agents' paths together."""
-    common = sorted(own.keys() & other.keys())
-    ours, base = (np.array([rows[name]["path_m"] for name in common]) for rows in (own, other))
-    if not len(ours) or base.mean() == 0:
+    """Return the ratio of the means and its 95 % interval, resampling layouts, both agents' paths together."""
+    sums: dict[str, list[float]] = {}  # layout → both agents' paths, over its maps
+    for name in sorted(own.keys() & other.keys()):
+        both = sums.setdefault(own[name]["layout"], [0.0, 0.0])
+        both[0] += own[name]["path_m"]
+        both[1] += other[name]["path_m"]
+    ours, base = np.array(list(sums.values())).reshape(-1, 2).T
+    if base.sum() == 0:
         return {"ratio": None, "ratio_low": None, "ratio_high": None}
     picks = np.random.default_rng(0).integers(0, len(ours), (_RESAMPLES, len(ours)))
-    below = base[picks].mean(axis=1)
-    ratios = ours[picks].mean(axis=1) / np.where(below > 0, below, math.nan)
+    below = base[picks].sum(axis=1)
+    ratios = ours[picks].sum(axis=1) / np.where(below > 0, below, math.nan)
     low, high = np.nanquantile(ratios, (0.025, 0.975))
-    return {"ratio": float(ours.mean() / base.mean()), "ratio_low": float(low), "ratio_high": float(high)}
+    return {"ratio": float(ours.sum() / base.sum()), "ratio_low": float(low), "ratio_high": float(high)}
 
 
 def table(summary: dict[str, Any]) -> str:
@@ -158,15 +167,16 @@ def table(summary: dict[str, Any]) -> str:
     references = [name for name in REFERENCES if name in summary["agents"]]
     further = "".join(f"to {name} (95 %) | " for name in references)
     lines = [
-        f"| agent | maps | covered | path, mean ± std [m] | to {BASELINE} (95 %) | {further}decision [ms] |",
+        f"| agent | maps (layouts) | covered | path, mean ± std [m] | to {BASELINE} (95 %) "
+        f"| {further}decision [ms] |",
         "|" + "---|" * (6 + len(references)),
     ]
     for name, own in summary["agents"].items():
         ratios = [_ratio_text(own), *(_ratio_text(own["to"][name]) for name in references)]
         decision = "" if own["decision_ms_median"] is None else f"{own['decision_ms_median']:.1f}"
         lines.append(
-            f"| `{name}` | {own['maps']} | {own['covered']} | {own['path_m_mean']:.0f} ± {own['path_m_std']:.0f} "
-            f"| {' | '.join(ratios)} | {decision} |"
+            f"| `{name}` | {own['maps']} ({own['layouts']}) | {own['covered']} "
+            f"| {own['path_m_mean']:.0f} ± {own['path_m_std']:.0f} | {' | '.join(ratios)} | {decision} |"
         )
     base, bound = PUBLISHED["nearest frontier"][0], PUBLISHED["known map"][0]
     for name, (mean, std) in PUBLISHED.items():

@@ -17,7 +17,7 @@ from training import dungeon_episode
 from training.dungeon_bound import known_map_path, known_walls_path
 from training.dungeon_episode import NEAREST, NEAREST_VIEW, explore, make_agent
 from training.dungeon_plans import dungeon_plan
-from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, load, scan
+from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, layout, load, scan
 from training.dungeons import main, run_dungeons, summarise, table
 from training.errors import BadInput
 
@@ -101,6 +101,13 @@ def test_a_scan_against_brute_force():
         np.testing.assert_array_equal(known[seen] == FREE, free[seen])
         away = np.argwhere(seen) - (row, col)
         assert np.hypot(*away.T).max() <= 52.0
+
+
+def test_a_map_turned_or_mirrored_is_the_same_layout():
+    plan, other = dungeon_plan(3), dungeon_plan(4)
+    for free in (np.rot90(plan.free), plan.free[::-1], np.rot90(plan.free, 3)[:, ::-1], np.roll(plan.free, 1, 1)):
+        assert layout(Dungeon("turned", np.ascontiguousarray(free), (0, 0))) == layout(plan)
+    assert layout(other) != layout(plan)
 
 
 def test_way_points_and_hops():
@@ -285,15 +292,20 @@ def test_bad_input_is_one_line(change, says, tmp_path, monkeypatch, capsys):
 def test_the_ratio_is_of_means_and_has_an_interval():
     def row(agent, name, path_m):
         return {
-            "agent": agent, "map": name, "path_m": path_m, "hops": 1, "coverage": 1.0, "end": "covered",
-            "path_to_250_m": path_m, "decision_ms_median": 1.0,
+            "agent": agent, "map": name, "layout": str(int(name) // 4), "path_m": path_m, "hops": 1,
+            "coverage": 1.0, "end": "covered", "path_to_250_m": path_m, "decision_ms_median": 1.0,
         }  # fmt: skip
 
     rng = np.random.default_rng(0)
     base = rng.uniform(400, 800, 40)
     rows = [row("nearest-frontier", str(i), v) for i, v in enumerate(base)]
     rows += [row("tour", str(i), 0.9 * v + rng.normal(0, 20)) for i, v in enumerate(base)]
-    assert summarise(rows)["tour"]["to"] == {}
+    assert summarise(rows)["tour"]["to"] == {} and summarise(rows)["tour"]["layouts"] == 10
+    # Maps of one layout are no news: with each of them four times, intervals are what they are with each once.
+    once = [row("nearest-frontier", str(4 * i), v) for i, v in enumerate(base)]
+    once += [row("tour", str(4 * i), v + 20 * math.sin(i)) for i, v in enumerate(base)]
+    often = [r | {"map": str(int(r["map"]) + k)} for r in once for k in range(4)]
+    assert summarise(often)["tour"]["ratio_low"] == pytest.approx(summarise(once)["tour"]["ratio_low"], abs=1e-3)
     rows += [row("known-walls", str(i), 0.75 * v) for i, v in enumerate(base)]
     own = summarise(rows)["tour"]
     assert own["to"]["known-walls"]["ratio"] == pytest.approx(own["ratio"] / 0.75)
