@@ -11,6 +11,7 @@ algorithms", 1997).
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from training.dungeon_plans import dungeon_plan
 from training.dungeon_walks import MOST, MOST_HOPS, Driver, LearnedDriver, Stop, TourDriver, Walk
 from training.dungeon_world import CELL_M
 
-__all__ = ["Lessons", "gather", "lessons_of", "read_lessons"]
+__all__ = ["Lessons", "gather", "joined", "lessons_of", "read_lessons"]
 
 _AT_RANDOM = 0.1  # share of the hops that are drawn at random
 
@@ -146,6 +147,13 @@ def read_lessons(folder: Path, seeds: range) -> Lessons:
     for seed in seeds:
         with np.load(_file(folder, seed), allow_pickle=False) as file:
             parts.append(Lessons(**file))
+    return joined(parts)
+
+
+def joined(parts: Sequence[Lessons]) -> Lessons:
+    """Return lessons one after the other."""
+    if len(parts) == 1:
+        return parts[0]
     return Lessons(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in Lessons.__dataclass_fields__)
     )

@@ -1,9 +1,9 @@
 """Training of ``learned-tour``: lessons on plans like the benchmark's, and a network that foresees them.
 
 ``python -m training.learned_tour --out DIR`` gathers lessons (plans of seeds 0 …, validated on others from 1000
-on) in ``DIR/round-1``, driven by the tour, and trains; in the next round, the network drives. It writes
-``learned-tour.safetensors`` and ``.json``. A killed run goes on where it stopped: with the next plan, or after the
-last whole epoch.
+on) in ``DIR/round-1``, driven by the tour, and trains. In the next round what was learned drives, and the network
+is trained anew on the lessons of both. It writes ``learned-tour.safetensors`` and ``.json``. A killed run goes on
+where it stopped: with the next plan, or after the last whole epoch.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from agents.station_network import PLANES, opening_numbers, with_walls
 from slam.formats import atomic_write, replacing
 from training.campaign import check_settings, installed_version, write_settings
 from training.dungeon_episode import explore
-from training.dungeon_lessons import Lessons, gather, read_lessons
+from training.dungeon_lessons import Lessons, gather, joined, read_lessons
 from training.dungeon_networks import StationNetwork
 from training.dungeon_plans import dungeon_plan
 from training.errors import BadInput, Interrupted
@@ -51,7 +51,8 @@ class TrainingConfig:
     """What a training depends on."""
 
     rounds: int = 2  # of lessons, each driven by what was learned in the one before
-    plans: int = 1000  # seeds 0 …
+    plans: int = 1000  # seeds 0 … of the first round
+    later_plans: int = 380  # seeds 0 … of the others: a network takes more time to drive than the tour
     validation_plans: int = 60  # seeds 1000 …
     epochs: int = 12
     batch: int = 64
@@ -167,10 +168,15 @@ def regret_m(network: StationNetwork, lessons: Lessons) -> tuple[float, float]:
     return float(longer.mean()), float(longer.std() / math.sqrt(len(longer)))
 
 
-def train(out: Path, config: TrainingConfig) -> tuple[StationNetwork, list[dict[str, float]]]:
-    """Train on the lessons in ``out``, from the last whole epoch on; return the network and its curve."""
-    lessons = read_lessons(out / "lessons", range(config.plans))
-    unseen = read_lessons(out / "lessons", range(_VALIDATION, _VALIDATION + config.validation_plans))
+def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNetwork, list[dict[str, float]]]:
+    """Train on the lessons of all rounds up to one; return the network and its curve.
+
+    A run that was broken off goes on from its last whole epoch. What is validated on is the last round's.
+    """
+    folders = {k: _round(out, k) for k in range(1, number + 1)}
+    lessons = joined([read_lessons(folder / "lessons", _seeds(config, k)) for k, folder in folders.items()])
+    unseen = read_lessons(folders[number] / "lessons", _unseen(config))
+    out = folders[number]
     torch.manual_seed(config.seed)
     network = StationNetwork()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -205,6 +211,18 @@ def train(out: Path, config: TrainingConfig) -> tuple[StationNetwork, list[dict[
         _keep(out / _CHECKPOINT, network, optimiser, curve)
         print(", ".join(f"{key} {value}" for key, value in curve[-1].items()), file=sys.stderr, flush=True)
     return network, curve
+
+
+def _round(out: Path, number: int) -> Path:
+    return out / f"round-{number}"
+
+
+def _seeds(config: TrainingConfig, number: int) -> range:
+    return range(config.plans if number == 1 else config.later_plans)
+
+
+def _unseen(config: TrainingConfig) -> range:
+    return range(_VALIDATION, _VALIDATION + config.validation_plans)
 
 
 def _rate_at(share: float) -> float:
@@ -247,18 +265,21 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m training.learned_tour", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the run")
     for name, value in asdict(TrainingConfig()).items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=type(value), default=value)
+        parser.add_argument(_option(name), type=type(value), default=value)
     parser.add_argument("--workers", type=int, default=1, help="processes that gather lessons")
     options = vars(parser.parse_args(argv))
     out, workers = options.pop("out"), options.pop("workers")
     try:
-        for name in ("rounds", "plans", "validation_plans", "epochs", "batch"):
+        for name in ("rounds", "plans", "later_plans", "validation_plans", "epochs", "batch"):
             if options[name] < 1:
-                raise BadInput(f"--{name.replace('_', '-')} must be at least 1, got {options[name]}")
+                raise BadInput(f"{_option(name)} must be at least 1, got {options[name]}")
         if not 0 <= options["untold"] <= 1:
             raise BadInput(f"--untold must be between 0 and 1, got {options['untold']}")
-        if options["plans"] > _VALIDATION:
-            raise BadInput(f"--plans must be at most {_VALIDATION}: those from there on are validated on")
+        for name in ("plans", "later_plans"):
+            if options[name] > _VALIDATION:
+                raise BadInput(
+                    f"{_option(name)} must be at most {_VALIDATION}: those from there on are validated on"
+                )
         if workers < 1:
             raise BadInput(f"--workers must be at least 1, got {workers}")
         run(out, TrainingConfig(**options), workers=workers)
@@ -269,6 +290,10 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
 def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     """Gather lessons, train and write the policy."""
     settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
@@ -277,10 +302,10 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     policy: Path | None = None
     curves = []
     for number in range(1, config.rounds + 1):
-        folder = out / f"round-{number}"
-        for seeds in (range(config.plans), range(_VALIDATION, _VALIDATION + config.validation_plans)):
+        folder = _round(out, number)
+        for seeds in (_seeds(config, number), _unseen(config)):
             gather(folder / "lessons", seeds, policy=policy, workers=workers)
-        network, curve = train(folder, config)
+        network, curve = train(out, config, number)
         curves.append(curve)
         weights = {
             name: np.asarray(value.numpy(), PRECISION, order="C")  # as it lies in memory, channels may come last
@@ -289,7 +314,7 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
         }
         policy = folder / _WEIGHTS
         atomic_write(policy, save(weights))
-    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in asdict(config).items()]
+    arguments = [f"{_option(name)}={value}" for name, value in asdict(config).items()]
     last = _VALIDATION + config.validation_plans - 1
     about: dict[str, Any] = {
         "format": FORMAT,

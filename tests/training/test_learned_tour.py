@@ -107,13 +107,13 @@ def test_where_nothing_is_news_the_robot_that_goes_on_goes_with_the_tour(monkeyp
 def run_folder(tmp_path_factory):
     """Lessons of two plans to learn from and one to validate on."""
     out = tmp_path_factory.mktemp("run")
-    gather(out / "lessons", range(2))
-    gather(out / "lessons", range(1000, 1001))
+    gather(out / "round-1" / "lessons", range(2))
+    gather(out / "round-1" / "lessons", range(1000, 1001))
     return out
 
 
 def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
-    folder = run_folder / "lessons"
+    folder = run_folder / "round-1" / "lessons"
     dates = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert set(dates) == {"000000.npz", "000001.npz", "001000.npz"}
     gather(folder, range(2))
@@ -130,7 +130,7 @@ def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
 
 
 def test_some_lessons_do_not_tell_how_far_the_plan_extends(run_folder):
-    lessons = read_lessons(run_folder / "lessons", range(1))
+    lessons = read_lessons(run_folder / "round-1" / "lessons", range(1))
     told, untold = batch_of(lessons, np.arange(4)), batch_of(lessons, np.arange(4), np.zeros(4, np.bool_))
     beyond = lessons.outside[:4] == 100
     known = lessons.planes[:4, :8].reshape(4, 2, 4, SIDE, SIDE).sum(axis=1) > 0
@@ -143,7 +143,7 @@ def test_some_lessons_do_not_tell_how_far_the_plan_extends(run_folder):
 
 
 def test_turning_a_lesson_turns_all_of_it(run_folder):
-    batch = batch_of(read_lessons(run_folder / "lessons", range(1)), np.arange(4))
+    batch = batch_of(read_lessons(run_folder / "round-1" / "lessons", range(1)), np.arange(4))
     round_again = batch
     for _ in range(4):
         round_again = turned(round_again, 1, False)
@@ -198,7 +198,8 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
     config = TrainingConfig(plans=2, validation_plans=1, epochs=2, batch=8)
     whole, curve = train(run_folder, config)
     assert [point["epoch"] for point in curve] == [1, 2] and curve[1]["cost"] < 2.0 * curve[0]["cost"]
-    (tmp_path / "lessons").symlink_to(run_folder / "lessons")
+    (tmp_path / "round-1").mkdir()
+    (tmp_path / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
     from training import learned_tour
 
     kept = learned_tour._keep
@@ -221,11 +222,10 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     from training.dungeon_episode import explore
 
     out = tmp_path / "run"
-    out.mkdir()
-    (out / "lessons").symlink_to(run_folder / "lessons")
-    arguments = ["--out", str(out), "--plans", "2", "--validation-plans", "1", "--epochs", "1", "--batch", "8"]
-    (out / "round-1").mkdir()
-    (out / "lessons").rename(out / "round-1" / "lessons")
+    (out / "round-1").mkdir(parents=True)
+    (out / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
+    arguments = ["--out", str(out), "--plans", "2", "--later-plans", "1", "--validation-plans", "1"]
+    arguments += ["--epochs", "1", "--batch", "8"]
     assert main(arguments) == 0
     path = out / "learned-tour.safetensors"
     assert capsys.readouterr().out.strip() == str(path)
@@ -234,7 +234,7 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     assert [len(curve) for curve in about["curves"]] == [1, 1]
     assert set(about["validation_path_m"]) == {"tour", "learned-tour"}
     first, second = ({p.name for p in (out / name / "lessons").iterdir()} for name in ("round-1", "round-2"))
-    assert first == second  # of the same plans, driven by what the first round learned
+    assert first == {*second, "000001.npz"}  # of the same plans, driven by what the first round learned
     assert agents.make(str(path)).about == about
     row = explore(dungeon_plan(5), str(path))
     assert row["end"] == "covered" and row["coverage"] > 0.99
@@ -250,6 +250,7 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         (["--plans", "1001"], "1000"),
         (["--epochs", "0"], "--epochs"),
         (["--rounds", "0"], "--rounds"),
+        (["--later-plans", "1001"], "--later-plans"),
         (["--untold", "1.5"], "--untold"),
         (["--workers", "0"], "--workers"),
     ],
