@@ -9,7 +9,7 @@ RAY := $(VENV)/ray
 SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
-AGENTS := nearest-frontier,cost-utility,next-best-view,rrt,tour,active,explore-and-return,random,known-map
+AGENTS := known-map,nearest-frontier,cost-utility,next-best-view,rrt,tour,brisk-tour,learned-tour,active,explore-and-return,random,ppo-frontier,ppo
 API_TESTS := $(wildcard tests/mecanum_env/test_env*.py)
 
 # The libraries' own threads only get in each other's way here: tests run in processes of their own.
