@@ -1,7 +1,9 @@
-"""``ExploreFrontier-v0`` over families of rooms, and the heuristics that a policy may begin with."""
+"""``ExploreFrontier-v0`` and its rehearsal over families of rooms, and the heuristics to begin with."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, SupportsInt
 
 import gymnasium
@@ -9,32 +11,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
-from agents.choice import Choice
+from agents.choice import CANDIDATE, Choice
 from agents.cost_utility import CostUtility
 from agents.explorer import Candidates
 from agents.frontier_env import ExploreFrontierEnv
 from agents.tour import Tour
 from mecanum_env import rooms as room_registry
+from training.campaign import start_worker
 from training.hindsight import Hindsight
-from training.train_config import WorldConfig
+from training.jump_world import JumpWorld
+from training.train_config import RehearsalConfig, WorldConfig
 from training.true_places import TruePlaces
 
-__all__ = ["Families", "Teacher", "make_world"]
+__all__ = ["Families", "Teacher", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
+
+_MIRRORED = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
 
 
 class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Draws a family of rooms and one of its training seeds, for as many episodes as ``world.repeats`` says.
 
-    A seed given to ``reset`` is where the drawing starts; ``options={"rooms": name, "room_seed": n}`` sets both.
+    A seed given to ``reset`` is where the drawing starts; ``options={"rooms": name, "room_seed": n}`` sets both,
+    and other options are passed on. With ``mirrors`` every other episode, by chance, is seen in a mirror.
     """
 
-    env: ExploreFrontierEnv
+    env: ExploreFrontierEnv | JumpWorld
     _hindsight: Hindsight | None
     _priced: tuple[Choice, NDArray[np.float32]] | None  # the last choice, and what was made of it
 
-    def __init__(self, env: ExploreFrontierEnv, world: WorldConfig) -> None:
+    def __init__(self, env: ExploreFrontierEnv | JumpWorld, world: WorldConfig, *, mirrors: bool = False) -> None:
         super().__init__(env)
-        self._world = world
+        self._world, self._mirrors, self._mirrored = world, mirrors, False
         self._rng = np.random.default_rng(0)
         self._room, self._episodes = ("", -1), 0  # the room drawn last, and how many episodes there were in it
         self._places: dict[tuple[str, int], TruePlaces] = {}
@@ -53,14 +60,20 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
             name, room_seed = self._room
         self._episodes += 1
         episode_seed = int(self._rng.integers(2**31))
-        if options:
-            name, room_seed = options["rooms"], options["room_seed"]
-            episode_seed = room_seed  # as the benchmark has it
-        plan = room_registry.make(name, seed=room_seed)
+        self._mirrored = self._mirrors and self._rng.random() < 0.5
+        passed_on = dict(options or {})
+        if passed_on:
+            name, room_seed = passed_on.pop("rooms"), passed_on.pop("room_seed")
+            episode_seed, self._mirrored = room_seed, False  # as the benchmark has it
+        if self._room != (name, room_seed):
+            self._plan = room_registry.make(name, seed=room_seed)
         self._room, self._hindsight, self._priced = (name, room_seed), None, None
-        observation, info = self.env.reset(seed=episode_seed, options={"floor_plan": plan})
+        observation, info = self.env.reset(seed=episode_seed, options={"floor_plan": self._plan, **passed_on})
         self._potential = self._worth(observation)
-        return observation, info
+        return self._seen(observation), info
+
+    def _seen(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        return mirrored(observation) if self._mirrored else observation
 
     def step(self, action: SupportsInt) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step; the reward is shaped by what is still to go, by hindsight, if the configuration says so.
@@ -70,7 +83,8 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._potential = self._potential, 0.0 if terminated else self._worth(observation)
-        return observation, float(reward) + self._potential - before, terminated, truncated, info
+        shaped = float(reward) + self._potential - before
+        return self._seen(observation), shaped, terminated, truncated, info
 
     def _worth(self, observation: dict[str, NDArray[Any]]) -> float:
         world = self._world
@@ -78,9 +92,16 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
             return 0.0
         return world.time_1_s * world.shaping_s_m * float(self.prices().min())
 
+    @property
+    def whole(self) -> ExploreFrontierEnv:
+        """The environment, where it is no rehearsal."""
+        assert isinstance(self.env, ExploreFrontierEnv)
+        return self.env
+
     def prices(self) -> NDArray[np.float32]:
         """Return what each candidate would cost by the truth ``(m,)`` [weighted m]: for teaching only."""
-        env, (choice, found) = self.env, self.env.agent.described
+        env = self.whole
+        choice, found = env.agent.described
         if self._priced is not None and self._priced[0] is choice:
             return self._priced[1]
         if self._hindsight is None:
@@ -111,6 +132,33 @@ def make_world(world: WorldConfig, index: int = 0, *, discount: float = 1.0) -> 
         config={"time_limit_s": world.time_limit_s},
     )  # fmt: skip
     return Families(env, world)
+
+
+def make_rehearsal(world: WorldConfig, rehearsal: RehearsalConfig) -> Families:
+    """Return an environment of a rehearsal: the same families of rooms, explored in jumps."""
+    patience = {**world.driver.get("patience", {}), "replan_s": rehearsal.replan_s}
+    env = JumpWorld(
+        driver={**world.driver, "patience": patience}, time_limit_s=world.time_limit_s, time_1_s=world.time_1_s,
+        covered_1=rehearsal.covered_1,
+    )  # fmt: skip
+    return Families(env, replace(world, shaping_s_m=0.0), mirrors=True)
+
+
+def world_of_worker(make: Callable[[], Families]) -> Families:
+    """Make an environment in a process of its own."""
+    start_worker()
+    return make()
+
+
+def mirrored(
+    observation: dict[str, NDArray[Any]], turned: NDArray[np.bool_] | bool = True
+) -> dict[str, NDArray[Any]]:
+    """Return a choice, or as many as ``turned`` ``(n,)`` says of n, as seen in a mirror: left is right."""
+    rows, patches = observation["candidates"].copy(), observation["patches"]
+    sign = np.where(turned, np.float32(-1.0), np.float32(1.0))[..., None, None]
+    rows[..., _MIRRORED] *= sign
+    patches = np.where(np.asarray(turned)[..., None, None, None, None], np.flip(patches, axis=-2), patches)
+    return observation | {"candidates": rows, "patches": patches}
 
 
 class Teacher:

@@ -40,7 +40,7 @@ def policy(
         raise BadInput("--like belongs to a .zip, and a .zip needs it: the .json file of the policy it comes from")
     check_writable(target.parent)
     try:
-        from training import policies
+        from training import networks, policies
     except ModuleNotFoundError as error:
         raise BadInput(f"this needs {error.name}; install it with pip install 'mecanum-slam[train]'") from error
     with bad_input():
@@ -50,7 +50,7 @@ def policy(
             policies.write_zip(source, target)
         else:
             assert like is not None
-            policies.export_policy(policies.read_zip(source), target, _read(like))
+            policies.export_policy(networks.read_zip(source), target, _read(like))
     print(f"wrote {target}")
 
 

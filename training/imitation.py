@@ -23,7 +23,7 @@ from torch import nn
 from agents import choice_network
 from agents.choice import CANDIDATE, TOUR_LOSS_M
 from slam.formats import replacing
-from training.choice_world import Families, Teacher, make_world
+from training.choice_world import Families, Teacher, make_world, mirrored
 from training.networks import ChoiceNetwork
 from training.train_config import TrainConfig
 
@@ -31,7 +31,6 @@ __all__ = ["Lessons", "give_lessons", "learn"]
 
 Weights = dict[str, NDArray[np.float32]]
 
-_MIRRORED = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
 _METRES = 5.0  # of price, for one unit of loss
 
 
@@ -91,7 +90,7 @@ def _episode(job: tuple[TrainConfig, int, Weights | None]) -> Lessons:
     torch.set_num_threads(1)
     imitation = config.imitation
     world = make_world(config.world, number)
-    heuristic = Teacher("tour" if imitation.teacher == "hindsight" else imitation.teacher, world.env)
+    heuristic = Teacher("tour" if imitation.teacher == "hindsight" else imitation.teacher, world.whole)
     network = None if weights is None else choice_network.ChoiceNetwork(weights, heads=config.heads)
     rng = np.random.default_rng([config.seed, number])
     observation, _ = world.reset(seed=int(rng.integers(2**31)))
@@ -179,8 +178,8 @@ def _loss(
     mirror: NDArray[np.bool_],
 ) -> tuple[torch.Tensor, float]:
     """Return the loss, and what the choice with the highest score costs above the cheapest."""
-    shown = {key: torch.as_tensor(value[rows]) for key, value in lessons.observations.items()}
-    observation = _mirrored(shown, mirror)
+    shown = mirrored({key: value[rows] for key, value in lessons.observations.items()}, mirror)
+    observation = {key: torch.as_tensor(value) for key, value in shown.items()}
     prices = torch.as_tensor(lessons.prices[rows])
     present = torch.isfinite(prices)
     above = torch.where(present, prices - prices.amin(dim=1, keepdim=True), 0.0)
@@ -194,12 +193,3 @@ def _loss(
     worth = nn.functional.mse_loss(network.value(tokens, observation["present"])[:, 0], returns)
     best = scores.argmax(dim=1, keepdim=True)
     return choice + 0.5 * worth, float(above.gather(1, best).mean())
-
-
-def _mirrored(observation: dict[str, torch.Tensor], mirror: NDArray[np.bool_]) -> dict[str, torch.Tensor]:
-    """Return an observation of as many choices, those asked for seen in a mirror: left is right."""
-    turned = torch.as_tensor(mirror)
-    rows, patches = observation["candidates"].clone(), observation["patches"]
-    rows[..., _MIRRORED] *= torch.where(turned, -1.0, 1.0)[:, None, None]
-    patches = torch.where(turned[:, None, None, None, None], patches.flip(3), patches)
-    return observation | {"candidates": rows, "patches": patches}

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import io
 import math
+import zipfile
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
 from gymnasium import spaces
+from numpy.typing import NDArray
 from sb3_contrib.common.maskable.policies import MaskableActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
-__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "PassedOn"]
+from agents.choice import CANDIDATE, STATE
+
+__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "PassedOn", "read_zip"]
 
 _NOWHERE = -1e9
+_INSIDE = "features_extractor.network."  # where the network is among the parameters of ChoicePolicy
 
 
 class Layer(nn.Module):
@@ -66,6 +73,15 @@ class ChoiceNetwork(nn.Module):
         self.score = nn.Linear(width, 1)
         self.value_1, self.value_2 = nn.Linear(2 * width, width), nn.Linear(width, 1)
         nn.init.zeros_(self.score.weight)
+
+    def ignore_uncertainty(self) -> None:
+        """Begin with no regard to covariance and landmarks: learned while these are 0, it is not upset later."""
+        with torch.no_grad():
+            for linear, names, ignored in (
+                (self.row, CANDIDATE, ("corners", "walls", "sigma_left")),
+                (self.state, STATE, ("sigma_m", "sigma_rad")),
+            ):
+                linear.weight[:, [names.index(name) for name in ignored]] = 0.0
 
     def tokens(self, observation: dict[str, Tensor]) -> Tensor:
         """Return the candidates after attention ``(b, k, width)``."""
@@ -161,3 +177,22 @@ class ChoicePolicy(MaskableActorCriticPolicy):
     def network(self) -> ChoiceNetwork:
         """The network itself."""
         return cast("ChoiceExtractor", self.features_extractor).network
+
+
+def read_zip(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Return the network's weights in a zip of stable-baselines3; of its pickles none is loaded.
+
+    Raises
+    ------
+    ValueError
+        Where the file is no such zip.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            state = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True, map_location="cpu")
+    except (OSError, KeyError, zipfile.BadZipFile, RuntimeError) as error:
+        raise ValueError(f"{path} is no zip that stable-baselines3 wrote: {error}") from error
+    weights = {name.removeprefix(_INSIDE): value for name, value in state.items() if name.startswith(_INSIDE)}
+    if not weights:
+        raise ValueError(f"{path} holds another policy than training.networks.ChoicePolicy")
+    return {name: value.numpy() for name, value in weights.items()}

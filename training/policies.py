@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -21,33 +19,11 @@ from agents.policy import load_choice_policy, policy_description
 from slam.formats import atomic_write, replacing
 from slam.settings import from_mapping, to_mapping
 from training.choice_world import make_world
-from training.networks import ChoicePolicy
+from training.networks import ChoicePolicy, read_zip
 from training.ppo import make_model
 from training.train_config import TrainConfig
 
-__all__ = ["export_policy", "export_run", "read_zip", "write_zip"]
-
-_INSIDE = "features_extractor.network."
-"""Where the network is among the parameters of :class:`training.networks.ChoicePolicy`."""
-
-
-def read_zip(path: Path) -> dict[str, NDArray[np.float32]]:
-    """Return the network's weights in a zip of stable-baselines3; of its pickles none is loaded.
-
-    Raises
-    ------
-    ValueError
-        Where the file is no such zip.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            state = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True, map_location="cpu")
-    except (OSError, KeyError, zipfile.BadZipFile, RuntimeError) as error:
-        raise ValueError(f"{path} is no zip that stable-baselines3 wrote: {error}") from error
-    weights = {name.removeprefix(_INSIDE): value for name, value in state.items() if name.startswith(_INSIDE)}
-    if not weights:
-        raise ValueError(f"{path} holds another policy than training.networks.ChoicePolicy")
-    return {name: value.numpy() for name, value in weights.items()}
+__all__ = ["export_policy", "export_run", "write_zip"]
 
 
 def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:

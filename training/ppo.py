@@ -1,17 +1,17 @@
-"""Training of ``ppo-frontier``: a warm start by imitation, then PPO, checkpointed so that it goes on exactly.
+"""Training of ``ppo-frontier``: a warm start by imitation, rehearsals, then PPO in the whole environment.
 
-A run is a chain of chunks of rollouts. Each begins with fresh episodes and random numbers that follow from the
-run's seed and the chunk's number alone, so that a run that was killed and resumed is the one that was not, bit for
-bit.
+A run is a chain of chunks of rollouts, those of the rehearsal first. Each begins with fresh episodes and random
+numbers that follow from the run's seed and the chunk's number alone, so that a run that was killed and resumed is
+the one that was not, bit for bit.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -26,13 +26,13 @@ from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
 from agents.choice_network import ChoiceNetwork
 from slam.formats import atomic_write
-from training.campaign import one_thread_each, start_worker, worker_pool
-from training.choice_world import Families, make_world
+from training.campaign import one_thread_each, worker_pool
+from training.choice_world import Families, make_rehearsal, make_world, world_of_worker
 from training.imitation import Lessons, give_lessons, learn
-from training.networks import ChoicePolicy
+from training.networks import ChoicePolicy, read_zip
 from training.running import progress_of_run
 from training.semi_markov import Durations, SemiMarkovBuffer
-from training.train_config import TrainConfig, WorldConfig
+from training.train_config import PpoConfig, TrainConfig, WorldConfig
 
 __all__ = ["Run", "evaluate", "make_model"]
 
@@ -57,29 +57,42 @@ class Run:
 
     def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
-        self._progress = progress_of_run(out, config, command=command, chunk=0, steps=0, best_s=None, wall_s=0.0)
+        self._progress = progress_of_run(
+            out, config, command=command, chunk=0, steps=0, best_s=None, best_in="", wall_s=0.0
+        )
 
     def train(self) -> None:
         """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
         torch.set_num_threads(1)
         self.out.mkdir(parents=True, exist_ok=True)
-        ppo, progress = self.config.ppo, self._progress
+        progress = self._progress
         # From the first: the lessons in the folder are of this configuration and no other.
         atomic_write(self.out / "progress.json", json.dumps(progress))
-        makers = [partial(_world_of_worker, self.config.world, k) for k in range(ppo.environments)]
+        self._began = time.perf_counter() - progress["wall_s"]
+        with worker_pool(self._workers) as pool:
+            for stage in _stages(self.config):
+                if progress["chunk"] <= stage.end:
+                    self._enact(stage, pool)
+
+    def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
+        """Go through what is left of a stage, from the last checkpoint if there is one."""
+        config, progress, checkpoint = self.config, self._progress, self.out / "checkpoint.zip"
+        makers = [partial(world_of_worker, maker) for maker in stage.makers]
         with one_thread_each():
             env = VecMonitor(SubprocVecEnv(makers, start_method="spawn"))  # type: ignore[arg-type]
-        self._began = time.perf_counter() - progress["wall_s"]
         try:
-            with worker_pool(self._workers) as pool:
-                model = make_model(self.config, env)
-                model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
-                if progress["chunk"] > 0:
-                    model.set_parameters(str(self.out / "checkpoint.zip"), device="cpu")
-                    model.num_timesteps = progress["steps"]
-                elif self.config.imitation.episodes > 0:
-                    self._imitate(model, pool)
-                self._go_on(model, env, pool)
+            model = make_model(config, env, stage.ppo)
+            model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
+            model.num_timesteps = progress["steps"]
+            if progress["chunk"] > stage.first:
+                model.set_parameters(str(checkpoint), device="cpu")
+            elif stage.first > 0:
+                network = cast("ChoicePolicy", model.policy).network
+                found = read_zip(checkpoint)
+                network.load_state_dict({name: torch.as_tensor(value) for name, value in found.items()})
+            elif config.imitation.episodes > 0:
+                self._imitate(model, pool)
+            self._go_on(stage, model, env, pool)
         finally:
             env.close()
 
@@ -100,52 +113,54 @@ class Run:
             for line in learn(network, Lessons.joined(rounds), self.config):
                 self._say(f"imitation {number + 1}: " + _words(line))
 
-    def _go_on(self, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor) -> None:
-        ppo, progress = self.config.ppo, self._progress
-        size = ppo.chunk * ppo.n_steps * ppo.environments
-        chunks = -(-ppo.steps // size)
-        while progress["chunk"] <= chunks:
+    def _go_on(self, stage: _Stage, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor) -> None:
+        progress = self._progress
+        while progress["chunk"] <= stage.end:
             number = progress["chunk"]
-            if number % self.config.evaluation.every == 0 or number == chunks:
-                self._evaluate(model, pool)
-            if number == chunks:
+            if (number - stage.first) % stage.every == 0 or number == stage.end:
+                self._evaluate(stage, model, pool)
+            if number == stage.end:
                 break
-            self._learn_chunk(model, env, number, chunks)
+            self._learn_chunk(stage, model, env, number)
             progress |= {
                 "chunk": number + 1, "steps": model.num_timesteps, "wall_s": time.perf_counter() - self._began,
             }  # fmt: skip
             _save(model, self.out / "checkpoint.zip")
             atomic_write(self.out / "progress.json", json.dumps(progress))
-            self._say(f"chunk {number + 1} of {chunks}: " + _words(_recent(model)))
+            done, of = number + 1 - stage.first, stage.end - stage.first
+            self._say(f"{stage.name}, chunk {done} of {of}: " + _words(_recent(model)))
 
-    def _learn_chunk(self, model: MaskablePPO, env: VecMonitor, number: int, chunks: int) -> None:
-        ppo = self.config.ppo
+    def _learn_chunk(self, stage: _Stage, model: MaskablePPO, env: VecMonitor, number: int) -> None:
         seed = int(np.random.SeedSequence([self.config.seed, number]).generate_state(1)[0] % 2**31)
         model.set_random_seed(seed)
         env.seed(seed)
         model._last_obs = None  # fresh episodes
-        model.lr_schedule = FloatSchedule(ppo.learning_rate * (1.0 - number / chunks))
-        steps = ppo.chunk * ppo.n_steps * ppo.environments
-        model.learn(steps, callback=Durations(), reset_num_timesteps=False)
+        left = 1.0 - (number - stage.first) / (stage.end - stage.first)
+        model.lr_schedule = FloatSchedule(stage.ppo.learning_rate * left)
+        model.learn(stage.ppo.size, callback=Durations(), reset_num_timesteps=False)
 
-    def _evaluate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
+    def _evaluate(self, stage: _Stage, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
         weights = _weights(cast("ChoicePolicy", model.policy).network)
-        result = {"steps": model.num_timesteps} | evaluate(weights, self.config, pool)
+        result = {"stage": stage.name, "steps": model.num_timesteps}
+        result |= evaluate(weights, self.config.heads, stage.trials, pool)
         with (self.out / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(result | {"wall_s": time.perf_counter() - self._began}) + "\n")
         self._say("evaluation: " + _words(result))
-        if self._progress["best_s"] is None or result["time_to_95_s"] < self._progress["best_s"]:
-            self._progress["best_s"] = result["time_to_95_s"]
+        best = self._progress["best_s"]
+        # Seconds of a rehearsal are not those of the whole environment.
+        if self._progress["best_in"] != stage.name or best is None or result["time_to_95_s"] < best:
+            self._progress |= {"best_s": result["time_to_95_s"], "best_in": stage.name}
             _save(model, self.out / "best.zip")
+            atomic_write(self.out / "progress.json", json.dumps(self._progress))
 
     def _say(self, text: str) -> None:
         self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
 
 
-def make_model(config: TrainConfig, env: VecEnv) -> MaskablePPO:
+def make_model(config: TrainConfig, env: VecEnv, ppo: PpoConfig | None = None) -> MaskablePPO:
     """Return an untrained model for an environment with the configuration's choices."""
-    ppo = config.ppo
-    return MaskablePPO(
+    ppo = ppo or config.ppo
+    model = MaskablePPO(
         ChoicePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
         learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
         clip_range=ppo.clip_range, target_kl=ppo.target_kl, rollout_buffer_class=SemiMarkovBuffer,
@@ -156,21 +171,72 @@ def make_model(config: TrainConfig, env: VecEnv) -> MaskablePPO:
             },
         },
     )  # fmt: skip
+    if config.rehearsal.steps > 0:
+        cast("ChoicePolicy", model.policy).network.ignore_uncertainty()
+    return model
 
 
-def evaluate(weights: Weights, config: TrainConfig, pool: ProcessPoolExecutor) -> dict[str, Any]:
-    """Return how long a policy, chance aside, takes to 95 % on validation seeds; unreached counts as the limit."""
-    world, heads = config.world, config.heads
-    jobs = [
-        (weights, heads, world, name, noise, _FIRST_VALIDATION_SEED + k)
+@dataclass(frozen=True)
+class Trial:
+    """An episode on a validation seed."""
+
+    family: str
+    make: Callable[[], Families]
+    options: dict[str, Any]
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A part of a run, in one kind of world."""
+
+    name: str
+    ppo: PpoConfig
+    first: int  # number of its first chunk
+    every: int  # chunks, between two evaluations
+    makers: list[Callable[[], Families]]
+    trials: list[Trial]
+
+    @property
+    def end(self) -> int:
+        """Number of the chunk after its last one."""
+        return self.first + -(-self.ppo.steps // self.ppo.size)
+
+
+def _stages(config: TrainConfig) -> list[_Stage]:
+    world, rehearsal, ppo = config.world, config.rehearsal, config.ppo
+    stages = []
+    if rehearsal.steps > 0:
+        jumps = partial(make_rehearsal, world, rehearsal)
+        stages.append(
+            _Stage(
+                "rehearsal", rehearsal, 0, rehearsal.every, [jumps] * rehearsal.environments,
+                _trials(world, jumps, rehearsal.episodes, {"anywhere": False}),
+            )
+        )  # fmt: skip
+    makers = [partial(make_world, world, k) for k in range(ppo.environments)]
+    whole = [partial(make_world, replace(world, noises=(noise,))) for noise in world.noises]
+    trials = [t for make in whole for t in _trials(world, make, config.evaluation.episodes, {})]
+    first = stages[0].end if stages else 0
+    return [*stages, _Stage("ppo", ppo, first, config.evaluation.every, [*makers], trials)]
+
+
+def _trials(
+    world: WorldConfig, make: Callable[[], Families], episodes: int, options: dict[str, Any]
+) -> list[Trial]:
+    return [
+        Trial(name, make, {"rooms": name, "room_seed": _FIRST_VALIDATION_SEED + k} | options, world.time_limit_s)
         for name in dict.fromkeys(world.rooms)
-        for noise in world.noises
-        for k in range(config.evaluation.episodes)
+        for k in range(episodes)
     ]
-    ends = list(pool.map(_try, jobs))
-    times: dict[str, list[float]] = {job[3]: [] for job in jobs}
-    for job, (time_s, _) in zip(jobs, ends, strict=True):
-        times[job[3]].append(time_s)
+
+
+def evaluate(weights: Weights, heads: int, trials: Sequence[Trial], pool: ProcessPoolExecutor) -> dict[str, Any]:
+    """Return how long a policy, chance aside, takes to 95 % on validation seeds; unreached counts as the limit."""
+    ends = list(pool.map(_try, [(weights, heads, trial) for trial in trials]))
+    times: dict[str, list[float]] = {trial.family: [] for trial in trials}
+    for trial, (time_s, _) in zip(trials, ends, strict=True):
+        times[trial.family].append(time_s)
     means = {name: float(np.mean(values)) for name, values in times.items()}
     return {
         "time_to_95_s": float(np.mean(list(means.values()))),
@@ -179,23 +245,17 @@ def evaluate(weights: Weights, config: TrainConfig, pool: ProcessPoolExecutor) -
     }
 
 
-def _try(job: tuple[Weights, int, WorldConfig, str, str, int]) -> tuple[float, int]:
+def _try(job: tuple[Weights, int, Trial]) -> tuple[float, int]:
     """Return the time to 95 % [s] and the collisions of one episode."""
-    weights, heads, world, rooms, noise, seed = job
+    weights, heads, trial = job
     network = ChoiceNetwork(weights, heads=heads)
-    env = make_world(replace(world, noises=(noise,)))
-    env.reset(options={"rooms": rooms, "room_seed": seed})
+    env = trial.make()
+    env.reset(options=trial.options)
     while True:
         k = int(np.argmax(network.scores(env.env.agent.described[0]))) if env.action_masks().sum() > 1 else 0
         *_, terminated, truncated, info = env.step(k)
         if terminated or truncated:
-            return info["time_s"] if info["is_success"] else world.time_limit_s, info["collisions"]
-
-
-def _world_of_worker(world: WorldConfig, index: int) -> Families:
-    """Make an environment in a process of its own."""
-    start_worker()
-    return make_world(world, index)
+            return info["time_s"] if info["is_success"] else trial.limit_s, info["collisions"]
 
 
 def _weights(network: torch.nn.Module) -> Weights:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
 from slam.settings import require, unknown_name
 
-__all__ = ["EvaluationConfig", "ImitationConfig", "PpoConfig", "TrainConfig", "WorldConfig"]
+__all__ = ["EvaluationConfig", "ImitationConfig", "PpoConfig", "RehearsalConfig", "TrainConfig", "WorldConfig"]
 
 TEACHERS = ("hindsight", "tour", "cost-utility")
 
@@ -73,6 +73,8 @@ class ImitationConfig:
 class PpoConfig:
     """Of stable-baselines3, but ``gamma``, which is per second."""
 
+    table: ClassVar[str] = "ppo"
+
     steps: int = 200_000  # decisions
     environments: int = 8
     n_steps: int = 128  # decisions an environment, in one rollout
@@ -89,9 +91,40 @@ class PpoConfig:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            require(math.isfinite(value) and value >= 0, f"[ppo] {f.name} must be ≥ 0, got {value}")
+            require(math.isfinite(value) and value >= 0, f"[{self.table}] {f.name} must be ≥ 0, got {value}")
         for name in ("environments", "n_steps", "batch_size", "n_epochs", "chunk"):
-            require(getattr(self, name) >= 1, f"[ppo] {name} must be at least 1")
+            require(getattr(self, name) >= 1, f"[{self.table}] {name} must be at least 1")
+
+    @property
+    def size(self) -> int:
+        """Decisions in a chunk."""
+        return self.chunk * self.n_steps * self.environments
+
+
+@dataclass(frozen=True, kw_only=True)
+class RehearsalConfig(PpoConfig):
+    """PPO in ``training/jump_world.py``, before that in the whole environment."""
+
+    table: ClassVar[str] = "rehearsal"
+
+    steps: int = 0  # 0: no rehearsal
+    environments: int = 16
+    n_steps: int = 256
+    batch_size: int = 512
+    n_epochs: int = 3
+    learning_rate: float = 5e-4
+    gamma: float = 1.0
+    gae_lambda: float = 0.9
+    chunk: int = 4
+    covered_1: float = 1.0  # reward for all there is to cover, as it is covered, besides that for time
+    replan_s: float = 3.0  # that a choice lasts at most: the longer, the more it is felt
+    every: int = 8  # chunks, between two trials on validation seeds …
+    episodes: int = 30  # … of each family
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.every >= 1 and 1 <= self.episodes <= 50, "[rehearsal] needs every ≥ 1, episodes 1 … 50")
+        require(self.replan_s > 0, "[rehearsal] replan_s must be > 0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,5 +148,6 @@ class TrainConfig:
     layers: int = 2
     world: WorldConfig = field(default_factory=WorldConfig)
     imitation: ImitationConfig = field(default_factory=ImitationConfig)
+    rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)

@@ -11,10 +11,11 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
+from agents.choice import CANDIDATE, STATE
 from slam.settings import from_mapping
 from training.cli import main
 from training.cli_train import CONFIGS, _read
-from training.policies import read_zip
+from training.networks import read_zip
 from training.ppo import Run
 from training.train_config import TrainConfig
 
@@ -30,7 +31,16 @@ class Killed(Exception):
     pass
 
 
-def run(out: Path, *, kill_after: str | None = None) -> list[str]:
+REHEARSED = SMALL | {
+    "imitation": {"episodes": 0},
+    "rehearsal": {
+        "steps": 32, "environments": 2, "n_steps": 8, "chunk": 1, "batch_size": 16, "every": 2, "episodes": 1,
+    },
+    "ppo": SMALL["ppo"] | {"steps": 16},
+}  # fmt: skip
+
+
+def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL) -> list[str]:
     said: list[str] = []
 
     def log(text: str) -> None:
@@ -38,8 +48,12 @@ def run(out: Path, *, kill_after: str | None = None) -> list[str]:
         if kill_after is not None and text.startswith(kill_after):
             raise Killed
 
-    Run(from_mapping(TrainConfig, SMALL), out, workers=2, log=log).train()
+    Run(from_mapping(TrainConfig, config), out, workers=2, log=log).train()
     return said
+
+
+def curve(out: Path) -> list[dict]:
+    return [json.loads(line) for line in (out / "curve.jsonl").read_text().splitlines()]
 
 
 def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_with_its_lessons(tmp_path):
@@ -48,7 +62,7 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_goes_on_with_its_less
     given = (tmp_path / "lessons-1.npz").read_bytes()
     with pytest.raises(ValueError, match="another configuration"):
         Run(from_mapping(TrainConfig, SMALL | {"seed": 2}), tmp_path, workers=1, log=print)
-    assert any(text.startswith("chunk 3 of 3") for text in run(tmp_path))
+    assert any(text.startswith("ppo, chunk 3 of 3") for text in run(tmp_path))
     assert (tmp_path / "lessons-1.npz").read_bytes() == given
 
 
@@ -56,19 +70,52 @@ def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
     said = run(tmp_path / "whole")
     assert any(text.startswith("imitation 2: epoch 1") for text in said)
     with pytest.raises(Killed):
-        run(tmp_path / "parts", kill_after="chunk 2 ")
+        run(tmp_path / "parts", kill_after="ppo, chunk 2 ")
     again = run(tmp_path / "parts")
-    assert not any(text.startswith(("imitation", "chunk 1 ", "chunk 2 ")) for text in again)
+    assert not any(text.startswith(("imitation", "ppo, chunk 1 ", "ppo, chunk 2 ")) for text in again)
     one, other = (read_zip(tmp_path / name / "checkpoint.zip") for name in ("whole", "parts"))
     for name, weights in one.items():
         np.testing.assert_array_equal(weights, other[name])
-    curves = [
-        [json.loads(line) for line in (tmp_path / name / "curve.jsonl").read_text().splitlines()]
-        for name in ("whole", "parts")
-    ]
-    assert [line["time_to_95_s"] for line in curves[0]] == [line["time_to_95_s"] for line in curves[1]]
+    times = [[line["time_to_95_s"] for line in curve(tmp_path / name)] for name in ("whole", "parts")]
+    assert times[0] == times[1]
     with pytest.raises(ValueError, match="another configuration"):
         Run(from_mapping(TrainConfig, SMALL | {"seed": 2}), tmp_path / "parts", workers=1, log=print)
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory):
+    out = tmp_path_factory.mktemp("rehearsed") / "whole"
+    return out, run(out, config=REHEARSED)
+
+
+def test_a_rehearsal_comes_first(rehearsed):
+    out, said = rehearsed
+    chunks = [text.partition(":")[0] for text in said if "chunk" in text]
+    assert chunks == ["rehearsal, chunk 1 of 2", "rehearsal, chunk 2 of 2", "ppo, chunk 1 of 1"]
+    lines = curve(out)
+    assert [line["stage"] for line in lines] == ["rehearsal", "rehearsal", "ppo", "ppo"]
+    assert [line["steps"] for line in lines] == [0, 32, 32, 48]
+    # The best is of the last stage: seconds of a rehearsal are others.
+    progress = json.loads((out / "progress.json").read_text())
+    assert progress["best_in"] == "ppo"
+    assert progress["best_s"] == min(line["time_to_95_s"] for line in lines[2:])
+
+
+@pytest.mark.parametrize("kill_after", ["rehearsal, chunk 1 ", "rehearsal, chunk 2 "])
+def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed, kill_after):
+    with pytest.raises(Killed):
+        run(tmp_path, kill_after=kill_after, config=REHEARSED)
+    # What the rehearsal has no use for weighs nothing until there is something to learn from.
+    weights = read_zip(tmp_path / "checkpoint.zip")
+    unused = [CANDIDATE.index(name) for name in ("corners", "walls", "sigma_left")]
+    assert not weights["row.weight"][:, unused].any()
+    assert not weights["state.weight"][:, [STATE.index(name) for name in ("sigma_m", "sigma_rad")]].any()
+    run(tmp_path, config=REHEARSED)
+    one, other = (read_zip(out / "checkpoint.zip") for out in (rehearsed[0], tmp_path))
+    same_weights(one, other)
+    assert one["row.weight"][:, unused].any()
+    times = [[line["time_to_95_s"] for line in curve(out)] for out in (rehearsed[0], tmp_path)]
+    assert times[0] == times[1]
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
