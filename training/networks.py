@@ -85,9 +85,12 @@ class ChoiceNetwork(nn.Module):
 
     def tokens(self, observation: dict[str, Tensor]) -> Tensor:
         """Return the candidates after attention ``(b, k, width)``."""
-        absent = observation["present"] < 0.5
-        patches = observation["patches"].flatten(2).float() / 255.0
-        seen = self.patch_2(torch.relu(self.patch_1(patches)))
+        present = observation["present"] > 0.5
+        absent = ~present
+        # Of the candidates that there are alone: most of the time goes into these two.
+        patches = observation["patches"][present].flatten(1).float() / 255.0
+        seen = torch.zeros(*present.shape, self.width)
+        seen[present] = self.patch_2(torch.relu(self.patch_1(patches)))
         x = self.row(observation["candidates"]) + seen + self.state(observation["state"])[:, None]
         x = self.token(torch.relu(x))
         for layer in self.layers:
