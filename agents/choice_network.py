@@ -8,7 +8,7 @@ no positions in the row of candidates: permuted candidates get permuted scores, 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.choice import Choice
 
-__all__ = ["ChoiceNetwork"]
+__all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
 
 Floats = NDArray[np.float32]
 
@@ -107,3 +107,48 @@ class ChoiceNetwork:
                     raise ValueError(f"weight {name} has the shape {found}, expected {shape}")
         except KeyError as error:
             raise ValueError(f"weight {error.args[0]} is missing") from error
+
+
+class ChoiceEnsemble:
+    """Networks that were trained apart and choose together: what one learned by chance the others outvote.
+
+    Parameters
+    ----------
+    weights : mapping
+        ``members.0.`` and so on before the names of each network's own; or those of a single one.
+    heads : int
+        Of the attention.
+
+    Raises
+    ------
+    ValueError
+        As for :class:`ChoiceNetwork`.
+    """
+
+    def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
+        self.members = [ChoiceNetwork(own, heads=heads) for own in apart(weights)]
+
+    def scores(self, choice: Choice) -> Floats:
+        """Return the mean of the networks' log-probabilities of each candidate ``(m,)``."""
+        return np.asarray(np.mean([_log_softmax(member.scores(choice)) for member in self.members], axis=0))
+
+
+def joined(members: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+    """Return the weights of several networks as :class:`ChoiceEnsemble` takes them; a single one's as they are."""
+    if len(members) == 1:
+        return dict(members[0])
+    return {f"members.{k}.{name}": value for k, own in enumerate(members) for name, value in own.items()}
+
+
+def apart(weights: Mapping[str, Floats]) -> list[dict[str, Floats]]:
+    """Return the weights of each network of an ensemble, or of the only one."""
+    count = len({name.split(".")[1] for name in weights if name.startswith("members.")})
+    if count == 0:
+        return [dict(weights)]
+    starts = [f"members.{k}." for k in range(count)]
+    return [{n.removeprefix(start): v for n, v in weights.items() if n.startswith(start)} for start in starts]
+
+
+def _log_softmax(scores: Floats) -> Floats:
+    above = scores - scores.max()
+    return np.asarray(above - np.log(np.exp(above).sum()))

@@ -11,7 +11,7 @@ import numpy as np
 
 from agents.base import Goal
 from agents.choice import CANDIDATE, STATE
-from agents.choice_network import ChoiceNetwork
+from agents.choice_network import ChoiceEnsemble
 from agents.chooser import Chooser, ChooserConfig
 from agents.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -32,8 +32,8 @@ class PpoFrontierConfig:
     driver: Mapping[str, Any] = field(default_factory=dict)  # laid over the ChooserConfig that it was trained with
 
 
-def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[str, Any]]:
-    """Read a policy: the network, the explorer it was trained with, and what the JSON file says of its training.
+def load_choice_policy(path: Path) -> tuple[ChoiceEnsemble, ChooserConfig, dict[str, Any]]:
+    """Read a policy: its networks, the explorer it was trained with, and what the JSON file says of its training.
 
     Neither file can run code.
 
@@ -47,7 +47,7 @@ def load_choice_policy(path: Path) -> tuple[ChoiceNetwork, ChooserConfig, dict[s
     if [described.get("candidate"), described.get("state")] != columns:
         raise ValueError(f"policy {path} was trained on other columns than this version shows; train it anew")
     try:
-        network = ChoiceNetwork(weights, heads=int(described["heads"]))
+        network = ChoiceEnsemble(weights, heads=int(described["heads"]))
         driver = from_mapping(ChooserConfig, described["driver"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"policy {path}: {error}") from error

@@ -20,6 +20,9 @@ def policy(
         Path | None,
         typer.Option(help="With a .zip for source: the .json file of the policy that it was trained on from."),
     ] = None,
+    member: Annotated[
+        int | None, typer.Option(min=1, help="To a .zip: which of several networks that choose together.")
+    ] = None,
 ) -> None:
     """Convert a policy: a run's best, the package's files, a zip of stable-baselines3 (ppo-frontier's only).
 
@@ -29,6 +32,7 @@ def policy(
     Examples:
       mecanum policy out/train mine.safetensors
       mecanum policy mine.safetensors mine.zip
+      mecanum policy three.safetensors mine.zip --member 2
       mecanum policy mine.zip other.safetensors --like mine.json
     """  # noqa: D301
     kinds = (_kind(source), target.suffix)
@@ -38,6 +42,8 @@ def policy(
         )
     if (like is not None) != (kinds[0] == ".zip"):
         raise BadInput("--like belongs to a .zip, and a .zip needs it: the .json file of the policy it comes from")
+    if member is not None and kinds[1] != ".zip":
+        raise BadInput("--member says which network of a .safetensors becomes a .zip")
     check_writable(target.parent)
     try:
         from training import networks, policies
@@ -47,7 +53,7 @@ def policy(
         if kinds[0] == ".run":
             policies.export_run(source, target)
         elif kinds[0] == ".safetensors":
-            policies.write_zip(source, target)
+            policies.write_zip(source, target, member)
         else:
             assert like is not None
             policies.export_policy(networks.read_zip(source), target, _read(like))

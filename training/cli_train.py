@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from training.drive import DriveRun
     from training.drive_config import DriveConfig
     from training.ppo import Run
+    from training.ppo_ensemble import EnsembleRun
     from training.train_config import TrainConfig
 
 __all__ = ["train"]
@@ -72,7 +73,7 @@ def train(
         raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
 
 
-def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | DriveRun]:
+def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | EnsembleRun | DriveRun]:
     from training.drive_config import DriveConfig
 
     if isinstance(settings, DriveConfig):
@@ -80,8 +81,9 @@ def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | DriveRun
 
         return DriveRun
     from training.ppo import Run
+    from training.ppo_ensemble import EnsembleRun
 
-    return Run
+    return Run if settings.members == 1 else EnsembleRun
 
 
 def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:

@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents.choice_network import apart
 from agents.chooser import ChooserConfig
 from agents.drive_policy import FORMAT, load_drive_policy
 from agents.policy import load_choice_policy, policy_description
 from slam.formats import atomic_write, replacing
 from slam.settings import from_mapping, to_mapping
 from training.choice_world import make_world
-from training.networks import ChoicePolicy, read_zip
+from training.networks import ChoicePolicy
 from training.ppo import make_model
+from training.ppo_ensemble import best_weights, curve_of
 from training.train_config import TrainConfig
 
 __all__ = ["export_policy", "export_run", "write_zip"]
@@ -56,24 +58,36 @@ def export_run(run: Path, target: Path) -> None:
     """
     try:
         progress = json.loads((run / "progress.json").read_text(encoding="utf-8"))
-        curve = [json.loads(line) for line in (run / "curve.jsonl").read_text(encoding="utf-8").splitlines()]
+        drives = progress["config"].get("policy") == "drive"
+        config = TrainConfig() if drives else from_mapping(TrainConfig, progress["config"])
+        curve = curve_of(config, run)
     except (OSError, ValueError) as error:
         raise ValueError(f"{run} holds no finished part of a run: {error}") from error
-    if progress["config"].get("policy") == "drive":
+    if drives:
         _export_drive(run, target, progress, curve)
     else:
-        export_policy(read_zip(run / "best.zip"), target, _training(progress, curve))
+        export_policy(best_weights(config, run), target, _training(progress, curve))
 
 
-def write_zip(source: Path, target: Path) -> None:
+def write_zip(source: Path, target: Path, member: int | None = None) -> None:
     """Write a policy of the package's format as a zip that ``MaskablePPO.load`` reads, to train on from.
+
+    Parameters
+    ----------
+    source, target
+        From and to.
+    member
+        Which of several networks that choose together, from 1: a zip holds one.
 
     Raises
     ------
     ValueError
-        Where ``source`` is no such policy, or its JSON file does not say how it was trained.
+        Where ``source`` is no such policy, is of several networks and ``member`` none of them, or its JSON file
+        does not say how it was trained.
     """
-    load_choice_policy(source)
+    count = len(load_choice_policy(source)[0].members)
+    if not 1 <= (member or (1 if count == 1 else 0)) <= count:
+        raise ValueError(f"{source} is of {count} network{'s' * (count > 1)}: choose one by --member 1 … {count}")
     described = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     if "config" not in described:
         raise ValueError(f"{source.with_suffix('.json')} does not say with which config it was trained")
@@ -81,7 +95,8 @@ def write_zip(source: Path, target: Path) -> None:
     env = DummyVecEnv([lambda: make_world(config.world)])
     model = make_model(config, env)
     network = cast("ChoicePolicy", model.policy).network
-    network.load_state_dict({name: torch.as_tensor(value) for name, value in load_file(source).items()})
+    weights = apart(load_file(source))[(member or 1) - 1]
+    network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
     with replacing(target) as new:
         model.save(new)
     env.close()

@@ -24,7 +24,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
-from agents.choice_network import ChoiceNetwork
+from agents.choice_network import ChoiceEnsemble
 from slam.formats import atomic_write
 from training.campaign import one_thread_each, worker_pool
 from training.choice_world import Families, make_rehearsal, make_world, world_of_worker
@@ -34,7 +34,7 @@ from training.running import progress_of_run
 from training.semi_markov import Durations, SemiMarkovBuffer
 from training.train_config import PpoConfig, TrainConfig, WorldConfig
 
-__all__ = ["Run", "evaluate", "make_model"]
+__all__ = ["Run", "Trial", "evaluate", "make_model", "trials_in_full"]
 
 Log = Callable[[str], None]
 Weights = dict[str, NDArray[np.float32]]
@@ -58,11 +58,13 @@ class Run:
     def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
         self._progress = progress_of_run(
-            out, config, command=command, chunk=0, steps=0, best_s=None, best_in="", wall_s=0.0
+            out, config, command=command, chunk=0, steps=0, best_s=None, best_in="", wall_s=0.0, done=False
         )
 
     def train(self) -> None:
-        """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
+        """Train to the end; a run broken off anywhere goes on from its last checkpoint, a finished one is left."""
+        if self._progress["done"]:
+            return
         torch.set_num_threads(1)
         self.out.mkdir(parents=True, exist_ok=True)
         progress = self._progress
@@ -73,6 +75,8 @@ class Run:
             for stage in _stages(self.config):
                 if progress["chunk"] <= stage.end:
                     self._enact(stage, pool)
+        progress["done"] = True
+        atomic_write(self.out / "progress.json", json.dumps(progress))
 
     def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
         """Go through what is left of a stage, from the last checkpoint if there is one."""
@@ -215,10 +219,15 @@ def _stages(config: TrainConfig) -> list[_Stage]:
             )
         )  # fmt: skip
     makers = [partial(make_world, world, k) for k in range(ppo.environments)]
-    whole = [partial(make_world, replace(world, noises=(noise,))) for noise in world.noises]
-    trials = [t for make in whole for t in _trials(world, make, config.evaluation.episodes, {})]
     first = stages[0].end if stages else 0
-    return [*stages, _Stage("ppo", ppo, first, config.evaluation.every, [*makers], trials)]
+    return [*stages, _Stage("ppo", ppo, first, config.evaluation.every, [*makers], trials_in_full(config))]
+
+
+def trials_in_full(config: TrainConfig) -> list[Trial]:
+    """Return the trials in the whole environment: every family, with every noise."""
+    world = config.world
+    whole = [partial(make_world, replace(world, noises=(noise,))) for noise in world.noises]
+    return [trial for make in whole for trial in _trials(world, make, config.evaluation.episodes, {})]
 
 
 def _trials(
@@ -248,7 +257,7 @@ def evaluate(weights: Weights, heads: int, trials: Sequence[Trial], pool: Proces
 def _try(job: tuple[Weights, int, Trial]) -> tuple[float, int]:
     """Return the time to 95 % [s] and the collisions of one episode."""
     weights, heads, trial = job
-    network = ChoiceNetwork(weights, heads=heads)
+    network = ChoiceEnsemble(weights, heads=heads)
     env = trial.make()
     env.reset(options=trial.options)
     while True:

@@ -143,6 +143,7 @@ class TrainConfig:
     """A training run of ``ppo-frontier``."""
 
     seed: int = 1
+    members: int = 1  # networks that are trained apart, each as all that follows says, and choose together
     width: int = 64
     heads: int = 4
     layers: int = 2
@@ -151,3 +152,6 @@ class TrainConfig:
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        require(self.members >= 1, f"members must be at least 1, got {self.members}")

@@ -62,6 +62,22 @@ def test_numpy_and_torch_agree(m):
     assert light.value(choice) == pytest.approx(worth, abs=2e-4)
 
 
+def test_an_ensemble_chooses_by_the_mean_of_its_members_logarithms():
+    members = [{name: value.numpy() for name, value in network(seed).state_dict().items()} for seed in range(3)]
+    together = choice_network.ChoiceEnsemble(choice_network.joined(members), heads=4)
+    alone = choice_network.ChoiceEnsemble(choice_network.joined(members[:1]), heads=4)
+    assert choice_network.joined(members[:1]).keys() == members[0].keys()
+    assert [own.keys() for own in choice_network.apart(choice_network.joined(members))] == [members[0].keys()] * 3
+    choice = a_choice(9)
+    chances = [torch.as_tensor(scores(network(seed), choice)[0]).softmax(dim=0).numpy() for seed in range(3)]
+    np.testing.assert_allclose(together.scores(choice), np.log(chances).mean(axis=0), atol=2e-4)
+    np.testing.assert_allclose(alone.scores(choice), np.log(chances[0]), atol=2e-4)
+    damaged = choice_network.joined(members)
+    del damaged["members.1.token.weight"]
+    with pytest.raises(ValueError, match=r"weight token.weight is missing"):
+        choice_network.ChoiceEnsemble(damaged, heads=4)
+
+
 def test_permuted_candidates_get_permuted_scores():
     made, choice = network(), a_choice(11)
     p = np.random.default_rng(1).permutation(11)

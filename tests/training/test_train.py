@@ -17,6 +17,7 @@ from training.cli import main
 from training.cli_train import CONFIGS, _read
 from training.networks import read_zip
 from training.ppo import Run
+from training.ppo_ensemble import EnsembleRun
 from training.train_config import TrainConfig
 
 SMALL = {
@@ -187,7 +188,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
     assert about["steps"] == 16 and about["command"] == "as typed" and about["curve"]
     assert driver == from_mapping(ChooserConfig, drive) and driver.control.near_wall_m_s == 0.6
     agent = PpoFrontier({"policy": str(mine)})
-    same_weights(read_zip(run_out / "best.zip"), agent._network._weights)
+    same_weights(read_zip(run_out / "best.zip"), agent._network.members[0]._weights)
     assert to_mapping(agent.config)["control"]["near_wall_m_s"] == 0.6
     # To a zip, which stable-baselines3 reads, and back.
     assert main(["policy", str(mine), str(tmp_path / "mine.zip")]) == 0
@@ -210,6 +211,55 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
     assert not (tmp_path / "x.safetensors").exists()
+
+
+def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
+    from agents.policy import load_choice_policy
+
+    config = SMALL | {
+        "members": 2, "world": {"rooms": ["rectangular"]}, "imitation": {"episodes": 0},
+        "ppo": SMALL["ppo"] | {"steps": 16},
+    }  # fmt: skip
+    made = from_mapping(TrainConfig, config)
+    out, mine = tmp_path / "run", tmp_path / "mine.safetensors"
+    said: list[str] = []
+
+    def log(text: str) -> None:
+        said.append(text)
+        if text.startswith("member-2: ppo, chunk 1"):
+            raise Killed
+
+    with pytest.raises(Killed):
+        EnsembleRun(made, out, workers=2, log=log, command="as typed").train()
+    with pytest.raises(ValueError, match="another configuration"):
+        EnsembleRun(from_mapping(TrainConfig, config | {"seed": 2}), out, workers=2, log=print)
+    EnsembleRun(made, out, workers=2, log=said.append, command="as typed").train()
+    assert sum(text.startswith("member-1: ppo, chunk 1") for text in said) == 1, "it was done"
+    assert sum(text.startswith("member-2: ppo, chunk 1") for text in said) == 1, "and this checkpointed"
+    assert said[-1].startswith("all members: ")
+    assert main(["policy", str(out), str(mine)]) == 0
+    network, _, about = load_choice_policy(mine)
+    assert len(network.members) == 2 and about["steps"] == 32 and about["command"] == "as typed"
+    assert [line.get("member", line["stage"]) for line in about["curve"]] == [
+        "member-1", "member-1", "member-2", "member-2", "all members",
+    ]  # fmt: skip
+    for k, member in enumerate(network.members, start=1):
+        same_weights(read_zip(out / f"member-{k}" / "best.zip"), member._weights)
+    assert not np.array_equal(network.members[0]._weights["row.weight"], network.members[1]._weights["row.weight"])
+    # A zip holds one of them.
+    zipped = tmp_path / "second.zip"
+    assert main(["policy", str(mine), str(zipped), "--member", "2"]) == 0
+    same_weights(read_zip(zipped), network.members[1]._weights)
+    capsys.readouterr()
+    for arguments, message in [
+        ([mine, tmp_path / "x.zip"], "is of 2 networks: choose one by --member 1 … 2"),
+        ([mine, tmp_path / "x.zip", "--member", "3"], "choose one by --member"),
+        ([out, tmp_path / "x.safetensors", "--member", "1"], "--member says which network"),
+    ]:
+        assert main(["policy", *map(str, arguments)]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "x.zip").exists()
 
 
 def test_a_damaged_policy_is_named(tmp_path):
