@@ -8,6 +8,7 @@ the one that was not, bit for bit.
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -25,7 +26,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
 
 from agents.choice_network import ChoiceEnsemble
-from slam.formats import atomic_write
+from slam.formats import atomic_write, replacing
 from training.campaign import one_thread_each, worker_pool
 from training.choice_world import Families, make_rehearsal, make_world, world_of_worker
 from training.imitation import Lessons, give_lessons, learn
@@ -73,7 +74,9 @@ class Run:
         self._began = time.perf_counter() - progress["wall_s"]
         with worker_pool(self._workers) as pool:
             for stage in _stages(self.config):
-                if progress["chunk"] <= stage.end:
+                if stage.first == stage.end > 0:  # nothing is learned in it
+                    self._evaluate(stage, read_zip(self.out / "checkpoint.zip"), pool, self._keep_checkpoint)
+                elif progress["chunk"] <= stage.end:
                     self._enact(stage, pool)
         progress["done"] = True
         atomic_write(self.out / "progress.json", json.dumps(progress))
@@ -122,7 +125,8 @@ class Run:
         while progress["chunk"] <= stage.end:
             number = progress["chunk"]
             if (number - stage.first) % stage.every == 0 or number == stage.end:
-                self._evaluate(stage, model, pool)
+                weights = _weights(cast("ChoicePolicy", model.policy).network)
+                self._evaluate(stage, weights, pool, partial(_save, model))
             if number == stage.end:
                 break
             self._learn_chunk(stage, model, env, number)
@@ -143,9 +147,10 @@ class Run:
         model.lr_schedule = FloatSchedule(stage.ppo.learning_rate * left)
         model.learn(stage.ppo.size, callback=Durations(), reset_num_timesteps=False)
 
-    def _evaluate(self, stage: _Stage, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
-        weights = _weights(cast("ChoicePolicy", model.policy).network)
-        result = {"stage": stage.name, "steps": model.num_timesteps}
+    def _evaluate(
+        self, stage: _Stage, weights: Weights, pool: ProcessPoolExecutor, save: Callable[[Path], None]
+    ) -> None:
+        result = {"stage": stage.name, "steps": self._progress["steps"]}
         result |= evaluate(weights, self.config.heads, stage.trials, pool)
         with (self.out / "curve.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(result | {"wall_s": time.perf_counter() - self._began}) + "\n")
@@ -154,8 +159,12 @@ class Run:
         # Seconds of a rehearsal are not those of the whole environment.
         if self._progress["best_in"] != stage.name or best is None or result["time_to_95_s"] < best:
             self._progress |= {"best_s": result["time_to_95_s"], "best_in": stage.name}
-            _save(model, self.out / "best.zip")
+            save(self.out / "best.zip")
             atomic_write(self.out / "progress.json", json.dumps(self._progress))
+
+    def _keep_checkpoint(self, path: Path) -> None:
+        with replacing(path) as new:
+            shutil.copyfile(self.out / "checkpoint.zip", new)
 
     def _say(self, text: str) -> None:
         self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
