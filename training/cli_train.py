@@ -38,7 +38,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
 ) -> None:
-    """Train a policy with PPO, after a warm start by imitation.
+    """Train a policy with PPO, after rehearsals or a warm start by imitation, as the configuration says.
 
     Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
     curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes

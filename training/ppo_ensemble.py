@@ -1,7 +1,6 @@
 """Several networks, trained apart from one seed, that choose together.
 
-What PPO comes to from other random weights is as good, and errs elsewhere: the mean of what they hold likely is
-better than each.
+What PPO comes to from other random weights errs elsewhere: the mean of what they hold likely shall err less.
 """
 
 from __future__ import annotations
