@@ -90,7 +90,11 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         world = self._world
         if world.shaping_s_m == 0.0 or not observation["present"].any():
             return 0.0
-        return world.time_1_s * world.shaping_s_m * float(self.prices().min())
+        if isinstance(self.env, JumpWorld):  # where all prices would take as long as the choice itself
+            price = self._by_truth().price_from_here(self.env.belief)
+        else:
+            price = float(self.prices().min())
+        return world.time_1_s * world.shaping_s_m * price
 
     @property
     def whole(self) -> ExploreFrontierEnv:
@@ -104,16 +108,22 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         choice, found = env.agent.described
         if self._priced is not None and self._priced[0] is choice:
             return self._priced[1]
+        prices = self._by_truth().prices(choice, found, env.belief)
+        self._priced = choice, prices
+        return prices
+
+    def _by_truth(self) -> Hindsight:
+        """Return what prices this episode's choices."""
+        env = self.env
         if self._hindsight is None:
             if self._room not in self._places:
                 self._places.clear()  # rooms drawn before hardly ever come again
-                self._places[self._room] = TruePlaces(
-                    env.base.truth.ground, env.driver.planner, robot=env.config.robot, lidar=env.config.lidar
+                ground, kit = (
+                    (env.ground, env) if isinstance(env, JumpWorld) else (env.base.truth.ground, env.config)
                 )
+                self._places[self._room] = TruePlaces(ground, env.driver.planner, robot=kit.robot, lidar=kit.lidar)
             self._hindsight = Hindsight(self._places[self._room])
-        prices = self._hindsight.prices(choice, found, env.belief)
-        self._priced = choice, prices
-        return prices
+        return self._hindsight
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions stand for a candidate."""
@@ -141,7 +151,7 @@ def make_rehearsal(world: WorldConfig, rehearsal: RehearsalConfig) -> Families:
         driver={**world.driver, "patience": patience}, time_limit_s=world.time_limit_s, time_1_s=world.time_1_s,
         covered_1=rehearsal.covered_1,
     )  # fmt: skip
-    return Families(env, replace(world, shaping_s_m=0.0), mirrors=True)
+    return Families(env, replace(world, shaping_s_m=rehearsal.shaping_s_m), mirrors=True)
 
 
 def world_of_worker(make: Callable[[], Families]) -> Families:

@@ -79,8 +79,9 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         self.time_limit_s, self._time_1_s, self._covered_1 = time_limit_s, time_1_s, covered_1
         self.action_space = spaces.Discrete(self.driver.choice.most)
         self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
-        self.agent = _Passenger(self.driver, robot=RobotConfig(), lidar=LidarConfig())
-        self._eye = _Eye(LidarConfig(), RobotConfig())
+        self.robot, self.lidar = RobotConfig(), LidarConfig()
+        self.agent = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
+        self._eye = _Eye(self.lidar, self.robot)
         self._place: _Place | None = None
 
     @property
@@ -90,6 +91,12 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
             pose=self._pose, pose_cov=_POSE_COV, landmarks=np.zeros((0, 2)),
             landmark_cov=np.zeros((0, 2, 2)), landmark_ids=np.zeros(0, np.int64), grid=self._grid,
         )  # fmt: skip
+
+    @property
+    def ground(self) -> GroundTruth:
+        """The truth of the episode."""
+        assert self._place is not None
+        return self._place.truth
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""

@@ -221,10 +221,12 @@ def _stages(config: TrainConfig) -> list[_Stage]:
     stages = []
     if rehearsal.steps > 0:
         jumps = partial(make_rehearsal, world, rehearsal)
+        # Trials ask for the time alone.
+        unshaped = partial(make_rehearsal, world, replace(rehearsal, shaping_s_m=0.0))
         stages.append(
             _Stage(
                 "rehearsal", rehearsal, 0, rehearsal.every, [jumps] * rehearsal.environments,
-                _trials(world, jumps, rehearsal.episodes, {"anywhere": False}),
+                _trials(world, unshaped, rehearsal.episodes, {"anywhere": False}),
             )
         )  # fmt: skip
     makers = [partial(make_world, world, k) for k in range(ppo.environments)]

@@ -117,6 +117,7 @@ class RehearsalConfig(PpoConfig):
     gae_lambda: float = 0.9
     chunk: int = 4
     covered_1: float = 1.0  # reward for all there is to cover, as it is covered, besides that for time
+    shaping_s_m: float = 0.0  # as in [world], of the way still to go from where the robot is
     replan_s: float = 3.0  # that a choice lasts at most: the longer, the more it is felt
     every: int = 8  # chunks, between two trials on validation seeds …
     episodes: int = 30  # … of each family

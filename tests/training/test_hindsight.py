@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
-from training.choice_world import make_world
+from training.choice_world import make_rehearsal, make_world
 from training.hindsight import _price
-from training.train_config import WorldConfig
+from training.train_config import RehearsalConfig, WorldConfig
 
 
 def price(seen, distance, cells, places, costs, spare=0.0):
@@ -63,18 +63,40 @@ def test_a_room_is_covered_for_about_its_first_price():
     assert info["is_success"] and 0.5 < info["path_length_m"] / first < 1.3
 
 
-def test_shaping_adds_up_to_what_there_was_to_go_at_the_beginning():
-    plain, shaped = (
-        make_world(WorldConfig(rooms=("rectangular",), shaping_s_m=s, time_1_s=-0.1)) for s in (0.0, 2.0)
-    )
+def _whole(shaping_s_m):
+    return make_world(WorldConfig(rooms=("rectangular",), shaping_s_m=shaping_s_m, time_1_s=-0.1))
+
+
+def _rehearsal(shaping_s_m):
+    world = WorldConfig(rooms=("rectangular",), time_1_s=-0.1)
+    return make_rehearsal(world, RehearsalConfig(covered_1=0.0, shaping_s_m=shaping_s_m))
+
+
+@pytest.mark.parametrize("make", [_whole, _rehearsal])
+def test_shaping_adds_up_to_what_there_was_to_go_at_the_beginning(make):
     totals = []
-    for world in (plain, shaped):
+    for world in (make(0.0), make(2.0)):
         world.reset(options={"rooms": "rectangular", "room_seed": 3})
-        first = float(world.prices().min())
+        first = -world._potential / 0.2
         total, done = 0.0, False
         while not done:
             _, reward, terminated, truncated, _ = world.step(0)
             total += reward
             done = terminated or truncated
         totals.append(total)
+    assert first > 1.0
     assert totals[1] - totals[0] == pytest.approx(0.1 * 2.0 * first, rel=1e-5)
+
+
+def test_the_price_from_here_is_about_the_lowest_of_all_prices():
+    world = make_rehearsal(WorldConfig(rooms=("apartment",)), RehearsalConfig(shaping_s_m=1.0))
+    world.reset(options={"rooms": "apartment", "room_seed": 5})
+    hindsight, done, ratios = world._by_truth(), False, []
+    while not done:
+        choice, found = world.env.agent.described
+        prices = hindsight.prices(choice, found, world.env.belief)
+        if prices.min() > 5.0:
+            ratios.append(hindsight.price_from_here(world.env.belief) / prices.min())
+        *_, terminated, truncated, _ = world.step(int(np.argmin(prices)))
+        done = terminated or truncated
+    assert len(ratios) > 5 and min(ratios) > 0.9 and np.median(ratios) < 1.3 and max(ratios) < 2.0
