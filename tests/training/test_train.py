@@ -36,6 +36,7 @@ REHEARSED = SMALL | {
     "imitation": {"episodes": 0},
     "rehearsal": {
         "steps": 32, "environments": 2, "n_steps": 8, "chunk": 1, "batch_size": 16, "every": 2, "episodes": 1,
+        "shaping_s_m": 1.3,
     },
     "ppo": SMALL["ppo"] | {"steps": 16},
 }  # fmt: skip
