@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import FloatSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from agents.choice_network import ChoiceEnsemble
 from slam.formats import atomic_write, replacing
@@ -48,7 +48,8 @@ class Run:
 
     The folder gets ``checkpoint.zip`` (stable-baselines3), ``progress.json``, ``best.zip``, ``curve.jsonl`` with a
     line per evaluation, TensorBoard's files in ``log`` and the lessons of the warm start. ``command`` is noted in
-    ``progress.json``, from where exported policies have it.
+    ``progress.json``, from where exported policies have it. With one worker the rollouts are made in this process;
+    with more, each of their environments has a process of its own. What is learned is the same.
 
     Raises
     ------
@@ -84,9 +85,7 @@ class Run:
     def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
         """Go through what is left of a stage, from the last checkpoint if there is one."""
         config, progress, checkpoint = self.config, self._progress, self.out / "checkpoint.zip"
-        makers = [partial(world_of_worker, maker) for maker in stage.makers]
-        with one_thread_each():
-            env = VecMonitor(SubprocVecEnv(makers, start_method="spawn"))  # type: ignore[arg-type]
+        env = VecMonitor(self._environments(stage.makers))
         try:
             model = make_model(config, env, stage.ppo)
             model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
@@ -102,6 +101,13 @@ class Run:
             self._go_on(stage, model, env, pool)
         finally:
             env.close()
+
+    def _environments(self, makers: Sequence[Callable[[], Families]]) -> VecEnv:
+        if self._workers == 1:
+            return DummyVecEnv(list(makers))
+        with one_thread_each():
+            apart: Any = [partial(world_of_worker, maker) for maker in makers]
+            return SubprocVecEnv(apart, start_method="spawn")
 
     def _imitate(self, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
         network = cast("ChoicePolicy", model.policy).network
@@ -152,8 +158,7 @@ class Run:
     ) -> None:
         result = {"stage": stage.name, "steps": self._progress["steps"]}
         result |= evaluate(weights, self.config.heads, stage.trials, pool)
-        with (self.out / "curve.jsonl").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(result | {"wall_s": time.perf_counter() - self._began}) + "\n")
+        self._add_to_curve(result | {"wall_s": time.perf_counter() - self._began})
         self._say("evaluation: " + _words(result))
         best = self._progress["best_s"]
         # Seconds of a rehearsal are not those of the whole environment.
@@ -161,6 +166,15 @@ class Run:
             self._progress |= {"best_s": result["time_to_95_s"], "best_in": stage.name}
             save(self.out / "best.zip")
             atomic_write(self.out / "progress.json", json.dumps(self._progress))
+
+    def _add_to_curve(self, result: dict[str, Any]) -> None:
+        path = self.out / "curve.jsonl"
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        lines = [json.loads(line) for line in text.splitlines()]
+        # A run killed after a trial repeats it: one line of it is enough.
+        where = ("stage", "steps")
+        kept = [line for line in lines if any(line[key] != result[key] for key in where)]
+        atomic_write(path, "".join(json.dumps(line) + "\n" for line in [*kept, result]))
 
     def _keep_checkpoint(self, path: Path) -> None:
         with replacing(path) as new:

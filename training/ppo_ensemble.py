@@ -6,8 +6,11 @@ What PPO comes to from other random weights errs elsewhere: the mean of what the
 from __future__ import annotations
 
 import json
+import multiprocessing
+import queue
+import time
+from concurrent.futures import Future
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,8 @@ __all__ = ["EnsembleRun", "best_weights", "curve_of"]
 class EnsembleRun:
     """A run for each member, in folders ``member-1``, ``member-2`` and so on, and a trial of all at the end.
 
-    The folder itself gets ``progress.json`` and ``curve.jsonl``; a member that is done is not trained again.
+    The folder itself gets ``progress.json`` and ``curve.jsonl``; a member that is done is not trained again. As
+    many members as there are workers are trained at a time, each in one process.
 
     Raises
     ------
@@ -42,20 +46,41 @@ class EnsembleRun:
     def train(self) -> None:
         """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
         self.out.mkdir(parents=True, exist_ok=True)
-        progress = self._progress
-        atomic_write(self.out / "progress.json", json.dumps(progress))
-        for number, folder in enumerate(_folders(self.config, self.out)):
-            run = Run(
-                replace(self.config, members=1, seed=_seed_of(self.config.seed, number)), folder,
-                workers=self._workers, log=partial(self._say, folder.name),
-                command=f"{progress['command']}: {folder.name}",
-            )  # fmt: skip
-            run.train()
-        if not progress["done"]:
+        self._began = time.perf_counter() - self._progress["wall_s"]
+        self._keep_progress()
+        if not self._progress["done"]:
+            self._train_members()
             self._evaluate()
 
-    def _say(self, name: str, text: str) -> None:
-        self._log(f"{name}: {text}")
+    def _train_members(self) -> None:
+        jobs = [
+            (replace(self.config, members=1, seed=_seed_of(self.config.seed, number)), folder)
+            for number, folder in enumerate(_folders(self.config, self.out))
+        ]
+        command = self._progress["command"]
+        with multiprocessing.get_context("spawn").Manager() as manager, worker_pool(self._workers) as pool:
+            said = manager.Queue()
+            futures = [pool.submit(_train_member, *job, f"{command}: {job[1].name}", said) for job in jobs]
+            while not said.empty() or not all(future.done() for future in futures):
+                self._pass_on(said, futures)
+        for future in futures:
+            future.result()
+
+    def _pass_on(self, said: queue.Queue[tuple[str, str]], futures: list[Future[None]]) -> None:
+        """Log what a member says next, if any does within a second; raise what one failed of."""
+        try:
+            name, text = said.get(timeout=1.0)
+            self._keep_progress()
+            self._log(f"{name}: {text}")
+        except queue.Empty:
+            for future in futures:
+                if future.done():
+                    future.result()
+
+    def _keep_progress(self) -> None:
+        if not self._progress["done"]:
+            self._progress["wall_s"] = time.perf_counter() - self._began
+        atomic_write(self.out / "progress.json", json.dumps(self._progress))
 
     def _evaluate(self) -> None:
         with worker_pool(self._workers) as pool:
@@ -64,12 +89,20 @@ class EnsembleRun:
         members = [
             json.loads((folder / "progress.json").read_text()) for folder in _folders(self.config, self.out)
         ]
-        progress = self._progress
-        progress |= {key: sum(member[key] for member in members) for key in ("steps", "wall_s")} | {"done": True}
-        line = {"stage": "all members", "steps": progress["steps"], **result, "wall_s": progress["wall_s"]}
+        self._progress["steps"] = sum(member["steps"] for member in members)
+        self._keep_progress()
+        line = {"stage": "all members", **result} | {key: self._progress[key] for key in ("steps", "wall_s")}
         atomic_write(self.out / "curve.jsonl", json.dumps(line) + "\n")
-        atomic_write(self.out / "progress.json", json.dumps(progress))
-        self._say("all members", f"{result['time_to_95_s']:.2f} s to 95 %, {result['collisions']} collisions")
+        self._progress["done"] = True
+        self._keep_progress()
+        self._log(f"all members: {result['time_to_95_s']:.2f} s to 95 %, {result['collisions']} collisions")
+
+
+def _train_member(config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]]) -> None:
+    def log(text: str) -> None:
+        said.put((out.name, text))
+
+    Run(config, out, workers=1, log=log, command=command).train()
 
 
 def best_weights(config: TrainConfig, out: Path) -> Weights:

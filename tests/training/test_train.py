@@ -42,7 +42,7 @@ REHEARSED = SMALL | {
 }  # fmt: skip
 
 
-def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL) -> list[str]:
+def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL, workers: int = 2) -> list[str]:
     said: list[str] = []
 
     def log(text: str) -> None:
@@ -50,7 +50,7 @@ def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL) -> li
         if kill_after is not None and text.startswith(kill_after):
             raise Killed
 
-    Run(from_mapping(TrainConfig, config), out, workers=2, log=log).train()
+    Run(from_mapping(TrainConfig, config), out, workers=workers, log=log).train()
     return said
 
 
@@ -112,7 +112,7 @@ def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed
     unused = [CANDIDATE.index(name) for name in ("corners", "walls", "sigma_left")]
     assert not weights["row.weight"][:, unused].any()
     assert not weights["state.weight"][:, [STATE.index(name) for name in ("sigma_m", "sigma_rad")]].any()
-    run(tmp_path, config=REHEARSED)
+    run(tmp_path, config=REHEARSED, workers=1)  # in one process, too
     one, other = (read_zip(out / "checkpoint.zip") for out in (rehearsed[0], tmp_path))
     same_weights(one, other)
     assert one["row.weight"][:, unused].any()
@@ -235,8 +235,7 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
     with pytest.raises(ValueError, match="another configuration"):
         EnsembleRun(from_mapping(TrainConfig, config | {"seed": 2}), out, workers=2, log=print)
     EnsembleRun(made, out, workers=2, log=said.append, command="as typed").train()
-    assert sum(text.startswith("member-1: rehearsal, chunk 1") for text in said) == 1, "it was done"
-    assert sum(text.startswith("member-2: rehearsal, chunk 1") for text in said) == 1, "and this checkpointed"
+    assert sum(text.startswith("member-2: rehearsal, chunk 1") for text in said) == 1, "it was checkpointed"
     assert said[-1].startswith("all members: ")
     assert main(["policy", str(out), str(mine)]) == 0
     network, _, about = load_choice_policy(mine)
