@@ -7,7 +7,7 @@ the rows carry no order: what is learned on few candidates goes for many.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numba import njit
@@ -24,7 +24,7 @@ from slam.occupancy import FREE, OCCUPIED
 from slam.settings import require
 from slam.types import Belief
 
-__all__ = ["CANDIDATE", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe"]
+__all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -38,6 +38,9 @@ CANDIDATE = (
     "walls", "sigma_left", "pieces", "tour_first", "tour_place", "tour_loss",
 )  # fmt: skip
 """Columns of a candidate's row."""
+
+SIDEWAYS = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
+"""Of these, those that change their sign in a mirror."""
 
 TOUR_LOSS_M = 5.0
 """One unit of the column ``tour_loss`` [weighted m]."""
@@ -156,6 +159,13 @@ def describe(
     ])  # fmt: skip
     as_floats = [np.asarray(np.clip(a, -10.0, 10.0), dtype=np.float32) for a in (rows, distances, state)]
     return Choice(index, as_floats[0], patches, as_floats[1], as_floats[2])
+
+
+def mirrored(choice: Choice) -> Choice:
+    """Return the choice as it is seen in a mirror: left is right."""
+    rows = choice.candidates.copy()
+    rows[:, SIDEWAYS] *= -1.0
+    return replace(choice, candidates=rows, patches=np.flip(choice.patches, axis=-2))
 
 
 def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Array]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.choice import Choice
+from agents.choice import Choice, mirrored
 
 __all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
 
@@ -112,6 +112,9 @@ class ChoiceNetwork:
 class ChoiceEnsemble:
     """Networks that were trained apart and choose together: what one learned by chance the others outvote.
 
+    Each looks twice, the second time in a mirror. What is best does not depend on left and right, what was learned
+    does a little.
+
     Parameters
     ----------
     weights : mapping
@@ -129,8 +132,9 @@ class ChoiceEnsemble:
         self.members = [ChoiceNetwork(own, heads=heads) for own in apart(weights)]
 
     def scores(self, choice: Choice) -> Floats:
-        """Return the mean of the networks' log-probabilities of each candidate ``(m,)``."""
-        return np.asarray(np.mean([_log_softmax(member.scores(choice)) for member in self.members], axis=0))
+        """Return the mean of the log-probabilities of each candidate ``(m,)``, of all networks and both views."""
+        views = choice, mirrored(choice)
+        return np.asarray(np.mean([_log_softmax(m.scores(view)) for m in self.members for view in views], axis=0))
 
 
 def joined(members: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:

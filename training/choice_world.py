@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
-from agents.choice import CANDIDATE, Choice
+from agents.choice import SIDEWAYS, Choice
 from agents.cost_utility import CostUtility
 from agents.explorer import Candidates
 from agents.frontier_env import ExploreFrontierEnv
@@ -24,8 +24,6 @@ from training.train_config import RehearsalConfig, WorldConfig
 from training.true_places import TruePlaces
 
 __all__ = ["Families", "Teacher", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
-
-_MIRRORED = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
 
 
 class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -166,7 +164,7 @@ def mirrored(
     """Return a choice, or as many as ``turned`` ``(n,)`` says of n, as seen in a mirror: left is right."""
     rows, patches = observation["candidates"].copy(), observation["patches"]
     sign = np.where(turned, np.float32(-1.0), np.float32(1.0))[..., None, None]
-    rows[..., _MIRRORED] *= sign
+    rows[..., SIDEWAYS] *= sign
     patches = np.where(np.asarray(turned)[..., None, None, None, None], np.flip(patches, axis=-2), patches)
     return observation | {"candidates": rows, "patches": patches}
 

@@ -33,7 +33,11 @@ def train(
     seed: Annotated[int | None, typer.Option(min=0, help="Another seed than the configuration's.")] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=1024, help="Processes of lessons and evaluation.  [default: one a core]"),
+        typer.Option(
+            min=1,
+            max=1024,
+            help="Processes of lessons and trials; members trained at once.  [default: one a core]",
+        ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,

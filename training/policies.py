@@ -29,7 +29,7 @@ __all__ = ["export_policy", "export_run", "write_zip"]
 
 
 def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:
-    """Write a policy of ``ppo-frontier`` as ``target`` (.safetensors) and the JSON file beside it.
+    """Write a policy of ``ppo-frontier`` as ``target`` (.safetensors, half precision) and the JSON file beside it.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, trai
     config = training["config"]
     driver = to_mapping(from_mapping(ChooserConfig, config["world"]["driver"]))
     described = policy_description(config["heads"], driver, **training)
-    atomic_write(target, save(dict(weights)))
+    atomic_write(target, save(_halved(weights)))
     atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     load_choice_policy(target)  # it is read back
 
@@ -110,10 +110,14 @@ def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: A
         "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
         **_training(progress, curve),
     }  # fmt: skip
-    weights = {name: value.astype(np.float16) for name, value in load_file(run / "best.safetensors").items()}
-    atomic_write(target, save(weights))
+    atomic_write(target, save(_halved(load_file(run / "best.safetensors"))))
     atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
     load_drive_policy(target)  # it is read back
+
+
+def _halved(weights: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
+    # Safetensors writes memory as it lies, whatever its order.
+    return {name: np.asarray(value, dtype=np.float16, order="C") for name, value in weights.items()}
 
 
 def _training(progress: Mapping[str, Any], curve: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ pytest.importorskip("sb3_contrib")
 from gymnasium import spaces  # noqa: E402
 
 from agents import choice_network  # noqa: E402
-from agents.choice import CANDIDATE, STATE, Choice  # noqa: E402
+from agents.choice import CANDIDATE, STATE, Choice, mirrored  # noqa: E402
 from agents.chooser import ChooserConfig  # noqa: E402
 from agents.frontier_env import as_observation, choice_space  # noqa: E402
 from training.choice_world import make_world  # noqa: E402
@@ -62,16 +62,22 @@ def test_numpy_and_torch_agree(m):
     assert light.value(choice) == pytest.approx(worth, abs=2e-4)
 
 
-def test_an_ensemble_chooses_by_the_mean_of_its_members_logarithms():
+def test_an_ensemble_chooses_by_the_mean_of_its_members_logarithms_in_both_views():
     members = [{name: value.numpy() for name, value in network(seed).state_dict().items()} for seed in range(3)]
     together = choice_network.ChoiceEnsemble(choice_network.joined(members), heads=4)
     alone = choice_network.ChoiceEnsemble(choice_network.joined(members[:1]), heads=4)
     assert choice_network.joined(members[:1]).keys() == members[0].keys()
     assert [own.keys() for own in choice_network.apart(choice_network.joined(members))] == [members[0].keys()] * 3
     choice = a_choice(9)
-    chances = [torch.as_tensor(scores(network(seed), choice)[0]).softmax(dim=0).numpy() for seed in range(3)]
-    np.testing.assert_allclose(together.scores(choice), np.log(chances).mean(axis=0), atol=2e-4)
-    np.testing.assert_allclose(alone.scores(choice), np.log(chances[0]), atol=2e-4)
+    views = choice, mirrored(choice)
+    chances = [
+        [torch.as_tensor(scores(network(seed), view)[0]).softmax(dim=0).numpy() for view in views]
+        for seed in range(3)
+    ]
+    assert not np.allclose(chances[0][0], chances[0][1], atol=1e-3), "to one network left and right are not alike"
+    np.testing.assert_allclose(together.scores(choice), np.log(chances).mean(axis=(0, 1)), atol=2e-4)
+    np.testing.assert_allclose(alone.scores(choice), np.log(chances[0]).mean(axis=0), atol=2e-4)
+    np.testing.assert_allclose(together.scores(mirrored(choice)), together.scores(choice), atol=2e-4)
     damaged = choice_network.joined(members)
     del damaged["members.1.token.weight"]
     with pytest.raises(ValueError, match=r"weight token.weight is missing"):
