@@ -2,20 +2,53 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.choice import Choice, ChoiceConfig, TourPlan, describe
+from agents.control import ControlConfig
 from agents.explorer import Candidates
+from agents.grip import WheelWatch
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief
 
-__all__ = ["Chooser", "ChooserConfig"]
+__all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlipConfig:
+    """How a floor found slippery is driven on: beyond what it grips wheels slide, and odometry tells less."""
+
+    acceleration_m_s2: float = 1.2
+    lateral_m_s2: float = 1.0  # in turns of the path
+    firm_share: float = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
+    slippery_share: float = 0.02  # … from here on it is driven as gently as it can be
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            require(math.isfinite(value) and value > 0, f"SlipConfig.{f.name} must be > 0, got {value}")
+        require(self.firm_share < self.slippery_share, "SlipConfig needs firm_share < slippery_share")
+
+    def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
+        """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
+        slippery = float(np.interp(share, [self.firm_share, self.slippery_share], [0.0, 1.0]))
+
+        def between(value: float, gentle: float) -> float:
+            return value + slippery * (min(value, gentle) - value)
+
+        return replace(
+            usual,
+            acceleration_m_s2=between(usual.acceleration_m_s2, self.acceleration_m_s2),
+            lateral_m_s2=between(usual.lateral_m_s2, self.lateral_m_s2),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,6 +56,7 @@ class ChooserConfig(TourConfig):
     """The parts of the explorer, the tour that is shown with the choice, and how a choice is described."""
 
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+    slip: SlipConfig = field(default_factory=SlipConfig)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -52,6 +86,13 @@ class Chooser(Tour):
         self._found: Candidates | None = None
         self._last: tuple[Choice, Candidates] | None = None
         self._taken = -1  # index of the candidate that was chosen
+        self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * self.config.slip.firm_share)
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action on the way to what was chosen, as gentle as the floor was found slippery."""
+        self._wheels.look(observation, belief)
+        self._follower.config = self.config.slip.eased(self.config.control, self._wheels.share)
+        return super().act(observation, belief)
 
     def due(self, belief: Belief) -> bool:
         """Whether the next :meth:`act` will ask for a choice."""

@@ -62,13 +62,18 @@ def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
 
 
 class _Beneath(ExploreEnv):
-    """The environment that the driver drives in: it looks at the scan alone."""
+    """The environment that the driver drives in: it looks at the scan, and at what the wheels tell."""
 
     planned_path: NDArray[np.float64] | None = None  # the driver's, for the frames
 
     def _observe(self) -> Any:
         share = self.scan.ranges / self.scan.range_max
-        return {"scan": np.where(share < 1.0, share, 1.0).astype(np.float32)}
+        robot = self.config.robot
+        limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])
+        return {
+            "scan": np.where(share < 1.0, share, 1.0).astype(np.float32),
+            "twist": (np.asarray(self._odometry.twist) / limits).astype(np.float32),
+        }
 
     @property
     def outline(self) -> Belief:

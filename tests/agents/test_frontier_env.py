@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,8 +11,10 @@ from gymnasium.utils.env_checker import check_env
 
 import agents
 import mecanum_env  # noqa: F401 - registers
+from agents.brisk_tour import BRISK
 from agents.choice import CANDIDATE, STATE
 from agents.frontier_env import ExploreFrontierEnv
+from agents.policy import load_choice_policy
 from training.choice_world import Teacher
 
 ID = "mecanum_env:mecanum_env/ExploreFrontier-v0"
@@ -156,6 +160,37 @@ def test_choosing_the_nearest_drives_as_the_nearest_frontier_agent_does_until_it
     np.testing.assert_array_equal(info["true_pose"], other["true_pose"])
 
 
+@pytest.mark.parametrize("noise", ["nominal", "slippery"])
+def test_a_policy_is_driven_here_as_by_its_agent(noise):
+    """Choices by the policy, in either environment: one and the same way, to the last bit."""
+    base = gymnasium.make("mecanum_env:mecanum_env/Explore-v0", rooms="apartment", noise=noise).unwrapped
+    observation, _ = base.reset(seed=1)
+    agent = agents.make("ppo-frontier")
+    agent.reset(base.belief, 1)
+    env = gymnasium.make(ID, rooms="apartment", noise=noise, driver=agent.config).unwrapped
+    env.reset(seed=1)
+    network = load_choice_policy(agent.policy_path)[0]
+    for _ in range(20):
+        *_, info = env.step(int(np.argmax(network.scores(env.agent.described[0]))))
+        for _ in range(round(info["duration_s"] / 0.1)):
+            observation, *_, other = base.step(agent.act(observation, base.belief))
+        np.testing.assert_array_equal(info["true_pose"], other["true_pose"])
+
+
+def test_a_slippery_floor_is_driven_on_gently_once_the_wheels_have_told_of_it():
+    def driven(noise, **slip):
+        env = gymnasium.make(ID, rooms="apartment", noise=noise, driver={"control": asdict(BRISK), "slip": slip})
+        play(env, 1, most=40)
+        control = env.unwrapped.agent._follower.config
+        return control.acceleration_m_s2, control.lateral_m_s2
+
+    brisk = BRISK.acceleration_m_s2, BRISK.lateral_m_s2
+    assert driven("nominal") == brisk
+    assert driven("slippery", acceleration_m_s2=1.0, lateral_m_s2=0.7) == pytest.approx((1.0, 0.7))
+    assert driven("slippery", acceleration_m_s2=9.0, lateral_m_s2=9.0) == brisk  # gentle never is rougher
+    assert driven("slippery", firm_share=0.5, slippery_share=0.6) == brisk
+
+
 def test_it_says_what_is_wrong():
     env = gymnasium.make(ID, rooms="rectangular").unwrapped
     env.reset(seed=0)
@@ -165,4 +200,8 @@ def test_it_says_what_is_wrong():
         ExploreFrontierEnv(discount=0.0)
     with pytest.raises(ValueError, match="valid"):
         ExploreFrontierEnv(driver={"speed": 1.0})
+    with pytest.raises(ValueError, match="SlipConfig needs firm_share < slippery_share"):
+        ExploreFrontierEnv(driver={"slip": {"firm_share": 0.03}})
+    with pytest.raises(ValueError, match=r"SlipConfig\.lateral_m_s2 must be > 0"):
+        ExploreFrontierEnv(driver={"slip": {"lateral_m_s2": 0.0}})
     assert len(STATE) == env.observation_space["state"].shape[0]
