@@ -26,8 +26,8 @@ __all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
 class SlipConfig:
     """How a floor found slippery is driven on: beyond what it grips wheels slide, and odometry tells less."""
 
-    acceleration_m_s2: float = 1.2
-    lateral_m_s2: float = 1.0  # in turns of the path
+    acceleration_m_s2: float = 1.0
+    lateral_m_s2: float = 0.75  # in turns of the path
     firm_share: float = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
     slippery_share: float = 0.02  # … from here on it is driven as gently as it can be
 
