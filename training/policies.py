@@ -62,7 +62,9 @@ def export_run(run: Path, target: Path) -> None:
         config = TrainConfig() if drives else from_mapping(TrainConfig, progress["config"])
         curve = curve_of(config, run)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{run} holds no finished part of a run: {error}") from error
+        raise ValueError(
+            f"{run} holds no finished part of a run; train it, or go on with mecanum train --resume ({error})"
+        ) from error
     if drives:
         _export_drive(run, target, progress, curve)
     else:
