@@ -85,7 +85,8 @@ class Run:
     def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
         """Go through what is left of a stage, from the last checkpoint if there is one."""
         config, progress, checkpoint = self.config, self._progress, self.out / "checkpoint.zip"
-        env = VecMonitor(self._environments(stage.makers))
+        lessons = [lesson for lesson in stage.lessons if progress["chunk"] < lesson.end] or stage.lessons[-1:]
+        env = VecMonitor(self._environments(lessons[0].makers))
         try:
             model = make_model(config, env, stage.ppo)
             model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
@@ -98,7 +99,13 @@ class Run:
                 network.load_state_dict({name: torch.as_tensor(value) for name, value in found.items()})
             elif config.imitation.episodes > 0:
                 self._imitate(model, pool)
-            self._go_on(stage, model, env, pool)
+            for lesson in lessons:
+                if lesson is not lessons[0]:
+                    env.close()
+                    env = VecMonitor(self._environments(lesson.makers))
+                    model.set_env(env)
+                self._go_on(stage, lesson.end, model, env, pool)
+            self._try_out(stage, model, pool)
         finally:
             env.close()
 
@@ -126,15 +133,14 @@ class Run:
             for line in learn(network, Lessons.joined(rounds), self.config):
                 self._say(f"imitation {number + 1}: " + _words(line))
 
-    def _go_on(self, stage: _Stage, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor) -> None:
+    def _go_on(
+        self, stage: _Stage, end: int, model: MaskablePPO, env: VecMonitor, pool: ProcessPoolExecutor
+    ) -> None:
         progress = self._progress
-        while progress["chunk"] <= stage.end:
+        while progress["chunk"] < end:
             number = progress["chunk"]
-            if (number - stage.first) % stage.every == 0 or number == stage.end:
-                weights = _weights(cast("ChoicePolicy", model.policy).network)
-                self._evaluate(stage, weights, pool, partial(_save, model))
-            if number == stage.end:
-                break
+            if (number - stage.first) % stage.every == 0:
+                self._try_out(stage, model, pool)
             self._learn_chunk(stage, model, env, number)
             progress |= {
                 "chunk": number + 1, "steps": model.num_timesteps, "wall_s": time.perf_counter() - self._began,
@@ -152,6 +158,10 @@ class Run:
         left = 1.0 - (number - stage.first) / (stage.end - stage.first)
         model.lr_schedule = FloatSchedule(stage.ppo.learning_rate * left)
         model.learn(stage.ppo.size, callback=Durations(), reset_num_timesteps=False)
+
+    def _try_out(self, stage: _Stage, model: MaskablePPO, pool: ProcessPoolExecutor) -> None:
+        weights = _weights(cast("ChoicePolicy", model.policy).network)
+        self._evaluate(stage, weights, pool, partial(_save, model))
 
     def _evaluate(
         self, stage: _Stage, weights: Weights, pool: ProcessPoolExecutor, save: Callable[[Path], None]
@@ -214,6 +224,14 @@ class Trial:
 
 
 @dataclass(frozen=True)
+class _Lesson:
+    """A part of a stage, in one part of the curriculum."""
+
+    end: int  # number of the chunk after its last one
+    makers: list[Callable[[], Families]]
+
+
+@dataclass(frozen=True)
 class _Stage:
     """A part of a run, in one kind of world."""
 
@@ -221,7 +239,8 @@ class _Stage:
     ppo: PpoConfig
     first: int  # number of its first chunk
     every: int  # chunks, between two evaluations
-    makers: list[Callable[[], Families]]
+    world: WorldConfig
+    makers: Callable[[WorldConfig], list[Callable[[], Families]]]
     trials: list[Trial]
 
     @property
@@ -229,23 +248,32 @@ class _Stage:
         """Number of the chunk after its last one."""
         return self.first + -(-self.ppo.steps // self.ppo.size)
 
+    @property
+    def lessons(self) -> list[_Lesson]:
+        """What the curriculum makes of it, in whole chunks."""
+        first, chunks = self.first, self.end - self.first
+        return [_Lesson(first + round(share * chunks), self.makers(part)) for share, part in self.world.parts()]
+
 
 def _stages(config: TrainConfig) -> list[_Stage]:
     world, rehearsal, ppo = config.world, config.rehearsal, config.ppo
     stages = []
     if rehearsal.steps > 0:
-        jumps = partial(make_rehearsal, world, rehearsal)
         # Trials ask for the time alone.
         unshaped = partial(make_rehearsal, world, replace(rehearsal, shaping_s_m=0.0))
         stages.append(
             _Stage(
-                "rehearsal", rehearsal, 0, rehearsal.every, [jumps] * rehearsal.environments,
+                "rehearsal", rehearsal, 0, rehearsal.every, world,
+                lambda part: [partial(make_rehearsal, part, rehearsal)] * rehearsal.environments,
                 _trials(world, unshaped, rehearsal.episodes, {"anywhere": False}),
             )
         )  # fmt: skip
-    makers = [partial(make_world, world, k) for k in range(ppo.environments)]
     first = stages[0].end if stages else 0
-    return [*stages, _Stage("ppo", ppo, first, config.evaluation.every, [*makers], trials_in_full(config))]
+    in_full = _Stage(
+        "ppo", ppo, first, config.evaluation.every, world,
+        lambda part: [partial(make_world, part, k) for k in range(ppo.environments)], trials_in_full(config),
+    )  # fmt: skip
+    return [*stages, in_full]
 
 
 def trials_in_full(config: TrainConfig) -> list[Trial]:

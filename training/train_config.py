@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import require, unknown_name
+from slam.settings import from_mapping, require, unknown_name
 
-__all__ = ["EvaluationConfig", "ImitationConfig", "PpoConfig", "RehearsalConfig", "TrainConfig", "WorldConfig"]
+__all__ = [
+    "CurriculumPart", "EvaluationConfig", "ImitationConfig", "PpoConfig", "RehearsalConfig", "TrainConfig",
+    "WorldConfig",
+]  # fmt: skip
 
 TEACHERS = ("hindsight", "tour", "cost-utility")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurriculumPart:
+    """Where is trained first, before it is everywhere that ``[world]`` says."""
+
+    until: float = 0.0  # share of the choices of a rehearsal, and of those of PPO after it
+    rooms: tuple[str, ...] = ()  # none: those of [world]
+    noises: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +44,7 @@ class WorldConfig:
     collision: float = -1.0
     shaping_s_m: float = 0.0  # seconds that a metre less still to go, by hindsight, counts for; 0: no such reward
     driver: Mapping[str, Any] = field(default_factory=dict)
+    curriculum: tuple[Mapping[str, Any], ...] = ()  # CurriculumPart, one after the other
 
     def __post_init__(self) -> None:
         require(len(self.rooms) > 0 and len(self.noises) > 0, "[world] needs rooms and noises")
@@ -43,6 +57,21 @@ class WorldConfig:
         require(self.repeats >= 1, f"[world] repeats must be at least 1, got {self.repeats}")
         low, high = self.seeds
         require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
+        shares = [0.0, *(until for until, _ in self.parts())]
+        rising = all(before < after for before, after in pairwise(shares))
+        require(rising, "[[world.curriculum]] needs until between 0 and 1, each more than the one before")
+
+    def parts(self) -> list[tuple[float, WorldConfig]]:
+        """Return the curriculum: up to which share of the choices, and where; the last part is all of it."""
+        known = isinstance(self.curriculum, tuple) and all(isinstance(part, Mapping) for part in self.curriculum)
+        require(known, "[[world.curriculum]] is a list of tables")
+        parts = [from_mapping(CurriculumPart, part) for part in self.curriculum]
+        whole = replace(self, curriculum=()) if parts else self
+        first = [
+            (part.until, replace(whole, rooms=part.rooms or self.rooms, noises=part.noises or self.noises))
+            for part in parts
+        ]
+        return [*first, (1.0, whole)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,9 +16,9 @@ from slam.settings import from_mapping
 from training.cli import main
 from training.cli_train import CONFIGS, _read
 from training.networks import read_zip
-from training.ppo import Run
+from training.ppo import Run, _stages
 from training.ppo_ensemble import EnsembleRun
-from training.train_config import TrainConfig
+from training.train_config import TrainConfig, WorldConfig
 
 SMALL = {
     "world": {"rooms": ["rectangular"], "shaping_s_m": 1.7},
@@ -118,6 +118,54 @@ def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed
     assert one["row.weight"][:, unused].any()
     times = [[line["time_to_95_s"] for line in curve(out)] for out in (rehearsed[0], tmp_path)]
     assert times[0] == times[1]
+
+
+def test_a_curriculum_leads_from_some_rooms_to_all(tmp_path):
+    parts = [{"until": 0.3, "noises": ["nominal"]}, {"until": 0.6, "rooms": ["maze", "cave"]}]
+    world = WorldConfig(rooms=("rectangular", "cave"), noises=("nominal", "slippery"), curriculum=tuple(parts))
+    (nominal, first), (second_until, second), (end, last) = world.parts()
+    assert (nominal, first.rooms, first.noises) == (0.3, world.rooms, ("nominal",))
+    assert (second_until, second.rooms, second.noises) == (0.6, ("maze", "cave"), world.noises)
+    assert (end, last.rooms, last.noises, last.seeds) == (1.0, world.rooms, world.noises, world.seeds)
+    # Of three chunks the first is of the first part, and so on: each has environments of its own.
+    config = from_mapping(TrainConfig, SMALL | {"imitation": {"episodes": 0}, "world": {"curriculum": parts}})
+    (stage,) = _stages(config)
+    assert [lesson.end for lesson in stage.lessons] == [1, 2, 3]
+    assert [lesson.makers[0]()._world.rooms for lesson in stage.lessons] == [
+        ("apartment",), ("maze", "cave"), ("apartment",),
+    ]  # fmt: skip
+
+
+def test_a_run_with_a_curriculum_that_was_killed_is_the_one_that_was_not(tmp_path):
+    parts = [{"until": 0.5, "rooms": ["maze"]}]
+    config = REHEARSED | {"world": SMALL["world"] | {"curriculum": parts}}
+    said = run(tmp_path / "whole", config=config, workers=1)
+    assert sum("chunk" in text for text in said) == 3
+    with pytest.raises(Killed):
+        run(tmp_path / "parts", kill_after="rehearsal, chunk 1 ", config=config, workers=1)
+    run(tmp_path / "parts", config=config, workers=1)
+    one, other = (read_zip(tmp_path / name / "checkpoint.zip") for name in ("whole", "parts"))
+    same_weights(one, other)
+    run(tmp_path / "without", config=REHEARSED, workers=1)
+    elsewhere = read_zip(tmp_path / "without" / "checkpoint.zip")
+    assert any((one[name] != value).any() for name, value in elsewhere.items())
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (5, "list of tables"),
+        ([5], "list of tables"),
+        ([{"rooms": ["maze"]}], "until between 0 and 1"),
+        ([{"until": 0.5}, {"until": 0.5}], "each more than the one before"),
+        ([{"until": 1.0}], "until between 0 and 1"),
+        ([{"until": 0.5, "room": ["maze"]}], "unknown key of CurriculumPart"),
+        ([{"until": 0.5, "rooms": ["mase"]}], "did you mean 'maze'"),
+    ],
+)
+def test_a_curriculum_that_makes_no_sense_is_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        from_mapping(TrainConfig, {"world": {"curriculum": parts}})
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
