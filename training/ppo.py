@@ -85,8 +85,8 @@ class Run:
     def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
         """Go through what is left of a stage, from the last checkpoint if there is one."""
         config, progress, checkpoint = self.config, self._progress, self.out / "checkpoint.zip"
-        lessons = [lesson for lesson in stage.lessons if progress["chunk"] < lesson.end] or stage.lessons[-1:]
-        env = VecMonitor(self._environments(lessons[0].makers))
+        parts = [part for part in stage.parts if progress["chunk"] < part.end] or stage.parts[-1:]
+        env = VecMonitor(self._environments(parts[0].makers))
         try:
             model = make_model(config, env, stage.ppo)
             model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
@@ -99,12 +99,12 @@ class Run:
                 network.load_state_dict({name: torch.as_tensor(value) for name, value in found.items()})
             elif config.imitation.episodes > 0:
                 self._imitate(model, pool)
-            for lesson in lessons:
-                if lesson is not lessons[0]:
+            for part in parts:
+                if part is not parts[0]:
                     env.close()
-                    env = VecMonitor(self._environments(lesson.makers))
+                    env = VecMonitor(self._environments(part.makers))
                     model.set_env(env)
-                self._go_on(stage, lesson.end, model, env, pool)
+                self._go_on(stage, part.end, model, env, pool)
             self._try_out(stage, model, pool)
         finally:
             env.close()
@@ -224,7 +224,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class _Lesson:
+class _Part:
     """A part of a stage, in one part of the curriculum."""
 
     end: int  # number of the chunk after its last one
@@ -249,10 +249,10 @@ class _Stage:
         return self.first + -(-self.ppo.steps // self.ppo.size)
 
     @property
-    def lessons(self) -> list[_Lesson]:
+    def parts(self) -> list[_Part]:
         """What the curriculum makes of it, in whole chunks."""
         first, chunks = self.first, self.end - self.first
-        return [_Lesson(first + round(share * chunks), self.makers(part)) for share, part in self.world.parts()]
+        return [_Part(first + round(share * chunks), self.makers(world)) for share, world in self.world.parts()]
 
 
 def _stages(config: TrainConfig) -> list[_Stage]:

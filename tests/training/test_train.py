@@ -130,8 +130,8 @@ def test_a_curriculum_leads_from_some_rooms_to_all(tmp_path):
     # Of three chunks the first is of the first part, and so on: each has environments of its own.
     config = from_mapping(TrainConfig, SMALL | {"imitation": {"episodes": 0}, "world": {"curriculum": parts}})
     (stage,) = _stages(config)
-    assert [lesson.end for lesson in stage.lessons] == [1, 2, 3]
-    assert [lesson.makers[0]()._world.rooms for lesson in stage.lessons] == [
+    assert [part.end for part in stage.parts] == [1, 2, 3]
+    assert [part.makers[0]()._world.rooms for part in stage.parts] == [
         ("apartment",), ("maze", "cave"), ("apartment",),
     ]  # fmt: skip
 
