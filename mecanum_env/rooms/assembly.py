@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mecanum_env.rooms.distance import distance_to_zero
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.furniture import CELL_M, Box, Piece
 from mecanum_env.rooms.rectilinear import surfaces
@@ -101,8 +102,7 @@ def unreached(
     reach = _largest(clearance >= radius_m)
     if reach is None:
         return np.zeros_like(free), free
-    distance = cv2.distanceTransform((~reach).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    missed = free & (distance * resolution > radius_m + 0.5 * resolution)
+    missed = free & (distance_to_zero(~reach) * resolution > radius_m + 0.5 * resolution)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(missed.astype(np.uint8), connectivity=4)
     if count > 1:
         worst = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.assembly import choose_start, generator, unreached
+from mecanum_env.rooms.distance import distance_to_zero
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.furniture import CELL_M
 from mecanum_env.rooms.limits import interval
@@ -193,7 +194,7 @@ def _distance_to_line(points: Array, shape: tuple[int, int]) -> Field:
     canvas = np.ones(shape, np.uint8)
     pixels = np.floor(points / CELL_M).astype(np.int32)
     cv2.polylines(canvas, [pixels[:, None]], False, 0, 1, cv2.LINE_8)
-    return np.asarray(cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, np.float32)
+    return np.asarray(distance_to_zero(canvas) * CELL_M, np.float32)
 
 
 def _noise(shape: tuple[int, int], spacing_m: float, rng: np.random.Generator) -> Field:
@@ -229,8 +230,7 @@ def _rolled(free: Mask) -> Mask | None:
 
 def _distance(mask: Mask) -> Field:
     """Return how far [m] each cell of a mask is from the nearest one that is not of it."""
-    cells = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(cells * CELL_M, np.float32)
+    return np.asarray(distance_to_zero(mask) * CELL_M, np.float32)
 
 
 def _walls(field: Array) -> tuple[Array, tuple[int, int]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.corners import find_corners
+from mecanum_env.rooms.distance import distance_to_zero
 
 __all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
 
@@ -30,7 +31,7 @@ def clearance_of(free: NDArray[np.bool_], resolution: float) -> NDArray[np.float
     """
     padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.uint8)
     padded[1:-1, 1:-1] = free
-    cells = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    cells = distance_to_zero(padded)[1:-1, 1:-1]
     # The transform measures from centre to centre; the surface is the edge, half a cell nearer.
     return np.asarray(np.maximum(cells - 0.5, 0.0) * resolution, np.float32)
 

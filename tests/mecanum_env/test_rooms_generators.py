@@ -8,6 +8,7 @@ import math
 import multiprocessing
 import time
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -17,6 +18,7 @@ from scipy import ndimage
 from mecanum_env import rooms
 from mecanum_env.rooms.apartment_layout import ApartmentConfig, draw_layout
 from mecanum_env.rooms.assembly import generator
+from mecanum_env.rooms.distance import distance_to_zero
 from mecanum_env.rooms.rectangular import RectangularConfig
 
 seeds = st.integers(0, 2**32 - 1)
@@ -163,6 +165,43 @@ def test_the_same_seed_gives_the_same_plan_in_another_process(kind):
         there = pool.starmap(digest, [(kind, seed) for seed in range(4)])
     assert here == there
     assert len(set(here)) == 4
+
+
+@every_kind
+def test_a_plan_does_not_depend_on_opencvs_threads(kind):
+    """Trials and benchmarks run with one thread, a script with as many as there are cores."""
+    before = cv2.getNumThreads()
+    try:
+        digests = []
+        for threads in (1, 2, 8):
+            cv2.setNumThreads(threads)
+            digests.append([digest(kind, seed) for seed in range(12)])
+    finally:
+        cv2.setNumThreads(before)
+    assert digests[0] == digests[1] == digests[2]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=seeds, rows=st.integers(1, 80), cols=st.integers(1, 80), share=st.sampled_from([0.001, 0.02, 0.5, 0.95])
+)
+def test_distances_are_exact_wherever_the_mask_lies_in_memory(seed, rows, cols, share):
+    rng = np.random.default_rng(seed)
+    mask = rng.random((rows, cols)) >= share
+    mask[rng.integers(rows), rng.integers(cols)] = False
+    expected = ndimage.distance_transform_edt(mask).astype(np.float32)
+    for shift in range(4):
+        moved = np.zeros(mask.size + shift, np.uint8)[shift:].reshape(mask.shape)
+        moved[:] = mask
+        np.testing.assert_array_equal(distance_to_zero(moved), expected)
+
+
+def test_distances_are_exact_up_to_800_cells():
+    mask = np.ones((561, 571), np.bool_)
+    mask[0, 0] = False
+    expected = ndimage.distance_transform_edt(mask).astype(np.float32)
+    assert expected.max() > 799.0
+    np.testing.assert_array_equal(distance_to_zero(mask), expected)
 
 
 @every_kind
