@@ -75,6 +75,12 @@ def _coerce(cls: type[Any], key: str, hint: Any, value: Any, base: Any) -> Any:
             return from_mapping(option, value, base=base)
     if isinstance(value, list):
         value = tuple(value)
+    if get_origin(hint) is tuple:
+        parts = get_args(hint)
+        if not isinstance(value, tuple):
+            raise ValueError(f"{cls.__name__}.{key} takes a list, got {value!r}")
+        if Ellipsis not in parts and len(value) != len(parts):
+            raise ValueError(f"{cls.__name__}.{key} takes a list of {len(parts)}, got {value!r}")
     kinds = [o for o in options if isinstance(o, type)]
     if isinstance(value, bool) and bool not in kinds and kinds:
         raise ValueError(f"{cls.__name__}.{key} is a {kinds[0].__name__}, not a boolean")

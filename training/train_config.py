@@ -63,8 +63,8 @@ class WorldConfig:
 
     def parts(self) -> list[tuple[float, WorldConfig]]:
         """Return the curriculum: up to which share of the choices, and where; the last part is all of it."""
-        known = isinstance(self.curriculum, tuple) and all(isinstance(part, Mapping) for part in self.curriculum)
-        require(known, "[[world.curriculum]] is a list of tables")
+        tables = all(isinstance(part, Mapping) for part in self.curriculum)
+        require(tables, "[[world.curriculum]] is a list of tables")
         parts = [from_mapping(CurriculumPart, part) for part in self.curriculum]
         whole = replace(self, curriculum=()) if parts else self
         first = [

@@ -120,7 +120,7 @@ def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed
     assert times[0] == times[1]
 
 
-def test_a_curriculum_leads_from_some_rooms_to_all(tmp_path):
+def test_a_curriculum_leads_from_some_rooms_to_all():
     parts = [{"until": 0.3, "noises": ["nominal"]}, {"until": 0.6, "rooms": ["maze", "cave"]}]
     world = WorldConfig(rooms=("rectangular", "cave"), noises=("nominal", "slippery"), curriculum=tuple(parts))
     (nominal, first), (second_until, second), (end, last) = world.parts()
@@ -154,13 +154,14 @@ def test_a_run_with_a_curriculum_that_was_killed_is_the_one_that_was_not(tmp_pat
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        (5, "list of tables"),
+        (5, "curriculum takes a list"),
         ([5], "list of tables"),
         ([{"rooms": ["maze"]}], "until between 0 and 1"),
         ([{"until": 0.5}, {"until": 0.5}], "each more than the one before"),
         ([{"until": 1.0}], "until between 0 and 1"),
         ([{"until": 0.5, "room": ["maze"]}], "unknown key of CurriculumPart"),
         ([{"until": 0.5, "rooms": ["mase"]}], "did you mean 'maze'"),
+        ([{"until": 0.5, "rooms": "maze"}], "rooms takes a list"),
     ],
 )
 def test_a_curriculum_that_makes_no_sense_is_refused(parts, message):
@@ -192,6 +193,8 @@ def test_a_configuration_is_laid_over_the_base_it_names(tmp_path):
         (["--config", "{folder}/bad.toml"], "cannot read"),
         (["--config", "{folder}/wrong.toml"], "unknown key of TrainConfig"),
         (["--config", "{folder}/seeds.toml"], "training seeds"),
+        (["--config", "{folder}/rooms.toml"], "rooms takes a list"),
+        (["--config", "{folder}/three.toml"], "seeds takes a list of 2"),
         (["--config", "{folder}/based.toml"], "no configuration 'nowhere'"),
         (["--config", "{folder}/five.toml"], "base is the name of a configuration"),
         (["--config", "{folder}/twice.toml"], "the base of a configuration has none itself"),
@@ -205,6 +208,8 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     (tmp_path / "five.toml").write_text("base = 5")
     (tmp_path / "twice.toml").write_text('base = "ppo-frontier-without-warm-start"')
     (tmp_path / "seeds.toml").write_text("[world]\nseeds = [0, 10000]")
+    (tmp_path / "rooms.toml").write_text("[world]\nrooms = 5")
+    (tmp_path / "three.toml").write_text("[world]\nseeds = [0, 1, 2]")
     arguments = [a.format(folder=tmp_path) for a in arguments]
     assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
