@@ -24,10 +24,10 @@ _REGISTRY = {
     "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "learned-tour": "agents.learned_tour:LearnedTour",
-    "nearest-frontier": "agents.frontier:NearestFrontier",
+    "nearest-frontier": "agents.nearest_frontier:NearestFrontier",
     "next-best-view": "agents.next_best_view:NextBestView",
-    "ppo": "agents.drive_policy:Ppo",
-    "ppo-frontier": "agents.policy:PpoFrontier",
+    "ppo": "agents.ppo:Ppo",
+    "ppo-frontier": "agents.ppo_frontier:PpoFrontier",
     "random": "agents.random:RandomAgent",
     "rrt": "agents.rrt:Rrt",
     "tour": "agents.tour:Tour",
@@ -65,7 +65,7 @@ def check(name: str, *others: str) -> None:
 
 
 def _reader(policy: str) -> str:
-    from agents.policy_files import policy_format
+    from agents.learned.policy_files import policy_format
 
     found = policy_format(Path(policy))
     if found not in _POLICIES:

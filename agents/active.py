@@ -1,9 +1,9 @@
 """Active SLAM: where to go, when to look first and how gently to drive, by the uncertainty it would leave.
 
 A frontier's price is how late all that is left would be seen, on the best tour that begins with it
-(:mod:`agents.tour`), plus what the way there would leave of the pose's uncertainty (:mod:`agents.foresight`;
-D-optimality, Carrillo et al., 2012). Where a detour past well known landmarks leaves so much less that it pays,
-the robot goes back there first.
+(:mod:`agents.tour`), plus what the way there would leave of the pose's uncertainty
+(:mod:`agents.view_points.foresight`; D-optimality, Carrillo et al., 2012). Where a detour past well known
+landmarks leaves so much less that it pays, the robot goes back there first.
 
 What a map gets wrong at its very beginning it never loses. The start pose is known by definition; a robot that
 drives off before its landmarks are settled has its wheels alone to tell where it was when it first saw them, and
@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import cost_map as cost_maps
 from agents.base import Goal
+from agents.driving.grip import GentleFollower, WheelWatch
 from agents.explorer import Candidates
-from agents.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
-from agents.grip import GentleFollower, WheelWatch
-from agents.planning import shortest_path
-from agents.sightings import expected_sightings
 from agents.tour import Outlook, Tour, TourConfig
+from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
+from agents.view_points.sightings import expected_sightings
+from agents.ways import cost_map as cost_maps
+from agents.ways.planning import shortest_path
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief
@@ -255,7 +255,7 @@ class ActiveSlam(Tour):
         return np.zeros(3, dtype=np.float32)
 
     def _looks_on(self, belief: Belief) -> bool:
-        """Whether another look from the start, which is known, pays (:func:`agents.foresight.anchoring`).
+        """Whether another look from the known start pays (:func:`agents.view_points.foresight.anchoring`).
 
         The landmarks' error relative to the start falls with the root of the number of looks.
         """

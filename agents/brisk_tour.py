@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from agents.control import ControlConfig
+from agents.driving.control import ControlConfig
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.gain import expected_area
+from agents.view_points.gain import expected_area
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief

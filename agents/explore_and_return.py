@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import cost_map as cost_maps
 from agents.base import Goal
-from agents.control import PathFollower
-from agents.frontier import NearestFrontier, NearestFrontierConfig
-from agents.planning import shortest_path, travel_costs
+from agents.driving.control import PathFollower
+from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
+from agents.ways import cost_map as cost_maps
+from agents.ways.planning import shortest_path, travel_costs
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.settings import from_mapping, require

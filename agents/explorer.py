@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents import cost_map as cost_maps
 from agents.base import Agent, Goal
-from agents.control import ControlConfig, PathFollower
-from agents.cost_map import CostMap, PlannerConfig
-from agents.frontiers import FrontierConfig, Frontiers, find, frontier_cells
-from agents.gain import expected_area
-from agents.planning import TravelCosts, shortest_path, travel_costs
-from agents.sight import Watch, view_points
-from agents.troubles import Troubles
+from agents.driving.control import ControlConfig, PathFollower
+from agents.view_points.frontiers import FrontierConfig, Frontiers, find, frontier_cells
+from agents.view_points.gain import expected_area
+from agents.view_points.sight import Watch, view_points
+from agents.view_points.troubles import Troubles
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import CostMap, PlannerConfig
+from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.settings import from_mapping, require

@@ -12,8 +12,8 @@ from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from agents.choice import CANDIDATE, STATE, Choice
-from agents.chooser import Chooser, ChooserConfig
+from agents.learned.choice import CANDIDATE, STATE, Choice
+from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.env import ExploreEnv
 from slam.settings import from_mapping, require
 from slam.types import Belief

@@ -2,7 +2,7 @@
 
 A tour over what is known leaves out what is not: whether there is a large part of the building behind a door, or
 little. On plans of the same kind a network has learned how much longer the path became, in the end, for each way
-to begin it (``training/dungeon_lessons.py``), and the tour is begun with the least of these.
+to begin it (``training/dungeons/lessons.py``), and the tour is begun with the least of these.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Goal
-from agents.policy_files import read_policy
-from agents.routing import draw_luck
-from agents.station_network import StationNetwork, outside, picture, pixels, with_walls
-from agents.station_stop import StationRound, StationStop
-from agents.station_survey import Openings, options
+from agents.learned.policy_files import read_policy
+from agents.learned.station_network import StationNetwork, outside, picture, pixels, with_walls
+from agents.stations.stop import StationRound, StationStop
+from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
+from agents.ways.routing import draw_luck
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.occupancy import UNKNOWN
+from slam.grids.occupancy import UNKNOWN
 from slam.settings import from_mapping, require
 from slam.types import Belief
 

@@ -20,11 +20,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.gain import expected_area
-from agents.planning import TravelCosts
-from agents.sight import first_in_good_sight
+from agents.view_points.gain import expected_area
+from agents.view_points.sight import first_in_good_sight
+from agents.ways.cost_map import CostMap
+from agents.ways.planning import TravelCosts
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.gain import expected_area
-from agents.rrt_tree import Tree, mean_shift
+from agents.view_points.gain import expected_area
+from agents.view_points.rrt_tree import Tree, mean_shift
+from agents.ways.cost_map import CostMap
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.settings import from_mapping, require
 from slam.types import Belief

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.cost_map import CostMap
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.gain import expected_area
-from agents.routing import best_tour, draw_luck, tours_begun_with
-from agents.station_stop import StationsConfig
-from agents.stations import in_sight, join, ways
-from agents.travel import between
+from agents.stations.lattice import in_sight, join, ways
+from agents.stations.stop import StationsConfig
+from agents.view_points.gain import expected_area
+from agents.ways.cost_map import CostMap
+from agents.ways.routing import best_tour, draw_luck, tours_begun_with
+from agents.ways.travel import between
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.occupancy import FREE
+from slam.grids.occupancy import FREE
 from slam.settings import from_mapping, require
 from slam.types import Belief
 

@@ -5,7 +5,7 @@ import sys
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.env_util import make_vec_env
 
-from training.networks import ChoicePolicy  # "MultiInputPolicy" works too, but learns each row apart
+from training.learning.networks import ChoicePolicy  # "MultiInputPolicy" works too, but learns each row apart
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 50_000
 

@@ -178,7 +178,7 @@ class EnvConfig:
     rooms_config: Mapping[str, Any] = field(default_factory=dict)
     slam: str = "invariant-ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
-    odometry_filter: str = "none"  # between the wheels and the backend (slam.odometry_filter)
+    odometry_filter: str = "none"  # between the wheels and the backend (slam.odometry.filters)
     odometry_filter_config: Mapping[str, Any] = field(default_factory=dict)
     robot: RobotConfig = field(default_factory=RobotConfig)
     lidar: LidarConfig = field(default_factory=LidarConfig)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 import slam
 from mecanum_env import rooms as room_registry
-from mecanum_env.calibration import backend_settings
 from mecanum_env.config import (
     LIDAR_PRESETS,
     NOISE_PRESETS,
@@ -33,19 +32,20 @@ from mecanum_env.config import (
 )
 from mecanum_env.episode import EpisodeRecord
 from mecanum_env.ground_truth import Coverage, GroundTruth
-from mecanum_env.noise import noise_stream
 from mecanum_env.observation import Observation, observation_space, observe
+from mecanum_env.physics.robot import WheelTargets
+from mecanum_env.physics.world import World
 from mecanum_env.reward import StepOutcome, reward_terms
-from mecanum_env.robot import WheelTargets
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
-from mecanum_env.sensors import FilteredEncoders, Lidar, WheelEncoders
-from mecanum_env.window import make_viewer
-from mecanum_env.world import World
+from mecanum_env.sensing.calibration import backend_settings
+from mecanum_env.sensing.noise import noise_stream
+from mecanum_env.sensing.sensors import FilteredEncoders, Lidar, WheelEncoders
+from mecanum_env.views.window import make_viewer
 from slam.backend import Backend
 from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
-from slam.odometry_filter import make_odometry_filter
+from slam.odometry.filters import make_odometry_filter
 from slam.settings import from_mapping, unknown_name
 from slam.types import Belief, Odometry, Scan
 
@@ -276,7 +276,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             gymnasium.logger.warn('render() needs render_mode="rgb_array" or "human" in gym.make')
         if self.render_mode != "rgb_array":
             return None
-        from mecanum_env.render import render_frame
+        from mecanum_env.views.render import render_frame
 
         return render_frame(self)
 

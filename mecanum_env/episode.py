@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth, occupied, on_lattice
-from slam import metrics
+from slam.metrics import measures as metrics
 
 if TYPE_CHECKING:
     from slam.types import Belief

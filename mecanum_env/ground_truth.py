@@ -10,10 +10,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, RobotConfig
-from mecanum_env.raycast import beam_directions, cast_rays
 from mecanum_env.rooms.floor_plan import FloorPlan
+from mecanum_env.sensing.raycast import beam_directions, cast_rays
 from slam.geometry import compose, inverse, transform_points, wrap_scalar
-from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.types import Scan
 
 __all__ = ["Coverage", "GroundTruth"]

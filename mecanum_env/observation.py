@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
 from slam.backend import Backend
-from slam.joint_gaussian import OBSERVED_LIMIT
-from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
+from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
+from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Scan
 
 __all__ = ["LOCAL_CELL_M", "MAP_SIZE", "draw_maps", "map_frame", "observation_space", "observe"]

@@ -10,11 +10,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.features import FeatureConfig, FeatureExtractor
-from slam.key_scans import KeyScanConfig, KeyScans
-from slam.metrics import nees_pose
+from slam.features.extraction import FeatureConfig, FeatureExtractor
+from slam.grids.key_scans import KeyScanConfig, KeyScans
+from slam.grids.occupancy import OccupancyGrid
+from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
-from slam.occupancy import OccupancyGrid
 from slam.settings import require
 from slam.types import Belief, Observations, Odometry, Scan
 
@@ -126,7 +126,7 @@ class Backend(abc.ABC):
         """Write the nearest landmarks in the robot frame, nearest first.
 
         Rows of ``(k, 6)``: x, y [m], σxx, σxy, σyy [m²] of the landmark's own covariance, 1; zeros where
-        there are fewer. Nothing exceeds :data:`slam.joint_gaussian.OBSERVED_LIMIT`.
+        there are fewer. Nothing exceeds :data:`slam.gaussian.joint_gaussian.OBSERVED_LIMIT`.
         """
 
     def sensor_pose(self) -> Array:

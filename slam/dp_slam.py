@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend, BackendConfig
 from slam.geometry import compose, inverse, wrap
-from slam.particle_grids import ParticleGrids, ScanCells
-from slam.particle_match import ParticleMatcher
-from slam.paths import Paths
-from slam.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
-from slam.scan_matching import MatchConfig, body_points
-from slam.scan_odometry import ScanOdometry, ScanOdometryConfig
+from slam.grids.scan_matching import MatchConfig, body_points
+from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
+from slam.particles.grids import ParticleGrids, ScanCells
+from slam.particles.match import ParticleMatcher
+from slam.particles.paths import Paths
+from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import require
-from slam.shared_grid import CopiedGrids, SharedGrid
 from slam.types import Belief, Observations, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]

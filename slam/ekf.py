@@ -13,17 +13,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
 from slam.backend import Backend, BackendConfig
-from slam.chi_square import chi2_quantile
-from slam.joint_gaussian import add_landmark, near_landmarks, read_block, symmetric_block
-from slam.landmarks import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
-from slam.lanes import aligned_zeros
-from slam.loop_closing import agreeing, put_off
-from slam.metrics import nees_pose
+from slam.gaussian.joint_gaussian import add_landmark, near_landmarks, read_block, symmetric_block
+from slam.gaussian.lanes import aligned_zeros
+from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.landmarks.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
+from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
+from slam.landmarks.loop_closing import agreeing, put_off
+from slam.metrics.chi_square import chi2_quantile
+from slam.metrics.measures import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
-from slam.stacked_update import stacked_update, work_space
 from slam.types import LINE, Belief, Observations, Odometry, Scan
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
@@ -265,7 +265,7 @@ class EkfSlam(Backend):
         )
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
-        """Tentative → confirmed → dropped (see :mod:`slam.landmarks`)."""
+        """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
         book, offset = self._book, self.config.lidar_offset_m
         if scan is None:
             new, gone = book.review(self._x, offset, z, match).tolist(), list[int]()
@@ -412,7 +412,7 @@ def _match_and_recall(
     x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
     match: NDArray[np.int64], distance: Array,
 ) -> tuple[int, int]:  # fmt: skip
-    """Match by nearest neighbour; return what :meth:`slam.landmarks.LandmarkBook.recently_seen` says of it."""
+    """Match by nearest neighbour; return what the book says of it (``LandmarkBook.recently_seen``)."""
     gate, near, max_turn = gates[0], gates[1], gates[2]
     h = np.empty((2, 5))
     nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)

@@ -15,15 +15,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.association import joint_compatibility
 from slam.backend import Backend, BackendConfig
-from slam.chi_square import chi2_quantile
+from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.geometry import compose, rotation, wrap
-from slam.joint_gaussian import OBSERVED_LIMIT
-from slam.landmarks import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
-from slam.particle_filter import correct_particles, narrow, predict_particles
-from slam.particle_maps import ParticleMaps, associate, refresh_extents
-from slam.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.landmarks.association import joint_compatibility
+from slam.landmarks.book import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
+from slam.metrics.chi_square import chi2_quantile
+from slam.particles.filter import correct_particles, narrow, predict_particles
+from slam.particles.maps import ParticleMaps, associate, refresh_extents
+from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
 from slam.settings import require
 from slam.types import Belief, Observations, Odometry, Scan
 
@@ -245,7 +245,7 @@ class FastSlam(Backend):
     # ---- the book of landmarks -----------------------------------------------------------------------------
 
     def _manage(self, z: Array, match: Indices, best: int, scan: Scan | None) -> None:
-        """Tentative → confirmed → dropped (see :mod:`slam.landmarks`), for all particles as the best one has it.
+        """Tentative → confirmed → dropped (:mod:`slam.landmarks.book`), for all particles as the best has it.
 
         So a row is the same landmark in every particle, which has it where it saw it from its own pose.
         """

@@ -19,7 +19,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from slam.geometry import wrap
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 __all__ = ["atomic_write", "read_map_server", "read_tum", "replacing", "write_map_server", "write_tum"]
 

@@ -16,13 +16,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.ekf import EkfLinesConfig, EkfSlam
+from slam.gaussian.joint_gaussian import landmark_by_pose
+from slam.gaussian.stacked_update import SPARE_ROWS, whiten
+from slam.gaussian.tiles import add_combination, downdate
+from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
-from slam.joint_gaussian import landmark_by_pose
-from slam.metrics import nees_pose_invariant
-from slam.stacked_update import SPARE_ROWS, whiten
-from slam.tiles import add_combination, downdate
+from slam.metrics.measures import nees_pose_invariant
 from slam.types import LINE, Odometry, Scan
-from slam.wheel_errors import WheelErrors
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -41,7 +41,8 @@ class InvariantEkfConfig(EkfLinesConfig):
 class InvariantEkfSlam(EkfSlam):
     """The right-invariant EKF-SLAM backend, ``invariant-ekf``.
 
-    Where the odometry's noise says what of it lasts, the wheels' errors are states, too (slam.wheel_errors).
+    Where the odometry's noise says what of it lasts, the wheels' errors are states, too
+    (slam.gaussian.wheel_errors).
     """
 
     config: InvariantEkfConfig
@@ -120,9 +121,9 @@ def invariant_update(
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 
-    The gain is the standard filter's (:func:`slam.stacked_update.stacked_update`). The reset P ← P + A Vᵀ + V Aᵀ
-    (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ, x and
-    y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space.
+    The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
+    + V Aᵀ (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
+    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     if rows == 0:

@@ -37,8 +37,8 @@ class OdometryNoise:
     """V, the covariance of the measured twist, diagonal: each σ is a floor plus a share of the wheels' speed.
 
     The wheels' speed is √(vx² + vy² + (lω)²). The shares are larger than the encoders' white noise alone, since
-    wheel radius errors stay the same from step to step; ``mecanum_env.calibration`` derives a robot's own from
-    its declared noise. A change of speed that the floor cannot pass on makes the wheels slip: what exceeds
+    wheel radius errors stay the same from step to step; ``mecanum_env.sensing.calibration`` derives a robot's own
+    from its declared noise. A change of speed that the floor cannot pass on makes the wheels slip: what exceeds
     ``grip_m_s2`` adds its own share.
     """
 
@@ -49,7 +49,9 @@ class OdometryNoise:
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: float = 0.6  # of the change beyond that
-    lasting: LastingErrors | None = None  # what of it invariant-ekf takes for states: see slam.wheel_errors
+    lasting: LastingErrors | None = (
+        None  # what of it invariant-ekf takes for states: see slam.gaussian.wheel_errors
+    )
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):

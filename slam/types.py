@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from slam.occupancy import OccupancyGrid
+    from slam.grids.occupancy import OccupancyGrid
 
 __all__ = ["CONCAVE", "CONVEX", "LINE", "Belief", "Observations", "Odometry", "Scan"]
 

@@ -19,7 +19,7 @@ HEAVY = ("torch", "stable_baselines3", "pygame", "imageio_ffmpeg", "mcap", "reru
 # What an agent must not touch: the environment's ground truth, what holds it, and what info tells of it.
 TRUTH_NAMES = {"truth", "true_pose", "floor_plan", "FloorPlan", "position_error_m", "heading_error_rad"}
 TRUTH_ATTRIBUTES = TRUTH_NAMES | {"world"}
-TRUTH_MODULES = ("mecanum_env.ground_truth", "mecanum_env.world", "mecanum_env.rooms")
+TRUTH_MODULES = ("mecanum_env.ground_truth", "mecanum_env.physics.world", "mecanum_env.rooms")
 
 
 def sources(package: str) -> list[Path]:
@@ -107,7 +107,7 @@ def test_upward_imports_are_noticed(line: str) -> None:
         "env.unwrapped.world.body",
         "def act(observation, truth): ...",
         "from mecanum_env.rooms.floor_plan import FloorPlan",
-        "import mecanum_env.world",
+        "import mecanum_env.physics.world",
     ],
 )
 def test_touches_of_truth_are_noticed(line: str) -> None:

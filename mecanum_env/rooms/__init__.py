@@ -8,8 +8,8 @@ from __future__ import annotations
 from mecanum_env.rooms.apartment import ApartmentConfig, apartment
 from mecanum_env.rooms.cave import CaveConfig, cave
 from mecanum_env.rooms.corridors import PAPER_D, CorridorsConfig, corridors
+from mecanum_env.rooms.files.importers import load
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
-from mecanum_env.rooms.importers import load
 from mecanum_env.rooms.maze import MazeConfig, maze
 from mecanum_env.rooms.rectangular import RectangularConfig, rectangular
 from mecanum_env.rooms.registry import make, names, register

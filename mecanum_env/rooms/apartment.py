@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mecanum_env.rooms.apartment_layout import ApartmentConfig, Layout, draw_layout
-from mecanum_env.rooms.assembly import assemble, generator
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.rooms.furniture import Box, Furnisher, Piece
+from mecanum_env.rooms.layout.apartment_layout import ApartmentConfig, Layout, draw_layout
+from mecanum_env.rooms.layout.assembly import assemble, generator
+from mecanum_env.rooms.layout.furniture import Box, Furnisher, Piece
 
 __all__ = ["ApartmentConfig", "apartment"]
 

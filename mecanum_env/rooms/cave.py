@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.rooms.assembly import choose_start, generator, unreached
-from mecanum_env.rooms.distance import distance_to_zero
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
-from mecanum_env.rooms.furniture import CELL_M
-from mecanum_env.rooms.limits import interval
-from mecanum_env.rooms.smooth_outline import facets, level_loops, rasterise
+from mecanum_env.rooms.layout.assembly import choose_start, generator, unreached
+from mecanum_env.rooms.layout.furniture import CELL_M
+from mecanum_env.rooms.layout.limits import interval
+from mecanum_env.rooms.outlines.distance import distance_to_zero
+from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise
 from slam.settings import require
 
 __all__ = ["CaveConfig", "cave"]

@@ -6,10 +6,17 @@ import math
 
 import numpy as np
 
-from mecanum_env.rooms.assembly import generator
-from mecanum_env.rooms.corridor_layout import PAPER_D, Corridor, CorridorsConfig, Sizes, draw_layout, sizes_of
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.rooms.rectilinear import surfaces
+from mecanum_env.rooms.layout.assembly import generator
+from mecanum_env.rooms.layout.corridor_layout import (
+    PAPER_D,
+    Corridor,
+    CorridorsConfig,
+    Sizes,
+    draw_layout,
+    sizes_of,
+)
+from mecanum_env.rooms.outlines.rectilinear import surfaces
 
 __all__ = ["PAPER_D", "CorridorsConfig", "corridors"]
 

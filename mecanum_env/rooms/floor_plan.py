@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.rooms.corners import find_corners
-from mecanum_env.rooms.distance import distance_to_zero
+from mecanum_env.rooms.outlines.corners import find_corners
+from mecanum_env.rooms.outlines.distance import distance_to_zero
 
 __all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
 

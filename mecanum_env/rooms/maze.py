@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.rooms.assembly import choose_start, generator, unreached
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
-from mecanum_env.rooms.furniture import CELL_M, Box, cells
-from mecanum_env.rooms.limits import interval
-from mecanum_env.rooms.rectilinear import surfaces
+from mecanum_env.rooms.layout.assembly import choose_start, generator, unreached
+from mecanum_env.rooms.layout.furniture import CELL_M, Box, cells
+from mecanum_env.rooms.layout.limits import interval
+from mecanum_env.rooms.outlines.rectilinear import surfaces
 from slam.settings import require
 
 __all__ = ["Grid", "MazeConfig", "draw_grid", "maze"]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mecanum_env.rooms.assembly import assemble, generator
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.rooms.furniture import Furnisher, cells
-from mecanum_env.rooms.limits import interval
+from mecanum_env.rooms.layout.assembly import assemble, generator
+from mecanum_env.rooms.layout.furniture import Furnisher, cells
+from mecanum_env.rooms.layout.limits import interval
 from slam.settings import require
 
 __all__ = ["RectangularConfig", "rectangular"]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.control import PathFollower
-from agents.follow import WINDOW_M
-from agents.safety import LocalMap, body_gaps, local_map
+from agents.driving.control import PathFollower
+from agents.driving.follow import WINDOW_M
+from agents.driving.safety import LocalMap, body_gaps, local_map
 from mecanum_env.config import LidarConfig
 from slam import geometry
 from slam.types import Belief

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.safety import footprint
+from agents.driving.safety import footprint
 from mecanum_env.config import RobotConfig
 from slam import geometry
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.types import Belief
 
 RESOLUTION = 0.05

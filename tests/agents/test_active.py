@@ -12,10 +12,10 @@ from hypothesis.extra.numpy import arrays
 
 import agents
 from agents.active import ActiveSlam
-from agents.control import ControlConfig
-from agents.grip import GentleFollower, WheelWatch
+from agents.driving.control import ControlConfig
+from agents.driving.grip import GentleFollower, WheelWatch
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.occupancy import UNKNOWN
+from slam.grids.occupancy import UNKNOWN
 from slam.types import Belief
 from tests.agents.grids import belief_of, drive, fill, half_known, room
 

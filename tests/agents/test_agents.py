@@ -13,9 +13,9 @@ from hypothesis.extra.numpy import arrays
 import agents
 from agents.base import Agent, Goal
 from agents.brisk_tour import BRISK
-from agents.policy import SHIPPED, load_choice_policy
+from agents.ppo_frontier import SHIPPED, load_choice_policy
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from slam.types import Belief, Scan
 from tests.agents.grids import RESOLUTION, belief_of, body_gap, drive, fill, half_known, room, two_rooms
 
@@ -63,7 +63,7 @@ def test_another_package_adds_an_agent(tmp_path, monkeypatch):
     points = "[mecanum_slam.agents]\ntheirs = somebodys_agents:Theirs\nrandom = somebodys_agents:Theirs\n"
     (info / "entry_points.txt").write_text(points)
     (tmp_path / "somebodys_agents.py").write_text(
-        "from agents.frontier import NearestFrontier\n\n\nclass Theirs(NearestFrontier):\n    pass\n"
+        "from agents.nearest_frontier import NearestFrontier\n\n\nclass Theirs(NearestFrontier):\n    pass\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     agents._installed.cache_clear()

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from agents.control import ControlConfig, PathFollower
-from agents.planning import resample
-from agents.safety import Guard, body_gaps, footprint, local_map, scan_points
+from agents.driving.control import ControlConfig, PathFollower
+from agents.driving.safety import Guard, body_gaps, footprint, local_map, scan_points
+from agents.ways.planning import resample
 from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
 from slam import geometry
 from tests.agents.grids import belief_of, body_gap, drive, fill, room, two_rooms

@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import dijkstra
 
 import agents
 import mecanum_env
-from agents.drive_network import DriveNetwork, PlanSettings, pixel_size
-from agents.drive_plan import EDGES, descend, distances, gradient, node_prices
-from agents.drive_policy import SHIPPED
+from agents.learned.drive_network import DriveNetwork, PlanSettings, pixel_size
+from agents.learned.drive_plan import EDGES, descend, distances, gradient, node_prices
+from agents.ppo import SHIPPED
 from mecanum_env.observation import draw_maps, map_frame
 
 assert mecanum_env

@@ -10,7 +10,7 @@ import agents
 from agents.explore_and_return import ExploreAndReturnConfig, HomingConfig
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig
 from slam.geometry import wrap_scalar
-from slam.occupancy import OCCUPIED, UNKNOWN
+from slam.grids.occupancy import OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, body_gap, drive, fill, half_known, room
 
 ROBOT = RobotConfig()

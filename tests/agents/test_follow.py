@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import agents.explore_and_return as homing
-from agents import follow
-from agents.control import ControlConfig, PathFollower
-from agents.planning import resample
-from agents.safety import local_map
+from agents.driving import follow
+from agents.driving.control import ControlConfig, PathFollower
+from agents.driving.safety import local_map
+from agents.ways.planning import resample
 from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
-from slam.occupancy import OCCUPIED, UNKNOWN
+from slam.grids.occupancy import OCCUPIED, UNKNOWN
 from tests.agents.follow_oracle import PlainFollower, rims_cover
 from tests.agents.grids import belief_of, drive, fill, room, two_rooms
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 import slam
-from agents import cost_map as cost_maps
-from agents.cost_map import PlannerConfig
-from agents.foresight import Foresight, ForesightConfig, anchoring, d_optimality, marks_of, spread_m
-from agents.sightings import SensorModel, expected_sightings
+from agents.view_points.foresight import Foresight, ForesightConfig, anchoring, d_optimality, marks_of, spread_m
+from agents.view_points.sightings import SensorModel, expected_sightings
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
-from slam.association import predicted
+from slam.grids.occupancy import FREE
+from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, jacobians, move, twist_between
-from slam.occupancy import FREE
 from slam.types import LINE, Belief, Observations, Odometry
 from tests.agents.grids import belief_of, fill, room
 

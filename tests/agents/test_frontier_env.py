@@ -12,10 +12,10 @@ from gymnasium.utils.env_checker import check_env
 import agents
 import mecanum_env  # noqa: F401 - registers
 from agents.brisk_tour import BRISK
-from agents.choice import CANDIDATE, STATE
 from agents.frontier_env import ExploreFrontierEnv
-from agents.policy import load_choice_policy
-from training.choice_world import Teacher
+from agents.learned.choice import CANDIDATE, STATE
+from agents.ppo_frontier import load_choice_policy
+from training.learning.choice_world import Teacher
 
 ID = "mecanum_env:mecanum_env/ExploreFrontier-v0"
 TIME_ALONE = {"area": 0.0, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": 0.0, "effort": 0.0, "time": -1.0}

@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents import cost_map as cost_maps
-from agents.cost_map import PlannerConfig
-from agents.frontiers import FrontierConfig, find, frontier_cells
-from agents.planning import travel_costs
-from agents.sight import Watch, in_good_sight, view_points
+from agents.view_points.frontiers import FrontierConfig, find, frontier_cells
+from agents.view_points.sight import Watch, in_good_sight, view_points
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import PlannerConfig
+from agents.ways.planning import travel_costs
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import RESOLUTION, belief_of, fill, half_known, room
 
 ROBOT = RobotConfig()

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from agents import cost_map as cost_maps
-from agents.cost_map import PlannerConfig
-from agents.gain import expected_area
+from agents.view_points.gain import expected_area
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import RobotConfig
-from slam.occupancy import OCCUPIED, UNKNOWN
+from slam.grids.occupancy import OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, half_known, room
 
 

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from agents import cost_map as cost_maps
-from agents.coarsening import FAR_M, coarsen, known_extent
-from agents.cost_map import CostMap, PlannerConfig
-from agents.frontiers import FrontierConfig, _borders_a_large_pocket, _clusters, find
-from agents.planning import travel_costs
-from agents.sight import Watch, first_in_good_sight, in_good_sight
+from agents.view_points.frontiers import FrontierConfig, _borders_a_large_pocket, _clusters, find
+from agents.view_points.sight import Watch, first_in_good_sight, in_good_sight
+from agents.ways import cost_map as cost_maps
+from agents.ways.coarsening import FAR_M, coarsen, known_extent
+from agents.ways.cost_map import CostMap, PlannerConfig
+from agents.ways.planning import travel_costs
 from mecanum_env.config import RobotConfig
-from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, half_known
 
 seeds = st.integers(0, 2**32 - 1)

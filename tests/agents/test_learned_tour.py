@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import agents
+from agents.learned.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
-from agents.routing import draw_luck
-from agents.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
-from agents.station_survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
-from agents.stations import edges, join, lengths, ways
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from agents.stations.lattice import edges, join, lengths, ways
+from agents.stations.survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
+from agents.ways.routing import draw_luck
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.types import Belief
 
 STATIONS = {"spacing_m": 4.0, "hop": 2}
@@ -288,7 +288,9 @@ def test_settings_are_checked():
 
 def test_its_policy_comes_with_where_it_is_from():
     network, about = load_station_policy(SHIPPED)
-    assert about["command"].startswith("python -m training.learned_tour") and min(map(len, about["curves"])) > 1
+    assert (
+        about["command"].startswith("python -m training.dungeons.training") and min(map(len, about["curves"])) > 1
+    )
     known, robot = rooms(1), (65, 65)
     found, visited = stop(known, robot)
     openings = options(found, LUCK, most=5, most_loss_m=40.0)

@@ -7,12 +7,12 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from agents import cost_map as cost_maps
-from agents.cost_map import CostMap, PlannerConfig, comfortable_clearance, tight_clearance
-from agents.planning import resample, shortest_path, travel_costs
-from agents.safety import local_map
+from agents.driving.safety import local_map
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import CostMap, PlannerConfig, comfortable_clearance, tight_clearance
+from agents.ways.planning import resample, shortest_path, travel_costs
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, half_known, room, two_rooms
 
 ROBOT = RobotConfig()

@@ -7,11 +7,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import agents
-from agents import cost_map as cost_maps
-from agents.cost_map import CostMap, PlannerConfig
-from agents.rrt_tree import Tree, mean_shift
+from agents.view_points.rrt_tree import Tree, mean_shift
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import CostMap, PlannerConfig
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, half_known, room, two_rooms
 
 SHORT = {"view_range_m": 1.2}

@@ -7,7 +7,7 @@ import pytest
 
 import agents
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, UNKNOWN
+from slam.grids.occupancy import FREE, UNKNOWN
 from tests.agents.grids import belief_of, drive, fill, half_known, room
 
 WEIGHING = ("cost-utility", "next-best-view")

@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import agents
-from agents import cost_map as cost_maps
-from agents.cost_map import PlannerConfig
-from agents.planning import travel_costs
-from agents.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost, tours_begun_with
-from agents.stations import count_in_sight, in_sight, join, line_is_free, ways
+from agents.stations.lattice import count_in_sight, in_sight, join, line_is_free, ways
 from agents.tour import Outlook, TourConfig
-from agents.travel import between
+from agents.ways import cost_map as cost_maps
+from agents.ways.cost_map import PlannerConfig
+from agents.ways.planning import travel_costs
+from agents.ways.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost, tours_begun_with
+from agents.ways.travel import between
 from mecanum_env.config import RobotConfig
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, room, two_rooms
 
 SHORT = {"view_range_m": 0.8}

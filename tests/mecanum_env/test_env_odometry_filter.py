@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from mecanum_env.config import EnvConfig, from_toml, to_toml
-from mecanum_env.sensors import WheelEncoders
+from mecanum_env.sensing.sensors import WheelEncoders
 from tests.mecanum_env.test_env import IDS, NO_WINDOWS, episode_bytes, make
 
 NAME = "differential-transform"

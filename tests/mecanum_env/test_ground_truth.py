@@ -9,7 +9,7 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.episode import score_map
 from mecanum_env.ground_truth import Coverage, GroundTruth, on_lattice
 from slam.geometry import transform_points
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
 def truth_of(name: str, seed: int) -> GroundTruth:

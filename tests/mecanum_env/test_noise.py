@@ -7,7 +7,7 @@ import copy
 import numpy as np
 import pytest
 
-from mecanum_env.noise import NoiseStream, noise_stream
+from mecanum_env.sensing.noise import NoiseStream, noise_stream
 
 
 @pytest.mark.parametrize("seed", range(4))

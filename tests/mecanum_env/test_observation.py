@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, UNKNOWN_BYTE, _fill_global, _fill_local, map_frame
-from slam.occupancy import PROBABILITY_BYTE, OccupancyGrid
+from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from tests.slam.simulated import room_scan
 
 poses = st.tuples(st.floats(-6, 6), st.floats(-6, 6), st.floats(-3.1, 3.1))

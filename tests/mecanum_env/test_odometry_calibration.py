@@ -8,13 +8,13 @@ import math
 import numpy as np
 import pytest
 
-from mecanum_env.calibration import backend_settings, odometry_noise
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, EnvConfig, NoiseConfig, RobotConfig
-from mecanum_env.odometry_calibration import Drives, drift_ratios, drive, fit, open_floor
-from mecanum_env.sensors import WheelEncoders
+from mecanum_env.sensing.calibration import backend_settings, odometry_noise
+from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit, open_floor
+from mecanum_env.sensing.sensors import WheelEncoders
 from slam.geometry import wrap
 from slam.motion import OdometryNoise
-from training.calibrate import main
+from training.studies.calibrate import main
 
 ROBOT = RobotConfig()
 LEVER = ROBOT.lever_m

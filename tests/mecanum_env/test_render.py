@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from mecanum_env import rooms
-from mecanum_env.canvas import Canvas, View, _round_length
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.paint import FRONTIER, LANDMARK, PLANNED_PATH
-from mecanum_env.pictures import draw_map, draw_truth, episode_view
-from mecanum_env.render import FRAME_SHAPE, frontier_cells, render_frame
 from mecanum_env.rooms.draw import FLOOR, ROBOT, WALL
-from mecanum_env.rooms.importers import from_raster
+from mecanum_env.rooms.files.importers import from_raster
+from mecanum_env.views.canvas import Canvas, View, _round_length
+from mecanum_env.views.paint import FRONTIER, LANDMARK, PLANNED_PATH
+from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
+from mecanum_env.views.render import FRAME_SHAPE, frontier_cells, render_frame
 from slam.geometry import inverse, transform_points
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
 def explored(steps: int = 60, **kwargs: Any) -> ExploreEnv:

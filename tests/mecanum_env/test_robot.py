@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig
-from mecanum_env.robot import (
+from mecanum_env.physics.robot import (
     INCREMENTS,
     POSE,
     REFERENCES,

@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from mecanum_env import rooms
 from mecanum_env.rooms.cave import CaveConfig
-from mecanum_env.rooms.smooth_outline import MOST_TURN_DEG, bends_deg, facets, level_loops, rasterise
+from mecanum_env.rooms.outlines.smooth_outline import MOST_TURN_DEG, bends_deg, facets, level_loops, rasterise
 
 seeds = st.integers(0, 2**32 - 1)
 few = settings(max_examples=15, deadline=None)

@@ -14,8 +14,8 @@ from scipy import ndimage
 
 from mecanum_env import rooms
 from mecanum_env.config import ROBOT_PRESETS
-from mecanum_env.rooms.assembly import generator
-from mecanum_env.rooms.corridor_layout import PAPER_D, Corridor, CorridorsConfig, draw_layout, sizes_of
+from mecanum_env.rooms.layout.assembly import generator
+from mecanum_env.rooms.layout.corridor_layout import PAPER_D, Corridor, CorridorsConfig, draw_layout, sizes_of
 from slam.types import CONCAVE, CONVEX
 
 seeds = st.integers(0, 2**32 - 1)

@@ -7,7 +7,7 @@ import pytest
 
 from mecanum_env import rooms
 from mecanum_env.rooms import draw
-from mecanum_env.rooms.importers import from_raster
+from mecanum_env.rooms.files.importers import from_raster
 
 
 def test_a_picture_shows_free_space_walls_and_furniture_where_they_are():

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
-from mecanum_env.rooms.rectilinear import surfaces
+from mecanum_env.rooms.outlines.rectilinear import surfaces
 from slam.types import CONCAVE, CONVEX
 
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from mecanum_env import rooms
-from mecanum_env.rooms.apartment_layout import ApartmentConfig, draw_layout
-from mecanum_env.rooms.assembly import generator
-from mecanum_env.rooms.distance import distance_to_zero
+from mecanum_env.rooms.layout.apartment_layout import ApartmentConfig, draw_layout
+from mecanum_env.rooms.layout.assembly import generator
+from mecanum_env.rooms.outlines.distance import distance_to_zero
 from mecanum_env.rooms.rectangular import RectangularConfig
 
 seeds = st.integers(0, 2**32 - 1)

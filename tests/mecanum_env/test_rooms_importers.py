@@ -17,10 +17,10 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import cKDTree
 
 from mecanum_env import rooms
+from mecanum_env.rooms.files.importers import from_raster
 from mecanum_env.rooms.floor_plan import FloorPlanError
-from mecanum_env.rooms.importers import from_raster
-from mecanum_env.rooms.outline import outline_segments, trace
-from mecanum_env.rooms.rectilinear import surfaces
+from mecanum_env.rooms.outlines.outline import outline_segments, trace
+from mecanum_env.rooms.outlines.rectilinear import surfaces
 
 DATA = Path(os.environ.get("MECANUM_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

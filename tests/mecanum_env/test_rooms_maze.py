@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from mecanum_env import rooms
-from mecanum_env.rooms.assembly import generator
+from mecanum_env.rooms.layout.assembly import generator
 from mecanum_env.rooms.maze import Grid, MazeConfig, draw_grid
 
 seeds = st.integers(0, 2**32 - 1)

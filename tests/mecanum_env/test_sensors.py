@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, NOISE_PRESETS, ROBOT_PRESETS, LidarConfig, NoiseConfig
-from mecanum_env.noise import noise_stream
-from mecanum_env.raycast import beam_directions, cast_rays
-from mecanum_env.robot import forward_kinematics, forward_matrix, twist_action_to_wheels
+from mecanum_env.physics.robot import forward_kinematics, forward_matrix, twist_action_to_wheels
+from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.sensors import Lidar, WheelEncoders
-from mecanum_env.world import World
+from mecanum_env.sensing.noise import noise_stream
+from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from mecanum_env.sensing.sensors import Lidar, WheelEncoders
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from gymnasium.error import DependencyNotInstalled
 
-from mecanum_env.render import FRAME_SHAPE, render_frame
-from mecanum_env.window import NoDisplay, Window, _fitted
+from mecanum_env.views.render import FRAME_SHAPE, render_frame
+from mecanum_env.views.window import NoDisplay, Window, _fitted
 
 ROOT = Path(__file__).resolve().parents[2]
 IDS = ("mecanum_env/Explore-v0", "mecanum_env/ExploreWheels-v0", "mecanum_env/ExploreFrontier-v0")

@@ -13,11 +13,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig, RobotConfig
-from mecanum_env.floor import build_floor
-from mecanum_env.robot import twist_action_to_wheels
+from mecanum_env.physics.floor import build_floor
+from mecanum_env.physics.robot import twist_action_to_wheels
+from mecanum_env.physics.world import CONTACT_GAP_S, MAX_TRAVEL_M, World
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
-from mecanum_env.sensors import WheelEncoders
-from mecanum_env.world import CONTACT_GAP_S, MAX_TRAVEL_M, World
+from mecanum_env.sensing.sensors import WheelEncoders
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 import slam
 from slam import Observations, Odometry
-from slam.association import IGNORED, innovation_blocks, joint_compatibility, nearest_neighbour
-from slam.chi_square import chi2_quantile
 from slam.geometry import compose, inverse, wrap
+from slam.landmarks.association import IGNORED, innovation_blocks, joint_compatibility, nearest_neighbour
+from slam.metrics.chi_square import chi2_quantile
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import solve_continuous_are
 
-from slam.differential_transform import (
+from slam.odometry.differential_transform import (
     MODELS,
     Model,
     PowerModel,
@@ -28,8 +28,8 @@ from slam.differential_transform import (
     quotient,
     rescale,
 )
-from slam.riccati import RECOVERIES, Tolerances
-from slam.transform_filter import KalmanBucyFilter
+from slam.odometry.riccati import RECOVERIES, Tolerances
+from slam.odometry.transform_filter import KalmanBucyFilter
 
 ORDER = 8
 spectra = st.lists(st.floats(-3, 3), min_size=ORDER + 1, max_size=ORDER + 1).map(np.array)

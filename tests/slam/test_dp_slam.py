@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 
 import slam
 from slam import Observations, Odometry, Scan
-from slam.ancestry import Ancestry
 from slam.dp_slam import DpSlam, DpSlamConfig
 from slam.geometry import compose, exp, inverse, wrap
 from slam.motion import OdometryNoise
-from slam.particle_grids import PASSES, STOPS, Lattice, ScanCells
-from slam.paths import Paths
-from slam.resampling import ResamplingPolicy
+from slam.particles.ancestry import Ancestry
+from slam.particles.grids import PASSES, STOPS, Lattice, ScanCells
+from slam.particles.paths import Paths
+from slam.particles.resampling import ResamplingPolicy
+from slam.particles.shared_grid import CopiedGrids, SharedGrid, _entry
 from slam.settings import from_mapping
-from slam.shared_grid import CopiedGrids, SharedGrid, _entry
 from tests.slam.simulated import circle_twist, drive, room_scan
 
 OFFSET = 0.2

@@ -10,14 +10,14 @@ from scipy.optimize import least_squares
 
 import slam
 from slam import Observations, Odometry
-from slam.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
-from slam.chi_square import chi2_quantile
 from slam.ekf import _leave_out
+from slam.gaussian.joint_gaussian import add_landmark, near_landmarks
+from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
-from slam.joint_gaussian import add_landmark, near_landmarks
-from slam.metrics import nees, nees_pose
+from slam.landmarks.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
+from slam.metrics.chi_square import chi2_quantile
+from slam.metrics.measures import nees, nees_pose
 from slam.motion import move
-from slam.stacked_update import stacked_update, work_space
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 import slam
 from slam import Observations, Odometry
-from slam.association import nearest_neighbour
 from slam.fastslam import FastSlam, FastSlam1, FastSlam2, FastSlamConfig
 from slam.geometry import compose, inverse, wrap
+from slam.landmarks.association import nearest_neighbour
 from slam.motion import OdometryNoise, jacobians, move
-from slam.particle_filter import draw, narrow
-from slam.particle_maps import ParticleMaps, associate, correct_landmark, innovation
-from slam.resampling import ResamplingPolicy
+from slam.particles.filter import draw, narrow
+from slam.particles.maps import ParticleMaps, associate, correct_landmark, innovation
+from slam.particles.resampling import ResamplingPolicy
 from slam.settings import from_mapping
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan

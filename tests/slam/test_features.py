@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam import CONCAVE, CONVEX, Scan
-from slam.features import FeatureConfig, FeatureExtractor
+from slam.features.extraction import FeatureConfig, FeatureExtractor
+from slam.features.surfaces import SIGMA, _breaks, _farthest, points_in_order
 from slam.geometry import inverse, transform_points, wrap
-from slam.surfaces import SIGMA, _breaks, _farthest, points_in_order
 from slam.types import LINE
 from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
 

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from slam.formats import atomic_write, read_map_server, read_tum, replacing, write_map_server, write_tum
 from slam.geometry import wrap
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 CLASSES = np.array([[FREE, FREE, OCCUPIED], [UNKNOWN, FREE, UNKNOWN]], np.int8)
 

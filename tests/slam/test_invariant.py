@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import slam
 from slam import Odometry
+from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.geometry import compose, exp, wrap
 from slam.invariant import invariant_update
-from slam.metrics import nees_band
-from slam.stacked_update import stacked_update, work_space
+from slam.metrics.measures import nees_band
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import drive, observe_landmarks
 

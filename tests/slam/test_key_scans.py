@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from slam.geometry import compose
-from slam.key_scans import KeyScanConfig, KeyScans
-from slam.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.grids.key_scans import KeyScanConfig, KeyScans
+from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from tests.slam.simulated import room_scan
 
 CORNERS = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.landmark_map import read_landmark_map, relate, write_landmark_map
+from slam.landmarks.database import read_landmark_map, relate, write_landmark_map
 from slam.types import CONCAVE, CONVEX
 
 

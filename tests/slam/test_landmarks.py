@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam import Scan
-from slam.association import IGNORED, UNMATCHED
-from slam.landmarks import LandmarkBook, LandmarkPolicy
+from slam.landmarks.association import IGNORED, UNMATCHED
+from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from tests.slam.simulated import ANGLE_MIN, INCREMENT
 
 POSE = np.zeros(3)

@@ -12,13 +12,13 @@ from scipy.optimize import least_squares
 
 import slam
 from slam import LINE
-from slam.association import line_blocks
-from slam.features import FeatureExtractor
+from slam.features.extraction import FeatureExtractor
+from slam.gaussian.joint_gaussian import add_landmark
+from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
 from slam.invariant import invariant_update
-from slam.joint_gaussian import add_landmark
+from slam.landmarks.association import line_blocks
 from slam.motion import move
-from slam.stacked_update import stacked_update, work_space
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, room_scan
 

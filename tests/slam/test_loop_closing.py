@@ -9,9 +9,9 @@ import pytest
 
 import slam
 from slam import LINE, Observations, Odometry
-from slam.association import IGNORED, UNMATCHED, nearest_neighbour
-from slam.chi_square import chi2_quantile
-from slam.loop_closing import agreeing, put_off
+from slam.landmarks.association import IGNORED, UNMATCHED, nearest_neighbour
+from slam.landmarks.loop_closing import agreeing, put_off
+from slam.metrics.chi_square import chi2_quantile
 from tests.slam.simulated import observe_landmarks
 
 OFFSET = 0.2

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import spatial, stats
 
-from slam import metrics
 from slam.geometry import compose, exp, inverse, transform_points
+from slam.metrics import measures as metrics
 
 RNG_SEED = 7
 angles = st.floats(-math.pi, math.pi)

@@ -9,7 +9,7 @@ import pytest
 
 import slam
 from slam.geometry import wrap
-from slam.metrics import fraction_in_band, nees
+from slam.metrics.measures import fraction_in_band, nees
 from tests.slam.simulated import drive, observe_landmarks
 
 pytestmark = pytest.mark.monte_carlo

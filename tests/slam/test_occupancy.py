@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam import Scan
-from slam.features import FeatureExtractor
-from slam.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.scan_drawing import (
+from slam.features.extraction import FeatureExtractor
+from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.grids.scan_drawing import (
     ENTROPY_BIT,
     HIT,
     IN_FREE,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.differential_transform import MODELS
 from slam.motion import move
-from slam.odometry_filter import OdometryFilter, OdometryFilterConfig, make_odometry_filter
-from slam.riccati import Tolerances
-from slam.transform_filter import KalmanBucyFilter
+from slam.odometry.differential_transform import MODELS
+from slam.odometry.filters import OdometryFilter, OdometryFilterConfig, make_odometry_filter
+from slam.odometry.riccati import Tolerances
+from slam.odometry.transform_filter import KalmanBucyFilter
 from slam.types import Odometry
 
 DT = 0.1

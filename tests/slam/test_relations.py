@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam import metrics
 from slam.geometry import compose, inverse
+from slam.metrics import measures as metrics
 from tests.slam.test_metrics import moved, trajectory, transforms
 
 

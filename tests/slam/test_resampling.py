@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slam.resampling import ResamplingPolicy, effective_particles, normalise, systematic
+from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, systematic
 
 weights_lists = st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40).filter(lambda w: sum(w) > 1e-3)
 

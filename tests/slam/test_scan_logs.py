@@ -17,7 +17,7 @@ from slam.logs import ScanLog, open_log, with_reference
 from slam.logs.carmen import beam_angles
 from slam.logs.dpslam import NOMINAL_DT_S
 from slam.logs.scans import rising, without_returns
-from slam.metrics import ate
+from slam.metrics.measures import ate
 from tests.slam.logs_on_disk import data_folder, write_utias
 from tests.slam.scans_on_disk import (
     SECONDS,

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from slam import Scan
 from slam.geometry import compose, transform_points, wrap
-from slam.match_kernels import field_sum, slope
-from slam.scan_matching import (
+from slam.grids.match_kernels import field_sum, slope
+from slam.grids.scan_matching import (
     LikelihoodField,
     MatchConfig,
     body_points,

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from numba import njit
 
 import slam
-from slam.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
-from slam.stacked_update import SPARE_ROWS
-from slam.tiles import add_combination, downdate, product
+from slam.gaussian.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
+from slam.gaussian.stacked_update import SPARE_ROWS
+from slam.gaussian.tiles import add_combination, downdate, product
 from tests.slam.simulated import circle_twist, drive, observe_landmarks
 
 STEPS = 12

@@ -10,16 +10,16 @@ import pytest
 
 import slam
 from mecanum_env.config import RobotConfig
-from mecanum_env.robot import forward_matrix
+from mecanum_env.physics.robot import forward_matrix
 from slam import Observations, Odometry
+from slam.gaussian.joint_gaussian import add_landmark, landmark_by_pose
+from slam.gaussian.stacked_update import SPARE_ROWS, stacked_update, work_space
+from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap
 from slam.invariant import InvariantEkfSlam, invariant_update
-from slam.joint_gaussian import add_landmark, landmark_by_pose
 from slam.motion import LastingErrors, OdometryNoise, jacobians, move
 from slam.settings import from_mapping
-from slam.stacked_update import SPARE_ROWS, stacked_update, work_space
 from slam.types import LINE
-from slam.wheel_errors import WheelErrors
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import room_scan
 from tests.slam.test_invariant import coordinates

@@ -9,8 +9,8 @@ import gymnasium
 import agents
 import mecanum_env  # noqa: F401 - registers the environments
 from mecanum_env.env import ExploreEnv
-from training.explore import Witness
-from training.recording import Recorder, Recording
+from training.episodes.explore import Witness
+from training.episodes.recording import Recorder, Recording
 
 STEPS = 60
 

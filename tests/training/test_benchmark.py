@@ -23,8 +23,9 @@ import pytest
 import agents
 from tests.training.plans import write_room
 from tests.training.test_cli_bad_input import refused
-from training import benchmark, suites
-from training.benchmark_episode import (
+from training.benchmark import run as benchmark
+from training.benchmark import suites
+from training.benchmark.episode import (
     CURVE_POINTS,
     WALL_CLOCK,
     EpisodeFailure,
@@ -34,12 +35,12 @@ from training.benchmark_episode import (
     resampled,
     run_job,
 )
-from training.benchmark_figures import METRICS, Group, comparisons, figures
-from training.benchmark_store import FILE, Store
-from training.campaign import run_all
+from training.benchmark.figures import METRICS, Group, comparisons, figures
+from training.benchmark.store import FILE, Store
+from training.benchmark.suites import SPLITS
 from training.cli import main
-from training.provenance import code_digest, modules_behind
-from training.suites import SPLITS
+from training.runs.campaign import run_all
+from training.runs.provenance import code_digest, modules_behind
 
 STEPS = 25
 
@@ -220,7 +221,7 @@ def test_ctrl_c_keeps_the_rows_and_the_same_command_goes_on(
 
 
 def test_ctrl_c_in_an_episode_leaves_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    from training import benchmark_episode
+    from training.benchmark import episode as benchmark_episode
 
     def pressed(found: Any, progress: Any) -> None:
         found.end, found.interrupted = "interrupted", True
@@ -237,7 +238,7 @@ def test_ctrl_c_in_an_episode_leaves_no_row(monkeypatch: pytest.MonkeyPatch) -> 
 def test_an_episode_that_fails_does_not_stop_the_others(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from agents.frontier import NearestFrontier
+    from agents.nearest_frontier import NearestFrontier
 
     inner = NearestFrontier.reset
 
@@ -434,7 +435,7 @@ def test_a_store_that_cannot_be_used(
 def test_the_dungeons_protocol_gets_its_options(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from training import dungeons
+    from training.dungeons import protocol as dungeons
 
     given: list[Any] = []
 
@@ -468,16 +469,31 @@ def test_a_curve_holds_until_the_next_row() -> None:
 
 
 def test_a_digest_follows_imports_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    behind = modules_behind("training.benchmark_episode").keys()
-    assert {"training.explore", "mecanum_env.env", "mecanum_env.rooms.cave", "slam.ekf", "agents.base"} <= behind
-    assert not {"training.report", "training.statistics", "training.cli", "agents", "agents.random"} & behind
+    behind = modules_behind("training.benchmark.episode").keys()
+    assert {
+        "training.episodes.explore",
+        "mecanum_env.env",
+        "mecanum_env.rooms.cave",
+        "slam.ekf",
+        "agents.base",
+    } <= behind
+    assert (
+        not {
+            "training.benchmark.report",
+            "training.figures.statistics",
+            "training.cli.commands",
+            "agents",
+            "agents.random",
+        }
+        & behind
+    )
     package = tmp_path / "an_agent_of_mine"
     package.mkdir()
     for name, text in (("__init__", ""), ("agent", "from .parts import x"), ("parts", "x = 1"), ("rest", "")):
         (package / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    bound = modules_behind("training.benchmark_episode", "training.known_map").keys()
-    assert "training.known_map" in bound - behind and "agents.routing" in bound - behind
+    bound = modules_behind("training.benchmark.episode", "training.episodes.known_map").keys()
+    assert "training.episodes.known_map" in bound - behind and "agents.ways.routing" in bound - behind
     assert modules_behind("an_agent_of_mine.agent").keys() == {
         "an_agent_of_mine", "an_agent_of_mine.agent", "an_agent_of_mine.parts",
     }  # fmt: skip

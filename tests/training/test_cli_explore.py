@@ -19,12 +19,12 @@ import pytest
 from mecanum_env.config import from_toml
 from mecanum_env.env import make_config
 from slam.formats import read_map_server, read_tum
-from slam.landmark_map import read_landmark_map
-from slam.occupancy import FREE, OCCUPIED
+from slam.grids.occupancy import FREE, OCCUPIED
+from slam.landmarks.database import read_landmark_map
 from tests.training.plans import write_room
 from training.cli import main
-from training.explore import EXTRAS, FILES
-from training.running import plain
+from training.episodes.explore import EXTRAS, FILES
+from training.runs.running import plain
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -298,6 +298,6 @@ def test_an_error_while_filming_leaves_the_episode_before_as_it_was(
     def failing(*_: Any, **__: Any) -> Any:
         raise RuntimeError("of a test")
 
-    monkeypatch.setattr("training.episode_files.episode_page", failing)
+    monkeypatch.setattr("training.views.episode_files.episode_page", failing)
     assert main(command) == 1
     assert {p.name: p.read_bytes() for p in out.iterdir()} == before

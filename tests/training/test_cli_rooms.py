@@ -7,7 +7,7 @@ import cv2
 import pytest
 
 from training.cli import main
-from training.rooms_command import parse_seeds
+from training.episodes.room_pictures import parse_seeds
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import pytest
 
 import slam
 from tests.training.test_cli_bad_input import refused
-from training import complexity
 from training.cli import main
+from training.studies import complexity
 
 
 @pytest.mark.parametrize("count", [10, 25, 60])

@@ -13,15 +13,15 @@ import pytest
 
 import slam
 from slam.geometry import inverse, transform_points, wrap
-from slam.metrics import nees_band
+from slam.metrics.measures import nees_band
 from slam.motion import move
 from tests.training.test_cli_bad_input import refused
-from training import consistency
-from training.campaign import run_all
-from training.circle_world import WORLDS, LandmarkWorld, drive, simulate
 from training.cli import main
-from training.errors import Interrupted
-from training.paper_b import floor_of, follow_filter, paper_b
+from training.runs.campaign import run_all
+from training.runs.errors import Interrupted
+from training.studies import consistency
+from training.studies.circle_world import WORLDS, LandmarkWorld, drive, simulate
+from training.studies.paper_b import floor_of, follow_filter, paper_b
 
 KEYS = {"anees_pose", "fraction_in_band", "nis_mean", "runs", "steps"}
 

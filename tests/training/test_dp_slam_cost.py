@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from training import dp_slam_cost
+from training.studies import dp_slam_cost
 
 
 def test_shared_maps_cost_less_than_copies_and_are_the_same_filter(

@@ -18,14 +18,14 @@ from safetensors.numpy import load_file  # noqa: E402
 
 import agents  # noqa: E402
 import mecanum_env  # noqa: E402
-from agents.drive_network import NUMBERS, SECTORS, DriveNetwork, control, sectors, stack  # noqa: E402
-from agents.drive_policy import load_drive_policy  # noqa: E402
+from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, control, sectors, stack  # noqa: E402
+from agents.ppo import load_drive_policy  # noqa: E402
 from slam.settings import from_mapping  # noqa: E402
-from training.drive import DriveRun  # noqa: E402
-from training.drive_config import DriveConfig  # noqa: E402
-from training.drive_lessons import FollowingTeacher, map_lesson  # noqa: E402
-from training.drive_networks import ControlNetwork, PlanNetwork, shortest  # noqa: E402
-from training.policies import export_run  # noqa: E402
+from training.learning.end_to_end.config import DriveConfig  # noqa: E402
+from training.learning.end_to_end.lessons import FollowingTeacher, map_lesson  # noqa: E402
+from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork, shortest  # noqa: E402
+from training.learning.end_to_end.run import DriveRun  # noqa: E402
+from training.learning.policies import export_run  # noqa: E402
 
 assert mecanum_env
 
@@ -126,8 +126,8 @@ def run(out: Path, *, kill_at: str = "", **changes) -> None:
 
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, monkeypatch):
-    monkeypatch.setattr("training.drive.worker_pool", no_workers)
-    monkeypatch.setattr("training.drive_ppo.start_worker", lambda: None)
+    monkeypatch.setattr("training.learning.end_to_end.run.worker_pool", no_workers)
+    monkeypatch.setattr("training.learning.end_to_end.ppo.start_worker", lambda: None)
     run(tmp_path / "whole")
     for moment in ("round 1: lessons", "round 1 of 2 done", "chunk 1 of 2"):
         with pytest.raises(Killed):

@@ -11,15 +11,15 @@ import pytest
 
 import agents
 from agents.base import Agent, Goal
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.slam.logs_on_disk import data_folder
-from training import dungeon_episode
-from training.dungeon_bound import known_map_path, known_walls_path
-from training.dungeon_episode import NEAREST, NEAREST_VIEW, explore, make_agent
-from training.dungeon_plans import dungeon_plan
-from training.dungeon_world import Dungeon, Lattice, dungeon_of, frontier_points, layout, load, scan
-from training.dungeons import main, run_dungeons, summarise, table
-from training.errors import BadInput
+from training.dungeons import episode as dungeon_episode
+from training.dungeons.bound import known_map_path, known_walls_path
+from training.dungeons.episode import NEAREST, NEAREST_VIEW, explore, make_agent
+from training.dungeons.plans import dungeon_plan
+from training.dungeons.protocol import main, run_dungeons, summarise, table
+from training.dungeons.world import Dungeon, Lattice, dungeon_of, frontier_points, layout, load, scan
+from training.runs.errors import BadInput
 
 WALL, OPEN, START = 127, 195, 208
 
@@ -254,7 +254,7 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     with store.open("a") as file:
         file.write("\n")
     ran = []
-    import training.dungeons as command
+    import training.dungeons.protocol as command
 
     real = command._run
     monkeypatch.setattr(command, "_run", lambda job: ran.append((job.agent, job.path.stem)) or real(job))

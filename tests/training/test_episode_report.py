@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mecanum_env.env import ExploreEnv
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from training import explore
-from training.episode_files import write_episode
-from training.episode_report import LOST, NO_RETURN, _thinned, pack, unpack
-from training.explore import ExploreOptions
-from training.recording import Recorded as Recording_
-from training.recording import Recorder, Recording, _MapFollower
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from training.episodes import explore
+from training.episodes.explore import ExploreOptions
+from training.episodes.recording import Recorded as Recording_
+from training.episodes.recording import Recorder, Recording, _MapFollower
+from training.views.episode_files import write_episode
+from training.views.report_page import LOST, NO_RETURN, _thinned, pack, unpack
 
 STEPS = 120
 

@@ -1,4 +1,4 @@
-"""``python -m training.evaluate``: what it refuses, before any episode is run."""
+"""``python -m training.benchmark.evaluate``: what it refuses, before any episode is run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from training.evaluate import main
+from training.benchmark.evaluate import main
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.geometry import compose, inverse, transform_points
-from slam.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.training.episodes import STEPS, Recorded, explore
-from training.errors import BadInput
-from training.export_mcap import TOPICS, write_mcap
-from training.playback import dead_reckoned, ellipses
-from training.ros2_messages import definition, encode
+from training.episodes.playback import dead_reckoned, ellipses
+from training.runs.errors import BadInput
+from training.views.mcap_file import TOPICS, write_mcap
+from training.views.ros2_messages import definition, encode
 
 pytest.importorskip("mcap_ros2")
 from mcap.reader import make_reader

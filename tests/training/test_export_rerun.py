@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.geometry import wrap
-from slam.occupancy import UNKNOWN
+from slam.grids.occupancy import UNKNOWN
 from tests.training.episodes import STEPS, Recorded, explore
-from training.errors import BadInput
-from training.export_rerun import APPLICATION, TIMELINE, write_rerun
-from training.playback import map_origin, maps
+from training.episodes.playback import map_origin, maps
+from training.runs.errors import BadInput
+from training.views.rerun_file import APPLICATION, TIMELINE, write_rerun
 
 pytest.importorskip("rerun")
 from rerun.chunk import RrdReader

@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
-from training.choice_world import make_rehearsal, make_world
-from training.hindsight import _price
-from training.train_config import RehearsalConfig, WorldConfig
+from training.learning.choice_world import make_rehearsal, make_world
+from training.learning.config import RehearsalConfig, WorldConfig
+from training.learning.hindsight import _price
 
 
 def price(seen, distance, cells, places, costs, spare=0.0):

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from agents.choice import CANDIDATE
+from agents.learned.choice import CANDIDATE
 from mecanum_env import rooms
 from mecanum_env.config import RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.geometry import transform_points
-from training.choice_world import make_rehearsal, make_world, mirrored
-from training.jump_world import COVERED, JumpWorld
-from training.train_config import RehearsalConfig, WorldConfig
+from training.learning.choice_world import make_rehearsal, make_world, mirrored
+from training.learning.config import RehearsalConfig, WorldConfig
+from training.learning.jump_world import COVERED, JumpWorld
 
 FAMILIES = ["rectangular", "apartment", "corridors", "cave", "maze"]
 WHERE = [CANDIDATE.index(name) for name in ("distance", "ahead", "left", "target_ahead", "target_left")]

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import agents
-from agents.cost_map import PlannerConfig
+from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
-from training.explore import ExploreOptions, prepare, run
-from training.known_map import NAME, _greedy, _way_until
-from training.true_places import TruePlaces, cells_per_tile
+from training.episodes.explore import ExploreOptions, prepare, run
+from training.episodes.known_map import NAME, _greedy, _way_until
+from training.episodes.true_places import TruePlaces, cells_per_tile
 
 
 def episode(tmp_path, agent, rooms="apartment", seed=5):

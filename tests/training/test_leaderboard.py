@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from training.errors import BadInput
-from training.leaderboard import BEGIN, END, main, tables, update
+from training.benchmark.leaderboard import BEGIN, END, main, tables, update
+from training.runs.errors import BadInput
 
 
 def figure(value, low=None, high=None):

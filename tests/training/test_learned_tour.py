@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from agents.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
-from agents.station_survey import begin, find_pieces, first_hop, no_pieces, options
-from slam.occupancy import UNKNOWN
-from training import dungeon_networks
-from training.dungeon_episode import _Run
-from training.dungeon_lessons import gather, lessons_of, read_lessons
-from training.dungeon_plans import dungeon_plan, loops
-from training.dungeon_walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
-from training.dungeon_world import CELL_M, Lattice, frontier_points
-from training.learned_tour import TrainingConfig, batch_of, main, train, turned
+from agents.learned.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
+from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options
+from slam.grids.occupancy import UNKNOWN
+from training.dungeons import networks as dungeon_networks
+from training.dungeons.episode import _Run
+from training.dungeons.lessons import gather, lessons_of, read_lessons
+from training.dungeons.plans import dungeon_plan, loops
+from training.dungeons.training import TrainingConfig, batch_of, main, train, turned
+from training.dungeons.walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
+from training.dungeons.world import CELL_M, Lattice, frontier_points
 
 # ---- plans -----------------------------------------------------------------------------------------------------
 
@@ -200,7 +200,7 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
     assert [point["epoch"] for point in curve] == [1, 2] and curve[1]["cost"] < 2.0 * curve[0]["cost"]
     (tmp_path / "round-1").mkdir()
     (tmp_path / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
-    from training import learned_tour
+    from training.dungeons import training as learned_tour
 
     kept = learned_tour._keep
 
@@ -219,7 +219,7 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
 
 def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys):
     import agents
-    from training.dungeon_episode import explore
+    from training.dungeons.episode import explore
 
     out = tmp_path / "run"
     (out / "round-1").mkdir(parents=True)

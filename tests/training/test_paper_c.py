@@ -1,4 +1,4 @@
-"""``python -m training.paper_c``: figures and their JSON with tiny settings; peers that solve and count right."""
+"""Paper C's study: figures and their JSON with tiny settings; peers that solve and count right."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ import cv2
 import numpy as np
 import pytest
 
-from training import paper_c
-from training.paper_c import run_of
-from training.paper_c_odometry import accelerating, best, drives, errors
-from training.paper_c_peers import Counted
-from training.paper_c_work import METHODS, count, reference, relative_deviation, solve
+from training.studies.paper_c import figures as paper_c
+from training.studies.paper_c.figures import run_of
+from training.studies.paper_c.odometry import accelerating, best, drives, errors
+from training.studies.paper_c.peers import Counted
+from training.studies.paper_c.work import METHODS, count, reference, relative_deviation, solve
 
 TINY = ["--runs", "2", "--repeats", "1", "--episodes", "1", "--explorations", "1", "--steps", "3"]
 
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("training.paper_c_work.METHODS", {name: tuple(METHODS[name])[:2] for name in METHODS})
+    monkeypatch.setattr(
+        "training.studies.paper_c.work.METHODS", {name: tuple(METHODS[name])[:2] for name in METHODS}
+    )
     grid = {"constant_velocity": np.array([0.03]), "uniform_acceleration": np.array([1.0])}
-    monkeypatch.setattr("training.paper_c_odometry._PROCESS", grid)
+    monkeypatch.setattr("training.studies.paper_c.odometry._PROCESS", grid)
     monkeypatch.setattr(paper_c, "ODOMETRY_MODELS", tuple(grid))
 
 

@@ -12,12 +12,12 @@ import pytest
 
 import slam
 from mecanum_env import rooms
-from mecanum_env.render import render_frame
+from mecanum_env.views.render import render_frame
 from tests.training.plans import write_room
-from training.errors import BadInput, Interrupted
-from training.play import PlayOptions, Session
-from training.play_controls import Command
-from training.play_picture import PICTURE_SHAPE, _shortened, play_picture
+from training.play.controls import Command
+from training.play.picture import PICTURE_SHAPE, _shortened, play_picture
+from training.play.session import PlayOptions, Session
+from training.runs.errors import BadInput, Interrupted
 
 FAST = 1000.0  # times true speed
 REST = np.zeros(3, np.float32)
@@ -146,7 +146,7 @@ class Player:
     """Presses keys."""
 
     def __init__(self, pygame: Any, played: Session) -> None:
-        from training.play_game import Game, open_window
+        from training.play.game import Game, open_window
 
         self.pygame, self.session = pygame, played
         self.window = open_window()
@@ -245,7 +245,7 @@ def test_ctrl_c_ends_it_in_one_line(pygame: Any) -> None:
 
 def test_the_pace_is_true_and_what_is_missed_is_not_caught_up_with(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="needs the extra `human`")
-    from training import play_game
+    from training.play import game as play_game
 
     now = [100.0]
     monkeypatch.setattr(play_game.time, "perf_counter", lambda: now[0])
@@ -277,7 +277,7 @@ def test_a_gamepad_drives(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_command_plays_so_many_steps(pygame: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    from training.cli_play import play
+    from training.cli.play import play
 
     play(rooms="rectangular", slam="odometry", speed=FAST, frames=5)
     assert capsys.readouterr().out.startswith("rectangular, seed 0, odometry: 0.5 s, coverage ")
@@ -285,7 +285,7 @@ def test_the_command_plays_so_many_steps(pygame: Any, capsys: pytest.CaptureFixt
 
 
 def test_the_command_refuses_a_speed_that_is_none() -> None:
-    from training.cli_play import play
+    from training.cli.play import play
 
     for speed in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(BadInput, match="--speed"):
@@ -293,7 +293,7 @@ def test_the_command_refuses_a_speed_that_is_none() -> None:
 
 
 def test_without_a_display_or_pygame_the_remedy_is_said(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    from training.play_game import open_window
+    from training.play.game import open_window
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "none-such")
     with pytest.raises(BadInput, match="SDL_VIDEODRIVER=dummy"):

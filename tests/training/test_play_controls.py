@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from training.play_controls import COMMANDS, DEAD_ZONE, DRIVING, KEYS, Command, Controls, stick_twist
+from training.play.controls import COMMANDS, DEAD_ZONE, DRIVING, KEYS, Command, Controls, stick_twist
 
 
 @pytest.mark.parametrize(

@@ -10,15 +10,15 @@ pytest.importorskip("sb3_contrib")
 
 from gymnasium import spaces  # noqa: E402
 
-from agents import choice_network  # noqa: E402
-from agents.choice import CANDIDATE, STATE, Choice, mirrored  # noqa: E402
-from agents.chooser import ChooserConfig  # noqa: E402
 from agents.frontier_env import as_observation, choice_space  # noqa: E402
-from training.choice_world import make_world  # noqa: E402
-from training.imitation import Lessons, learn  # noqa: E402
-from training.networks import ChoiceNetwork  # noqa: E402
-from training.semi_markov import SemiMarkovBuffer  # noqa: E402
-from training.train_config import ImitationConfig, TrainConfig, WorldConfig  # noqa: E402
+from agents.learned import choice_network  # noqa: E402
+from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored  # noqa: E402
+from agents.learned.chooser import ChooserConfig  # noqa: E402
+from training.learning.choice_world import make_world  # noqa: E402
+from training.learning.config import ImitationConfig, TrainConfig, WorldConfig  # noqa: E402
+from training.learning.imitation import Lessons, learn  # noqa: E402
+from training.learning.networks import ChoiceNetwork  # noqa: E402
+from training.learning.semi_markov import SemiMarkovBuffer  # noqa: E402
 
 CONFIG = ChooserConfig()
 

@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from training.ratios import main, ratio, table
+from training.benchmark.ratios import main, ratio, table
 
 FIELDS = ("suite", "place", "seed", "agent", "time_to_95_s", "time_s", "ate_rmse_m", "corner_mean_m", "limit_s")
 

@@ -21,11 +21,11 @@ from hypothesis import strategies as st
 
 import slam
 from slam.formats import read_tum
-from slam.landmark_map import read_landmark_map
+from slam.landmarks.database import read_landmark_map
 from tests.slam.logs_on_disk import data_folder, write_park, write_utias
-from training import replay as task
-from training import replay_report
 from training.cli import main
+from training.replay import report as replay_report
+from training.replay import run as task
 
 
 @pytest.fixture(scope="module")

@@ -17,9 +17,9 @@ from slam.formats import read_map_server, read_tum
 from tests.slam.logs_on_disk import data_folder
 from tests.slam.scans_on_disk import HEIGHT, WIDTH, carmen_lines, dpslam_lines, drive, put_lines
 from tests.training.test_replay import refused, replayed
-from training import replay as task
-from training import replay_report
 from training.cli import main
+from training.replay import report as replay_report
+from training.replay import run as task
 
 SCANS = 140  # more than twice round
 

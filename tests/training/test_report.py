@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from tests.training.test_benchmark import made_up_group
-from training.benchmark_figures import Group
-from training.benchmark_markdown import markdown
-from training.benchmark_output import Report, as_json, table, write_tables
-from training.report import page, worst_first, write_report
-from training.report_charts import band, coverage_chart, extent
+from training.benchmark.figures import Group
+from training.benchmark.markdown import markdown
+from training.benchmark.output import Report, as_json, table, write_tables
+from training.benchmark.report import page, worst_first, write_report
+from training.benchmark.report_charts import band, coverage_chart, extent
 
 VOID = {"meta", "img", "br", "line"}
 

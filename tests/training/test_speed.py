@@ -9,9 +9,9 @@ import pytest
 
 from mecanum_env import rooms
 from mecanum_env.env import make_config
-from mecanum_env.sensors import Lidar
-from training import peers
+from mecanum_env.sensing.sensors import Lidar
 from training.cli import main
+from training.studies import peers
 
 
 def _missing() -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from training.statistics import (
+from training.figures.statistics import (
     CONFIDENCE,
     compare,
     estimate,

@@ -11,14 +11,14 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
-from agents.choice import CANDIDATE, STATE
+from agents.learned.choice import CANDIDATE, STATE
 from slam.settings import from_mapping
 from training.cli import main
-from training.cli_train import CONFIGS, _read
-from training.networks import read_zip
-from training.ppo import Run, _stages
-from training.ppo_ensemble import EnsembleRun
-from training.train_config import TrainConfig, WorldConfig
+from training.cli.train import CONFIGS, _read
+from training.learning.config import TrainConfig, WorldConfig
+from training.learning.ensemble import EnsembleRun
+from training.learning.networks import read_zip
+from training.learning.ppo import Run, _stages
 
 SMALL = {
     "world": {"rooms": ["rectangular"], "shaping_s_m": 1.7},
@@ -231,8 +231,8 @@ def halved(weights):
 def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_path, capsys):
     from sb3_contrib import MaskablePPO
 
-    from agents.chooser import ChooserConfig
-    from agents.policy import PpoFrontier, load_choice_policy
+    from agents.learned.chooser import ChooserConfig
+    from agents.ppo_frontier import PpoFrontier, load_choice_policy
     from slam.settings import to_mapping
 
     drive = {"control": {"near_wall_m_s": 0.6}}
@@ -273,7 +273,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
 
 
 def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
-    from agents.policy import load_choice_policy
+    from agents.ppo_frontier import load_choice_policy
 
     config = SMALL | {
         "members": 2, "world": {"rooms": ["rectangular"]}, "imitation": {"episodes": 0},
@@ -323,7 +323,7 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
 
 
 def test_a_damaged_policy_is_named(tmp_path):
-    from agents.policy import load_choice_policy
+    from agents.ppo_frontier import load_choice_policy
 
     target = tmp_path / "mine.safetensors"
     target.write_bytes(b"nonsense")

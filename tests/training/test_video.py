@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 import mecanum_env  # noqa: F401 - registers the environments
 from mecanum_env.config import EnvConfig
-from mecanum_env.render import FRAME_SHAPE, render_frame
+from mecanum_env.views.render import FRAME_SHAPE, render_frame
 from slam.geometry import compose, exp, inverse, log
 from tests.training.episodes import explore
-from training.errors import BadInput
-from training.video import Camera, check_video, film, film_episode
+from training.runs.errors import BadInput
+from training.views.film import Camera, check_video, film, film_episode
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
@@ -164,7 +164,7 @@ def test_what_ffmpeg_cannot_write_is_said(tmp_path: Path) -> None:
 def test_ctrl_c_keeps_the_film_so_far(tmp_path: Path) -> None:
     # Sent to the whole group, as a terminal does: ffmpeg must not hear of it.
     script = (
-        "import sys, time\nimport numpy as np\nfrom training.video import film\n"
+        "import sys, time\nimport numpy as np\nfrom training.views.film import film\n"
         "with film('f.mp4', fps=10) as write:\n"
         "    for k in range(10**6):\n"
         "        write(np.full((64, 96, 3), 40 + k % 200, np.uint8))\n"

@@ -1,0 +1,189 @@
+"""Following a path with a body that can move any way: pure pursuit, with the heading turned alongside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
+from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points
+from agents.ways.cost_map import position_sigma
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import require
+from slam.types import Belief
+
+__all__ = ["ControlConfig", "PathFollower"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlConfig:
+    """Speeds, accelerations and gaps of the path follower."""
+
+    speed_share: float = 0.95  # of the robot's limit
+    near_wall_m_s: float = 0.4  # speed at the least clearance at which the robot may turn
+    open_m: float = 0.25  # clearance beyond that one from which walls no longer slow it
+    acceleration_m_s2: float = 1.2
+    deceleration_m_s2: float = 0.8  # towards the goal and into turns
+    braking_m_s2: float = 1.5  # what the safety check counts on: a slippery floor gives no more
+    turn_rate_rad_s: float = 0.8
+    turn_gain: float = 2.0  # turn rate per heading error [1/s]
+    turn_acceleration_rad_s2: float = 3.0
+    any_side: bool = False  # whichever side leads is quickest; for lidars that see all round
+    lag_s: float = 0.2  # a step and the motors' lag: how long a twist is held before braking shows
+    look_ahead_s: float = 0.7
+    min_look_ahead_m: float = 0.25
+    max_look_ahead_m: float = 0.6
+    lateral_m_s2: float = 0.5  # in turns of the path
+    align_rad: float = 0.25  # heading error within which a tight passage is entered
+    map_gap_m: float = 0.04  # between body and occupied cells, and 2σ of the position more, capped
+    max_sigma_gap_m: float = 0.05  # the planner's cap: where a path is planned, it can be driven
+    scan_gap_m: float = 0.04  # between body and what the scan hit
+    arrival_m_s: float = 0.2  # speed at which the goal is reached; what is left is braked away there
+    arrived_m: float = 0.12
+    arrived_rad: float = 0.2
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            good = f.name == "any_side" or (math.isfinite(value) and value > 0)
+            require(good, f"ControlConfig.{f.name} must be > 0, got {value}")
+        require(self.speed_share <= 1, f"ControlConfig.speed_share must be ≤ 1, got {self.speed_share}")
+
+
+class PathFollower:
+    """Turns a path into body twists, one a step, and never one whose braking distance is blocked.
+
+    The sums of a step are kernels, in :mod:`agents.driving.follow` and :mod:`agents.driving.safety`; here is what
+    lasts.
+    """
+
+    _turn_within_m = 0.0  # of the goal, where it turns to the goal's heading whatever walls are there
+
+    def __init__(self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float) -> None:
+        self._robot, self._lidar, self._step_s = robot, lidar, step_s
+        self._rim = footprint(robot)
+        self._half = 0.5 * np.array([robot.length_m, robot.width_m])
+        self.config = config
+        self.reset()
+
+    @property
+    def config(self) -> ControlConfig:
+        """Speeds, accelerations and gaps; they may be changed on the way."""
+        return self._config
+
+    @config.setter
+    def config(self, config: ControlConfig) -> None:
+        self._config = config
+        robot = self._robot
+        self._pace = Pace(
+            max_speed_m_s=config.speed_share * robot.max_speed_m_s,
+            near_wall_m_s=config.near_wall_m_s,
+            open_m=config.open_m,
+            deceleration_m_s2=config.deceleration_m_s2,
+            lag_s=config.lag_s,
+            look_ahead_s=config.look_ahead_s,
+            min_look_ahead_m=config.min_look_ahead_m,
+            max_look_ahead_m=config.max_look_ahead_m,
+            lateral_m_s2=config.lateral_m_s2,
+            turn_gain=config.turn_gain,
+            max_turn_rad_s=min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s),
+            align_rad=config.align_rad,
+            arrival_m_s=config.arrival_m_s,
+            arrived_m=config.arrived_m,
+            arrived_rad=config.arrived_rad,
+            half_length_m=0.5 * robot.length_m,
+            # A sensor that sees all round can as well be driven backwards out of a narrow place.
+            reversible=self._lidar.field_of_view_deg >= 270.0,
+            turn_within_m=self._turn_within_m,
+            any_side=config.any_side and self._lidar.field_of_view_deg >= 360.0,
+            lever_m=robot.lever_m,
+            spare_m=robot.circumscribed_radius_m - self._half_across(),
+        )
+        self._motors = Motors(
+            step_s=self._step_s,
+            acceleration_m_s2=config.acceleration_m_s2,
+            turn_acceleration_rad_s2=config.turn_acceleration_rad_s2,
+            max_speed_m_s=robot.max_speed_m_s,
+            lever_m=robot.lever_m,
+        )
+        self._guard = Guard(
+            rim=self._rim,
+            half=self._half,
+            lag_s=config.lag_s,
+            braking_m_s2=config.braking_m_s2,
+            turn_braking_rad_s2=2.0 * config.turn_acceleration_rad_s2,
+            scan_gap_m=config.scan_gap_m,
+        )
+
+    def _half_across(self) -> float:
+        """Return what the body takes up to either side of the way [m] where a long side leads, and askew."""
+        askew = self.config.align_rad
+        return float(self._half[0] * math.cos(askew) + self._half[1] * math.sin(askew))
+
+    def reset(self) -> None:
+        """Stand still, with no path."""
+        self._velocity = np.zeros(2)  # last command in the belief's frame [m/s]
+        self._turn = 0.0  # last command [rad/s]
+        self._path = np.zeros((1, 2))
+        self._arc = np.zeros(1)
+        self._heading: float | None = None
+        self._index = 0
+        self.blocked = False  # the last step wanted to move and could not
+        self.arrived = False
+        self.remaining_m = 0.0
+
+    def set_path(self, path: Array, heading: float | None) -> None:
+        """Follow ``path`` ``(n, 2)`` and end with ``heading`` [rad], or with any where it is ``None``."""
+        self._path = np.ascontiguousarray(path, dtype=np.float64)
+        self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self._path, axis=0).T))])
+        self._heading = heading
+        self._index = 0
+        self.arrived = False
+        self.remaining_m = float(self._arc[-1])
+
+    def follow(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return the next body twist ``(3,)`` [m/s, m/s, rad/s] along the path."""
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
+        velocity, turn, self._index, self.remaining_m, self.arrived = aim(
+            pose,
+            math.hypot(*self._velocity),
+            self._path,
+            self._arc,
+            self._index,
+            math.nan if self._heading is None else self._heading,
+            near,
+            self._robot.circumscribed_radius_m + gap,
+            self._pace,
+        )
+        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+
+    def drive(self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return the twist ``(3,)`` nearest to a velocity ``(2,)`` in the belief's frame that is safe."""
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
+        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+
+    def room(self, belief: Belief, points: Array) -> Array:
+        """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""
+        return local_map(belief, WINDOW_M).at(points)
+
+    def _map_gap(self, belief: Belief) -> float:
+        """Return what the body keeps from the map [m]: the more, the less sure the position is."""
+        sigma = position_sigma(belief.pose_cov)
+        return self.config.map_gap_m + min(2.0 * sigma, self.config.max_sigma_gap_m)
+
+    def _send(self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, hits: Array) -> Array:
+        """Smooth, bound and check a wanted velocity (belief frame) and turn rate; remember what goes out."""
+        sent, self._velocity, self.blocked = send(
+            velocity, turn, self._velocity, self._turn, pose, near, gap, hits, self._motors, self._guard
+        )
+        self._turn = float(sent[2])
+        return np.asarray(sent)

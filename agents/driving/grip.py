@@ -1,0 +1,119 @@
+"""How well the wheels tell the motion, learnt on the way; and a follower that drives as gently as they slip.
+
+Nobody tells the agent on what floor it drives. What the wheels claim and what the filter makes of it, with the
+landmarks' help, differ by the odometry's error: V's share of the wheels' speed (:mod:`slam.motion`), and what a
+wheel that slips adds to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.driving.control import ControlConfig, PathFollower
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.motion import OdometryNoise, twist_between
+from slam.types import Belief
+
+__all__ = ["GentleFollower", "WheelWatch"]
+
+Array = NDArray[np.float64]
+
+_MEMORY = 200.0  # steps at full weight of what was expected before any was driven
+_FORGET = 0.998  # share of the past that a step leaves: what was learnt fades over some fifty seconds
+
+
+class WheelWatch:
+    """Learns the odometry's error, as a share of the wheels' speed, from twists claimed and believed.
+
+    Parameters
+    ----------
+    robot : RobotConfig
+        Its limits scale the observation's twist; its lever turns a turn rate into a speed of the wheels.
+    step_s : float
+        Time between two observations [s].
+    share : float
+        The error that is expected before anything is driven.
+    """
+
+    def __init__(self, robot: RobotConfig, *, step_s: float, share: float) -> None:
+        self._limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])
+        self._lever, self._step_s, self._expected = robot.lever_m, step_s, share
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was learnt."""
+        speed = 0.4  # m/s: what is expected weighs as much as so many steps at this speed
+        self._driven = _MEMORY * speed**2
+        self._missed = self._driven * self._expected**2
+        self._pose: Array | None = None
+
+    @property
+    def share(self) -> float:
+        """1σ of a linear component of the twist, as a share of the wheels' speed."""
+        return math.sqrt(self._missed / self._driven)
+
+    def noise(self) -> OdometryNoise:
+        """Return V with the share that was learnt."""
+        return OdometryNoise(
+            lever_m=self._lever, speed_share=self.share, turn_share_rad_m=self.share / self._lever
+        )
+
+    def look(self, observation: Mapping[str, Any] | None, belief: Belief) -> None:
+        """Take in one step: the observation's ``twist``, where there is one, and where the belief has moved."""
+        before, self._pose = self._pose, np.array(belief.pose, dtype=np.float64)
+        if before is None or not isinstance(observation, Mapping) or "twist" not in observation:
+            return
+        claimed = np.asarray(observation["twist"], dtype=np.float64) * self._limits
+        missed = claimed - twist_between(before, self._pose, self._step_s)
+        wheels = np.array([1.0, 1.0, self._lever])
+        self._driven = _FORGET * self._driven + float(np.sum((claimed * wheels) ** 2))
+        # Three components of like variance. A jump of the whole estimate, a loop closed, is no slip.
+        error = float(np.sum((missed * wheels) ** 2)) / 3.0
+        self._missed = _FORGET * self._missed + min(error, 0.25)
+
+
+class GentleFollower(PathFollower):
+    """Drives, speeds up and brakes as gently as a slippery floor asks for, once the wheels have told of it."""
+
+    def __init__(
+        self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float, gentle_m_s2: float,
+        gentle_speed_share: float = 1.0,
+    ) -> None:  # fmt: skip
+        self._usual, self._gentle, self._gentle_share = config, gentle_m_s2, gentle_speed_share
+        self._sent = (np.zeros(2), 0.0)
+        super().__init__(config, robot=robot, lidar=lidar, step_s=step_s)
+
+    def stand(self) -> None:
+        """Take it that the robot stands still."""
+        self.reset()
+        self._sent = (np.zeros(2), 0.0)
+
+    def go_gently(self, share: float) -> None:
+        """Take this much (0 … 1) of the way from the usual speed and acceleration to the gentle ones."""
+        usual = self._usual
+
+        def between(value: float, gentle: float) -> float:
+            return value + share * (min(value, gentle) - value)
+
+        self.config = replace(
+            usual,
+            speed_share=between(usual.speed_share, self._gentle_share),
+            acceleration_m_s2=between(usual.acceleration_m_s2, self._gentle),
+            deceleration_m_s2=between(usual.deceleration_m_s2, self._gentle),
+        )
+
+    def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return the next twist ``(3,)`` on the way to a stand: wheels stopped at once slide, and tell nothing."""
+        self._velocity, self._turn = self._sent
+        return self.drive(np.zeros(2), 0.0, observation, belief)
+
+    def _send(self, velocity: Array, turn: float, *rest: Any) -> Array:
+        sent = super()._send(velocity, turn, *rest)
+        self._sent = (self._velocity, self._turn)
+        return sent

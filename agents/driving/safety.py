@@ -1,0 +1,240 @@
+"""The last check before a twist goes out: the body, braking from it, must come onto nothing.
+
+Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agents.ways.cost_map import clearance
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.types import Belief
+
+__all__ = [
+    "Guard",
+    "LocalMap",
+    "body_gaps",
+    "clearance_at",
+    "footprint",
+    "local_map",
+    "safe_twist",
+    "scan_points",
+]
+
+Array = NDArray[np.float64]
+
+POSES = 8  # of a predicted motion, the present one included
+_SPEEDS = (1.0, 0.7, 0.45, 0.25, 0.1)  # shares of the wanted twist that are tried
+_SIDESTEPS = (0.6, -0.6, 1.2, -1.2)  # [rad] off the wanted direction, tried after that
+_SIDESTEP_M_S = 0.12
+
+
+# Named tuples, for these go into kernels as they are.
+class LocalMap(NamedTuple):
+    """Clearance around the robot: the distance [m] from each fine cell's centre to the nearest occupied edge."""
+
+    clearance: NDArray[np.float32]  # (rows, cols) [m]
+    origin: Array  # (2,) lower-left corner of cell (0, 0) in the belief's frame [m]
+    resolution: float  # [m]
+
+    def at(self, points: Array) -> Array:
+        """Return the clearance [m] at points ``(n, 2)``; beyond the window that of its rim."""
+        return _clearances(self, np.atleast_2d(np.asarray(points, dtype=np.float64)))
+
+
+class Guard(NamedTuple):
+    """What the check knows of the body: its outline and how it brakes."""
+
+    rim: Array  # (n, 2) points of the outline [m], in the body frame
+    half: Array  # (2,) half the length and width [m]
+    lag_s: float  # how long a twist is held before braking shows
+    braking_m_s2: float
+    turn_braking_rad_s2: float
+    scan_gap_m: float  # between the body and what the scan hit
+
+
+def local_map(belief: Belief, radius_m: float) -> LocalMap:
+    """Return the clearance within a square of this half side [m] around the robot."""
+    grid = belief.grid
+    resolution, (rows, cols) = grid.resolution, grid.shape
+    row0, col0 = grid.lattice_origin
+    x, y = float(belief.pose[0]), float(belief.pose[1])
+    row, col = math.floor(y / resolution) - row0, math.floor(x / resolution) - col0
+    span = math.ceil(radius_m / resolution)
+    low_r, high_r = max(row - span, 0), min(row + span + 1, rows)
+    low_c, high_c = max(col - span, 0), min(col + span + 1, cols)
+    if high_r <= low_r or high_c <= low_c:  # off the map: nothing is known to be near
+        low_r, high_r, low_c, high_c = 0, 1, 0, 1
+    origin = np.array([grid.origin[0] + low_c * resolution, grid.origin[1] + low_r * resolution])
+    return LocalMap(clearance(grid.log_odds[low_r:high_r, low_c:high_c], resolution), origin, resolution)
+
+
+def footprint(robot: RobotConfig, spacing_m: float = 0.05) -> Array:
+    """Return points ``(n, 2)`` [m] along the body's rim, in the body frame."""
+    half_l, half_w = 0.5 * robot.length_m, 0.5 * robot.width_m
+    along = np.linspace(-half_l, half_l, math.ceil(robot.length_m / spacing_m) + 1)
+    across = np.linspace(-half_w, half_w, math.ceil(robot.width_m / spacing_m) + 1)[1:-1]
+    sides = [np.stack([along, np.full_like(along, y)], axis=1) for y in (-half_w, half_w)]
+    ends = [np.stack([np.full_like(across, x), across], axis=1) for x in (-half_l, half_l)]
+    return np.ascontiguousarray(np.vstack(sides + ends))
+
+
+def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig, *, within_m: float = 2.0) -> Array:
+    """Return what the scan in an observation hit ``(n, 2)`` [m], in the body frame; empty where there is none.
+
+    Raises
+    ------
+    ValueError
+        If the scan has another number of beams than the lidar.
+    """
+    if not isinstance(observation, Mapping) or "scan" not in observation:
+        return np.zeros((0, 2))
+    share = np.asarray(observation["scan"], dtype=np.float64)
+    if share.shape != (lidar.beams,):
+        raise ValueError(
+            f"the scan has shape {share.shape}, the agent's lidar {lidar.beams} beams: "
+            "give agents.make the environment's lidar"
+        )
+    return _hits(share, _directions(lidar), lidar.offset_m, lidar.range_min_m, lidar.range_max_m, within_m)
+
+
+@lru_cache(maxsize=16)
+def _directions(lidar: LidarConfig) -> Array:
+    """Return the unit vectors ``(beams, 2)`` along the beams, in the body frame."""
+    angles = lidar.angle_min + lidar.angle_increment * np.arange(lidar.beams)
+    return np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _hits(
+    share: Array, directions: Array, offset_m: float, range_min_m: float, range_max_m: float, within_m: float
+) -> Array:
+    points = np.empty((len(share), 2))
+    count = 0
+    for i in range(len(share)):
+        reach = share[i] * range_max_m
+        # Nothing returned at 1; a return below the least range is no return (NaN compares false).
+        if share[i] < 1.0 and reach > range_min_m and reach < within_m:
+            points[count, 0] = offset_m + reach * directions[i, 0]
+            points[count, 1] = reach * directions[i, 1]
+            count += 1
+    return points[:count]
+
+
+@njit(cache=True, nogil=True)
+def safe_twist(twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: Array, guard: Guard) -> Array:
+    """Return the first of a twist ``(3,)`` and its tamer kin whose braking distance is clear; zero if none.
+
+    ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] scan points in the body frame.
+    """
+    kin = _tamer_kin(twist)
+    for k in range(len(kin)):
+        candidate: Array = kin[k]
+        if not candidate.any():
+            continue
+        map_now, map_ahead, scan_now, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
+        # Already too near: any motion that brings it no nearer is allowed, or it would never get away.
+        if map_ahead >= min(map_gap, map_now - 0.002) and scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002):
+            return candidate
+    return np.zeros(3)
+
+
+@njit(cache=True, nogil=True)
+def _tamer_kin(twist: Array) -> Array:
+    """Return what is tried for a twist ``(14, 3)``, in turn: slower, without its turn, turning only, sideways."""
+    kin = np.zeros((14, 3))
+    for k in range(5):
+        kin[k] = _SPEEDS[k] * twist
+    for k in range(4):
+        kin[5 + k, :2] = kin[k, :2]
+    kin[9, 2] = twist[2]
+    slow = _SIDESTEP_M_S * twist[:2] / max(math.hypot(twist[0], twist[1]), _SIDESTEP_M_S)
+    for k in range(4):
+        c, s = math.cos(_SIDESTEPS[k]), math.sin(_SIDESTEPS[k])
+        kin[10 + k, 0], kin[10 + k, 1] = c * slow[0] - s * slow[1], s * slow[0] + c * slow[1]
+    return kin
+
+
+@njit(cache=True, nogil=True)
+def body_gaps(
+    twist: Array, pose: Array, near: LocalMap, hits: Array, guard: Guard
+) -> tuple[float, float, float, float]:
+    """Return gaps [m] between the body and what the map and the scan show: now and, at the least, braking.
+
+    The twist ``(3,)`` is held for the guard's lag, then shed as fast as it brakes speed and turn, whichever takes
+    longer. ``hits`` are scan points in the body frame.
+
+    Returns
+    -------
+    tuple
+        Gap to the map now, gap to the map ahead, gap to the scan now, gap to the scan ahead.
+    """
+    lag, rim, half = guard.lag_s, guard.rim, guard.half
+    speed = math.hypot(twist[0], twist[1])
+    braking = max(speed / guard.braking_m_s2, abs(twist[2]) / guard.turn_braking_rad_s2)
+    total = lag + braking
+    map_now = map_ahead = scan_now = scan_ahead = np.inf
+    x, y, theta = 0.0, 0.0, 0.0  # of the predicted body in the present body frame
+    last = 0.0
+    heading = pose[2]
+    cos_b, sin_b = math.cos(heading), math.sin(heading)
+    for k in range(POSES):
+        t = total * k / (POSES - 1)
+        # Distance covered so far, as seconds at the full twist: uniform braking after the hold.
+        late = max(t - lag, 0.0)
+        held = min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0)
+        dt, last = held - last, held
+        middle = theta + 0.5 * dt * twist[2]
+        x += dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
+        y += dt * (math.sin(middle) * twist[0] + math.cos(middle) * twist[1])
+        theta += dt * twist[2]
+        c, s = math.cos(theta), math.sin(theta)
+        map_gap = np.inf
+        for i in range(rim.shape[0]):
+            bx, by = x + c * rim[i, 0] - s * rim[i, 1], y + s * rim[i, 0] + c * rim[i, 1]
+            wx, wy = pose[0] + cos_b * bx - sin_b * by, pose[1] + sin_b * bx + cos_b * by
+            map_gap = min(map_gap, clearance_at(near, wx, wy))
+        scan_gap = np.inf
+        for i in range(hits.shape[0]):
+            dx, dy = hits[i, 0] - x, hits[i, 1] - y
+            out_x = abs(c * dx + s * dy) - half[0]
+            out_y = abs(-s * dx + c * dy) - half[1]
+            out = max(out_x, out_y)
+            if out < scan_gap:  # few are: the root is taken for them alone
+                scan_gap = min(scan_gap, math.hypot(out_x, out_y) if out_x > 0.0 and out_y > 0.0 else out)
+        if k == 0:
+            map_now, scan_now = map_gap, scan_gap
+        else:
+            map_ahead, scan_ahead = min(map_ahead, map_gap), min(scan_ahead, scan_gap)
+    return map_now, map_ahead, scan_now, scan_ahead
+
+
+@njit(cache=True, nogil=True)
+def clearance_at(near: LocalMap, x: float, y: float) -> float:
+    """Return the clearance [m] at a point, bilinear between cell centres; beyond the window that of its rim."""
+    field = near.clearance
+    rows, cols = field.shape
+    u = min(max((x - near.origin[0]) / near.resolution - 0.5, 0.0), cols - 1.0)
+    v = min(max((y - near.origin[1]) / near.resolution - 0.5, 0.0), rows - 1.0)
+    col, row = min(int(u), max(cols - 2, 0)), min(int(v), max(rows - 2, 0))
+    fu, fv = u - col, v - row
+    next_c, next_r = min(col + 1, cols - 1), min(row + 1, rows - 1)
+    low = field[row, col] * (1.0 - fu) + field[row, next_c] * fu
+    high = field[next_r, col] * (1.0 - fu) + field[next_r, next_c] * fu
+    return float(low * (1.0 - fv) + high * fv)
+
+
+@njit(cache=True, nogil=True)
+def _clearances(near: LocalMap, points: Array) -> Array:
+    out = np.empty(len(points))
+    for i in range(len(points)):
+        out[i] = clearance_at(near, points[i, 0], points[i, 1])
+    return out

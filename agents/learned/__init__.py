@@ -1,0 +1,5 @@
+"""Learned choices: what trained policies see, and their networks in NumPy.
+
+``choice`` with ``choice_network`` and ``chooser`` are ``ppo-frontier``'s, ``drive_network`` and ``drive_plan``
+those of ``ppo``, ``station_network`` that of ``learned-tour``; ``policy_files`` reads them all.
+"""

@@ -1,0 +1,158 @@
+"""The network that scores candidates, in NumPy: what was trained runs without PyTorch.
+
+Tokens, one a candidate, look at each other by attention (Vaswani et al., 2017), weaker the farther apart their
+view points lie (a bias linear in the distance, as in Press et al., "Train short, test long", ICLR 2022). There are
+no positions in the row of candidates: permuted candidates get permuted scores, and any number of them will do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.learned.choice import Choice, mirrored
+
+__all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
+
+Floats = NDArray[np.float32]
+
+
+class ChoiceNetwork:
+    """``training.learning.networks.ChoiceNetwork``, forward only.
+
+    Parameters
+    ----------
+    weights : mapping
+        Name to array, as PyTorch names them.
+    heads : int
+        Of the attention.
+
+    Raises
+    ------
+    ValueError
+        Where a weight is missing or has another shape than the others ask for.
+    """
+
+    def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
+        self._weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
+        self._heads = heads
+        self._layers = len({name.split(".")[1] for name in weights if name.startswith("layers.")})
+        self._check()
+
+    def scores(self, choice: Choice) -> Floats:
+        """Return the score of each candidate ``(m,)``; the policy takes the highest."""
+        tokens = self._tokens(choice)
+        return np.asarray(self._linear("score", tokens)[:, 0])
+
+    def value(self, choice: Choice) -> float:
+        """Return what the choice as a whole is worth."""
+        tokens = self._tokens(choice)
+        summary = np.concatenate([tokens.mean(axis=0), tokens.max(axis=0)])
+        return float(self._linear("value_2", np.maximum(self._linear("value_1", summary), 0.0))[0])
+
+    def _tokens(self, choice: Choice) -> Floats:
+        patches = choice.patches.reshape(len(choice.patches), -1).astype(np.float32) / np.float32(255.0)
+        x = (
+            self._linear("row", choice.candidates)
+            + self._linear("patch_2", np.maximum(self._linear("patch_1", patches), 0.0))
+            + self._linear("state", choice.state)
+        )
+        x = self._linear("token", np.maximum(x, 0.0))
+        for k in range(self._layers):
+            x = self._attend(f"layers.{k}.", x, choice.distances)
+        return self._normal("norm", x)
+
+    def _attend(self, layer: str, x: Floats, distances: Floats) -> Floats:
+        m, width = x.shape
+        qkv = self._linear(layer + "qkv", self._normal(layer + "norm_1", x))
+        q, key, v = qkv.reshape(m, 3, self._heads, -1).transpose(1, 2, 0, 3)
+        reach = np.logaddexp(np.float32(0.0), self._weights[layer + "reach"])
+        score = q @ key.transpose(0, 2, 1) / np.float32(math.sqrt(width // self._heads))
+        score = score - reach[:, None, None] * distances
+        score = np.exp(score - score.max(axis=-1, keepdims=True))
+        score /= score.sum(axis=-1, keepdims=True)
+        x = x + self._linear(layer + "out", (score @ v).transpose(1, 0, 2).reshape(m, width))
+        up = np.maximum(self._linear(layer + "up", self._normal(layer + "norm_2", x)), 0.0)
+        return np.asarray(x + self._linear(layer + "down", up))
+
+    def _linear(self, name: str, x: Floats) -> Floats:
+        return np.asarray(x @ self._weights[name + ".weight"].T + self._weights[name + ".bias"])
+
+    def _normal(self, name: str, x: Floats) -> Floats:
+        centred = x - x.mean(axis=-1, keepdims=True)
+        scale = np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(1e-5))
+        return np.asarray(centred / scale * self._weights[name + ".weight"] + self._weights[name + ".bias"])
+
+    def _check(self) -> None:
+        try:
+            width = len(self._weights["norm.bias"])
+            wanted: dict[str, tuple[int, ...]] = {
+                "patch_2.weight": (width, 2 * width), "token.weight": (width, width), "norm.weight": (width,),
+                "score.weight": (1, width),
+                "score.bias": (1,), "value_1.weight": (width, 2 * width), "value_2.weight": (1, width),
+            }  # fmt: skip
+            for k in range(self._layers):
+                wanted |= {
+                    f"layers.{k}.qkv.weight": (3 * width, width), f"layers.{k}.out.weight": (width, width),
+                    f"layers.{k}.up.weight": (2 * width, width), f"layers.{k}.down.weight": (width, 2 * width),
+                    f"layers.{k}.reach": (self._heads,),
+                }  # fmt: skip
+            for name, shape in wanted.items():
+                found: Any = self._weights[name].shape
+                if found != shape:
+                    raise ValueError(f"weight {name} has the shape {found}, expected {shape}")
+        except KeyError as error:
+            raise ValueError(f"weight {error.args[0]} is missing") from error
+
+
+class ChoiceEnsemble:
+    """Networks that were trained apart and choose together: what one learned by chance the others outvote.
+
+    Each looks twice, the second time in a mirror. What is best does not depend on left and right, what was learned
+    does a little.
+
+    Parameters
+    ----------
+    weights : mapping
+        ``members.0.`` and so on before the names of each network's own; or those of a single one.
+    heads : int
+        Of the attention.
+
+    Raises
+    ------
+    ValueError
+        As for :class:`ChoiceNetwork`.
+    """
+
+    def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
+        self.members = [ChoiceNetwork(own, heads=heads) for own in apart(weights)]
+
+    def scores(self, choice: Choice) -> Floats:
+        """Return the mean of the log-probabilities of each candidate ``(m,)``, of all networks and both views."""
+        views = choice, mirrored(choice)
+        return np.asarray(np.mean([_log_softmax(m.scores(view)) for m in self.members for view in views], axis=0))
+
+
+def joined(members: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
+    """Return the weights of several networks as :class:`ChoiceEnsemble` takes them; a single one's as they are."""
+    if len(members) == 1:
+        return dict(members[0])
+    return {f"members.{k}.{name}": value for k, own in enumerate(members) for name, value in own.items()}
+
+
+def apart(weights: Mapping[str, Floats]) -> list[dict[str, Floats]]:
+    """Return the weights of each network of an ensemble, or of the only one."""
+    count = len({name.split(".")[1] for name in weights if name.startswith("members.")})
+    if count == 0:
+        return [dict(weights)]
+    starts = [f"members.{k}." for k in range(count)]
+    return [{n.removeprefix(start): v for n, v in weights.items() if n.startswith(start)} for start in starts]
+
+
+def _log_softmax(scores: Floats) -> Floats:
+    above = scores - scores.max()
+    return np.asarray(above - np.log(np.exp(above).sum()))

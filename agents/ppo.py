@@ -1,0 +1,154 @@
+"""``ppo``: a trained policy that drives, from the observation straight to the body twist.
+
+It was trained for the youBot and its lidar; another body's twists are fractions of another's limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Agent, Goal
+from agents.learned.drive_network import BEAMS, RANGE_M, DriveNetwork, Plan, PlanSettings
+from agents.learned.policy_files import read_policy
+from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.observation import draw_maps
+from slam import geometry
+from slam.grids.occupancy import FREE
+from slam.settings import from_mapping, require
+from slam.types import Belief
+
+__all__ = ["Ppo", "PpoConfig", "load_drive_policy"]
+
+Array = NDArray[np.float64]
+
+FORMAT = "mecanum-slam drive policy 1"
+SHIPPED = Path(__file__).parent / "policies" / "ppo.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoConfig:
+    """Which policy."""
+
+    policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
+    patience_s: float = 30.0  # with nothing new in sight, until the place is held for explored
+    new_m2: float = 0.3  # what counts for new
+
+    def __post_init__(self) -> None:
+        require(self.patience_s > 0 and self.new_m2 > 0, "PpoConfig.patience_s and new_m2 must be > 0")
+
+
+def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
+    """Read a policy: the network, and what the JSON file says of its training. Neither file can run code.
+
+    Raises
+    ------
+    ValueError
+        For a missing or damaged file, or one of another format; the message names it.
+    """
+    weights, described = read_policy(path, FORMAT)
+    try:
+        settings = PlanSettings(**{key: float(value) for key, value in described["planning"].items()})
+        network = DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path}: {error}") from error
+    return network, described
+
+
+class Ppo(Agent):
+    """Sends what the policy's network says, until nothing new has come in sight for a while."""
+
+    def __init__(
+        self,
+        config: PpoConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
+        settings = from_mapping(PpoConfig, config)
+        self.policy_path = Path(settings.policy or SHIPPED)
+        self._network, self.about = load_drive_policy(self.policy_path)
+        self._settings = settings
+        self._forget()
+
+    def _forget(self) -> None:
+        self._sent = np.zeros(3, np.float32)
+        self._time = self._news_at = 0.0
+        self._known_m2 = 0.0
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; nothing is drawn at random, and of the past only the last action is known."""
+        super().reset(belief, seed)
+        self._forget()
+        self._status = "driving"
+
+    def choose(self, belief: Belief) -> Goal:
+        """Return the way that the network's planning layer sees on the belief's maps."""
+        return _goal(self._network.plan(draw_maps(belief.grid, belief.pose)), belief)
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the network's action; what the observation lacks is drawn from the belief."""
+        if self._done(belief):
+            self._sent, self._goal = np.zeros(3, np.float32), None
+            return self._sent.copy()
+        seen = self._complete(observation, belief)
+        way = self._network.plan(seen)
+        self._goal = _goal(way, belief)
+        self._sent = self._network.twist(self._network.inputs(seen, way))
+        return self._sent.copy()
+
+    def _done(self, belief: Belief) -> bool:
+        """Whether nothing new has been seen for long; looked after once a second."""
+        step = round(self._time / self._step_s)
+        self._time += self._step_s
+        if step % max(round(1.0 / self._step_s), 1) == 0:
+            known = float(np.count_nonzero(belief.grid.classes() == FREE)) * belief.grid.resolution**2
+            if known >= self._known_m2 + self._settings.new_m2:
+                self._known_m2, self._news_at = known, self._time
+            self._status = "covered" if self._time - self._news_at > self._settings.patience_s else "driving"
+        return self.ended
+
+    def _complete(self, observation: Mapping[str, Any] | None, belief: Belief) -> dict[str, Any]:
+        """Return an observation in which all is there, and the scan is one of the lidar that was trained with."""
+        given = dict(observation or {})
+        seen: dict[str, Any] = {} if "map_local" in given else draw_maps(belief.grid, belief.pose)
+        seen |= {
+            "scan": np.ones(BEAMS, np.float32), "landmarks": np.zeros((1, 6), np.float32),
+            "pose_cov": np.asarray(belief.pose_cov)[np.triu_indices(3)].astype(np.float32), "twist": self._sent,
+            "progress": np.zeros(2, np.float32),
+        }  # fmt: skip
+        if "scan" in given:
+            given["scan"] = self._scan(np.asarray(given["scan"], np.float32))
+        return seen | given if "map_local" in given else seen | {"scan": given.get("scan", seen["scan"])}
+
+    def _scan(self, scan: NDArray[np.float32]) -> NDArray[np.float32]:
+        lidar = self._lidar
+        if scan.shape != (lidar.beams,):
+            raise ValueError(
+                f"the scan has shape {scan.shape}, the agent's lidar {lidar.beams} beams: "
+                "give agents.make the environment's lidar"
+            )
+        if lidar.beams == BEAMS and lidar.field_of_view_deg == 360.0 and lidar.range_max_m == RANGE_M:
+            return scan
+        angles = -math.pi + np.arange(BEAMS) * (2.0 * math.pi / BEAMS)
+        nearest = np.round((angles - lidar.angle_min) / lidar.angle_increment).astype(np.int64)
+        inside = (nearest >= 0) & (nearest < lidar.beams)
+        out = np.ones(BEAMS, np.float32)
+        hit = scan[np.where(inside, nearest, 0)]
+        out[inside & (hit < 1.0)] = np.minimum(hit * lidar.range_max_m / RANGE_M, 1.0)[inside & (hit < 1.0)]
+        return out
+
+
+def _goal(way: Plan, belief: Belief) -> Goal:
+    pose = np.asarray(belief.pose, dtype=np.float64)
+    path: Array = pose[:2] + way.path @ geometry.rotation(float(pose[2])).T
+    along = path[-1] - path[-2]
+    return Goal(pose=np.array([*path[-1], math.atan2(along[1], along[0])]), path=path)

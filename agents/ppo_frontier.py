@@ -1,0 +1,95 @@
+"""A trained policy as an agent: the network's weights beside a JSON file that says where they come from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.base import Goal
+from agents.learned.choice import CANDIDATE, STATE
+from agents.learned.choice_network import ChoiceEnsemble
+from agents.learned.chooser import Chooser, ChooserConfig
+from agents.learned.policy_files import read_policy
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.settings import from_mapping
+from slam.types import Belief
+
+__all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
+
+_FORMAT = "mecanum-slam choice policy 1"
+SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PpoFrontierConfig:
+    """Which policy."""
+
+    policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
+    driver: Mapping[str, Any] = field(default_factory=dict)  # laid over the ChooserConfig that it was trained with
+
+
+def load_choice_policy(path: Path) -> tuple[ChoiceEnsemble, ChooserConfig, dict[str, Any]]:
+    """Read a policy: its networks, the explorer it was trained with, and what the JSON file says of its training.
+
+    Neither file can run code.
+
+    Raises
+    ------
+    ValueError
+        For a missing or damaged file, or one of another format; the message names it.
+    """
+    weights, described = read_policy(path, _FORMAT)
+    columns = [list(CANDIDATE), list(STATE)]
+    if [described.get("candidate"), described.get("state")] != columns:
+        raise ValueError(f"policy {path} was trained on other columns than this version shows; train it anew")
+    try:
+        network = ChoiceEnsemble(weights, heads=int(described["heads"]))
+        driver = from_mapping(ChooserConfig, described["driver"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path}: {error}") from error
+    return network, driver, described
+
+
+class PpoFrontier(Chooser):
+    """Goes where a policy trained with PPO on ``mecanum_env/ExploreFrontier-v0`` says.
+
+    Attributes
+    ----------
+    policy_path : Path
+        The weights; what belongs to them lies beside, with the suffix ``.json``.
+    about : dict
+        What the policy's JSON file says of its training: command, configuration, steps, hours, curve.
+    """
+
+    def __init__(
+        self,
+        config: PpoFrontierConfig | Mapping[str, Any] | None = None,
+        *,
+        robot: RobotConfig | Mapping[str, Any] | str | None = None,
+        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
+        step_s: float = 0.1,
+    ) -> None:
+        settings = from_mapping(PpoFrontierConfig, config)
+        self.policy_path = Path(settings.policy or SHIPPED)
+        self._network, driver, self.about = load_choice_policy(self.policy_path)
+        driver = from_mapping(ChooserConfig, settings.driver, base=driver)
+        super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
+
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
+        choice = self.survey(belief)
+        if choice is not None:
+            self.take(choice, int(np.argmax(self._network.scores(choice))))
+        return super().choose(belief)
+
+
+def policy_description(network_heads: int, driver: Mapping[str, Any], **training: Any) -> dict[str, Any]:
+    """Return what the JSON file beside the weights must say."""
+    return {
+        "format": _FORMAT, "heads": network_heads, "candidate": list(CANDIDATE), "state": list(STATE),
+        "driver": dict(driver), **training,
+    }  # fmt: skip

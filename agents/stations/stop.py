@@ -1,0 +1,139 @@
+"""A robot that stands on a station of its lattice: what it makes of its belief there.
+
+Shared by the agents that choose among stations with :mod:`agents.stations.survey`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Goal
+from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
+from slam.grids.occupancy import FREE, UNKNOWN
+from slam.settings import require
+from slam.types import Belief
+
+__all__ = ["StationRound", "StationStop", "StationsConfig"]
+
+Array = NDArray[np.float64]
+Cell = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StationsConfig:
+    """The lattice that the robot hops on, where it is no robot that drives anywhere and looks all the while."""
+
+    spacing_m: float = 0.0  # between stations, through the start; 0: there are none
+    hop: int = 2  # stations a hop goes at most along each axis
+    reach_m: float = 12.0  # from which a piece of frontier is looked at
+
+    def __post_init__(self) -> None:
+        require(math.isfinite(self.spacing_m) and self.spacing_m >= 0, "StationsConfig.spacing_m must be ≥ 0")
+        require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
+        require(math.isfinite(self.reach_m) and self.reach_m > 0, "StationsConfig.reach_m must be > 0")
+
+
+@dataclass(frozen=True, eq=False)
+class StationStop:
+    """Where the robot stands, and what there is to do. Cells are those of ``known``."""
+
+    known: NDArray[np.int8]  # (rows, cols) classes of what is known, with a margin
+    visited: NDArray[np.bool_]  # (rows, cols) cells that were looked from
+    corner: Cell  # lattice row and column of the first cell
+    first: Cell  # the station that the lattice goes through
+    robot: Cell
+    resolution: float  # [m]
+    found: Survey
+
+    def goal(self, station: int, belief: Belief) -> Goal:
+        """Return a station as a goal."""
+        at = self._point(self.found.cells[station])
+        return Goal(pose=np.array([*at, belief.pose[2]]), path=np.array([belief.pose[:2], at]))
+
+    def frontiers(self) -> Array:
+        """Return the pieces of frontier ``(m, 2)`` [m]."""
+        return self._point(self.found.pieces)
+
+    def box(self, extent: tuple[float, ...]) -> tuple[int, int, int, int]:
+        """Return the first row and column of a rectangle of the frame [m], and the first beyond it."""
+        x0, y0, x1, y1 = (round(value / self.resolution) for value in extent)
+        return y0 - self.corner[0], x0 - self.corner[1], y1 - self.corner[0], x1 - self.corner[1]
+
+    def _point(self, cells: NDArray[np.int64]) -> Array:
+        return np.asarray((cells[..., ::-1] + np.array(self.corner[::-1]) + 0.5) * self.resolution)
+
+
+class StationRound:
+    """A robot's round over the stations of a lattice, in the course of an episode.
+
+    Parameters
+    ----------
+    belief
+        At the start, which is a station.
+    config
+        The lattice.
+    """
+
+    def __init__(self, belief: Belief, config: StationsConfig) -> None:
+        self._config = config
+        self._start = np.array(belief.pose[:2], dtype=np.float64)
+        self._looked_from: list[Array] = []
+
+    def looked(self, belief: Belief) -> None:
+        """Take note that the sensor looked from the belief's pose."""
+        self._looked_from.append(np.array(belief.pose[:2], dtype=np.float64))
+
+    def stop(self, belief: Belief) -> StationStop | None:
+        """Return what there is to do, ``None`` where the robot stands on no station.
+
+        Only lattices of :data:`agents.stations.survey.STRIDE` cells of the grid, and hops of
+        :data:`agents.stations.survey.HOP` stations, are known here.
+        """
+        resolution = belief.grid.resolution
+        if round(self._config.spacing_m / resolution) != STRIDE or self._config.hop != HOP:
+            return None
+        known, corner = _aligned(belief)
+        robot, first = (_cell_of(at, resolution, corner) for at in (belief.pose, self._start))
+        if not _is_free(known, robot) or any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
+            return None
+        visited = np.zeros(known.shape, dtype=np.bool_)
+        for position in self._looked_from:
+            cell = _cell_of(position, resolution, corner)
+            if _is_free(known, cell):
+                visited[cell] = True
+        pieces = no_pieces(known.shape)
+        find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
+        found = survey(known, pieces, visited, first, robot, resolution, self._config.reach_m / resolution)
+        return StationStop(known, visited, corner, first, robot, resolution, found)
+
+
+def _aligned(belief: Belief) -> tuple[NDArray[np.int8], Cell]:
+    """Return the classes of what is known, with a margin, and the lattice row and column of its first cell.
+
+    The corner lies on a multiple of :data:`VOXEL`, wherever the grid begins: squares of frontier are the frame's.
+    """
+    classes = belief.grid.classes()
+    rows, cols = (np.flatnonzero((classes != UNKNOWN).any(axis=axis)) for axis in (1, 0))
+    row0, col0 = belief.grid.lattice_origin
+    low = [row0 + int(rows[0]), col0 + int(cols[0])]
+    corner = [(value - 1) // VOXEL * VOXEL for value in low]  # at least one unknown cell all round
+    part = classes[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    pad = [(value - own, STRIDE) for value, own in zip(low, corner, strict=True)]
+    return np.pad(part, pad, constant_values=UNKNOWN), (corner[0], corner[1])
+
+
+def _is_free(known: NDArray[np.int8], cell: Cell) -> bool:
+    """Whether a cell, which may lie beyond what is known, is known to be free."""
+    inside = all(0 <= value < size for value, size in zip(cell, known.shape, strict=True))
+    return inside and bool(known[cell] == FREE)
+
+
+def _cell_of(pose: NDArray[np.float64], resolution: float, corner: Cell) -> Cell:
+    return (
+        int(np.floor(pose[1] / resolution)) - corner[0],
+        int(np.floor(pose[0] / resolution)) - corner[1],
+    )

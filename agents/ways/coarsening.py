@@ -1,0 +1,191 @@
+"""From the belief's fine grid to the planning grid: in few passes, for a large map has millions of cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
+
+__all__ = ["FAR_M", "Blocks", "coarsen", "known_extent", "to_walls"]
+
+FAR_M = 10.0
+"""Clearances [m] beyond this say nothing more."""
+
+_LOG_ODDS = np.arange(256, dtype=np.uint8).view(np.int8)
+# Classes are ranges of log-odds: free up to here, and occupied from here.
+_FREE_MOST = int(_LOG_ODDS[CLASS_OF == FREE].max())
+_OCCUPIED_LEAST = int(_LOG_ODDS[CLASS_OF == OCCUPIED].min())
+_NO_WALL = (CLASS_OF != OCCUPIED).astype(np.uint8)
+
+# Three counts in one number: of free fine cells, of occupied ones, and of suspect ones.
+_FIELD = 20  # bits
+_COUNT = (1 << _FIELD) - 1
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Blocks of fine cells, and a ring of unknown ones around them."""
+
+    classes: NDArray[np.int8]  # (rows, cols): occupied if any fine cell is, free if most are
+    clearance: NDArray[np.float32]  # (rows, cols) [m] from the block's centre to the nearest occupied edge
+    suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
+
+
+def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Return the box of what is known or was visited: first row and column, and those beyond the last.
+
+    Of an empty grid the first are beyond all.
+    """
+    row0, col0, row1, col1 = _box(log_odds, visited)
+    return int(row0), int(col0), int(row1), int(col1)
+
+
+def coarsen(
+    log_odds: NDArray[np.int8],
+    visited: NDArray[np.uint8],
+    *,
+    resolution: float,
+    factor: int,
+    pads: tuple[int, int],
+) -> Blocks:
+    """Return blocks of ``factor`` × ``factor`` cells; the corner lies ``pads`` (row, column) into the first."""
+    rows = -(-(log_odds.shape[0] + pads[0]) // factor) + 2
+    cols = -(-(log_odds.shape[1] + pads[1]) // factor) + 2
+    classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
+    clearance = np.full((rows, cols), FAR_M, dtype=np.float32)
+    suspect = np.zeros((rows, cols), dtype=np.bool_)
+    _fill(
+        log_odds, visited, to_walls(log_odds), np.float32(resolution), np.float32(FAR_M), factor,
+        pads[0], pads[1], classes, clearance, suspect,
+    )  # fmt: skip
+    return Blocks(classes, clearance, suspect)
+
+
+def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
+    """Return each cell's distance to the nearest occupied cell's centre, in cells, infinite without any."""
+    free_of_wall = cv2.LUT(log_odds.view(np.uint8), _NO_WALL)
+    if cv2.countNonZero(free_of_wall) == free_of_wall.size:
+        return np.full(log_odds.shape, np.inf, dtype=np.float32)
+    return np.asarray(cv2.distanceTransform(free_of_wall, cv2.DIST_L2, cv2.DIST_MASK_5), dtype=np.float32)
+
+
+@njit(cache=True, nogil=True)
+def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Look at each row only outside the columns that are in the box already."""
+    rows, cols = log_odds.shape
+    row0, row1 = 0, rows
+    while row0 < rows and _is_blank(log_odds[row0], visited[row0]):
+        row0 += 1
+    while row1 > 0 and _is_blank(log_odds[row1 - 1], visited[row1 - 1]):
+        row1 -= 1
+    col0, col1 = cols, 0
+    for row in range(row0, row1):
+        for col in range(col0):
+            if log_odds[row, col] != 0 or visited[row, col] != 0:
+                col0 = col
+                break
+        for col in range(cols - 1, col1 - 1, -1):
+            if log_odds[row, col] != 0 or visited[row, col] != 0:
+                col1 = col + 1
+                break
+    return row0, col0, row1, col1
+
+
+@njit(cache=True, nogil=True)
+def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
+    found = np.uint8(0)
+    for col in range(log_odds.shape[0]):  # to the end: then it is many at a time
+        found |= np.uint8(log_odds[col]) | visited[col]
+    return bool(found == 0)
+
+
+@njit(cache=True, nogil=True)
+def _fill(
+    log_odds: NDArray[np.int8],
+    visited: NDArray[np.uint8],
+    distance: NDArray[np.float32],
+    resolution: np.float32,
+    far: np.float32,
+    factor: int,
+    row_pad: int,
+    col_pad: int,
+    classes: NDArray[np.int8],
+    clearance: NDArray[np.float32],
+    suspect: NDArray[np.bool_],
+) -> None:
+    """Fill the blocks but for the ring, a row of them at a time."""
+    fine_rows, fine_cols = log_odds.shape
+    blocks = classes.shape[1] - 2
+    metres, marks = np.empty(fine_cols, dtype=np.float32), np.empty(fine_cols, dtype=np.int64)
+    totals, counts = np.empty(blocks), np.empty(blocks, dtype=np.int64)
+    inside = np.zeros(blocks, dtype=np.int64)  # fine columns of each
+    for col in range(fine_cols):
+        inside[(col + col_pad) // factor] += 1
+    for row in range(1, classes.shape[0] - 1):
+        totals[:] = 0.0
+        counts[:] = 0
+        low, high = max((row - 1) * factor - row_pad, 0), min(row * factor - row_pad, fine_rows)
+        for r in range(low, high):
+            _read(log_odds[r], visited[r], distance[r], resolution, far, metres, marks)
+            for i in range(factor):
+                _add(metres, marks, i - col_pad, factor, totals, counts)
+        for block in range(blocks):
+            count, col = counts[block], block + 1
+            if (count >> _FIELD) & _COUNT:
+                classes[row, col] = OCCUPIED
+            elif 2 * (count & _COUNT) > factor * factor:
+                classes[row, col] = FREE
+            suspect[row, col] = count >> (2 * _FIELD) != 0
+            # The mean over a block is the distance at its centre, to second order.
+            clearance[row, col] = totals[block] / (inside[block] * (high - low))
+
+
+@njit(cache=True, nogil=True)
+def _read(
+    log_odds: NDArray[np.int8],
+    visited: NDArray[np.uint8],
+    distance: NDArray[np.float32],
+    resolution: np.float32,
+    far: np.float32,
+    metres: NDArray[np.float32],
+    marks: NDArray[np.int64],
+) -> None:
+    """Write each fine cell's clearance [m] and what it is, in a row; without branches, for many at a time."""
+    half = np.float32(0.5)  # a cell: from the occupied cell's centre to its edge
+    for col in range(log_odds.shape[0]):
+        metres[col] = min((distance[col] - half) * resolution, far)
+    for col in range(log_odds.shape[0]):
+        odds = log_odds[col]
+        occupied = odds >= _OCCUPIED_LEAST
+        free = (odds <= _FREE_MOST) | ((visited[col] != 0) & ~occupied)
+        unsettled = (odds > 0) & ~occupied & ~free
+        marks[col] = np.int64(free) | np.int64(occupied) << _FIELD | np.int64(unsettled) << (2 * _FIELD)
+
+
+@njit(cache=True, nogil=True)
+def _add(
+    metres: NDArray[np.float32],
+    marks: NDArray[np.int64],
+    shift: int,
+    factor: int,
+    totals: NDArray[np.float64],
+    counts: NDArray[np.int64],
+) -> None:
+    """Add to each block the cell of a row that lies ``shift`` cells from the block's beginning, if any."""
+    first, beyond = 1 if shift < 0 else 0, (metres.shape[0] - 1 - shift) // factor + 1
+    start = factor * first + shift
+    # Views that begin where the work does: their indices are seen to be in order, and many are taken at a time.
+    totals, counts, metres, marks = totals[first:beyond], counts[first:beyond], metres[start:], marks[start:]
+    if factor == 2:  # the usual one: the compiler makes more of a number that it knows
+        for j in range(totals.shape[0]):
+            totals[j] += metres[2 * j]
+            counts[j] += marks[2 * j]
+    else:
+        for j in range(totals.shape[0]):
+            totals[j] += metres[factor * j]
+            counts[j] += marks[factor * j]

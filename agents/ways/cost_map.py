@@ -1,0 +1,262 @@
+"""What the belief's grid means to a body of this size: where its centre may be, and at what price.
+
+Planning runs on a coarser grid (about 0.1 m) laid on a fixed lattice of the belief's frame, so that a grid that
+grows does not shift it. A coarse cell is occupied if any of its fine cells is, and free only if most of them
+are; distances to walls are taken from the fine grid, so that coarsening closes no door.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
+from mecanum_env.config import RobotConfig
+from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
+from slam.settings import require
+from slam.types import Belief
+
+__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
+
+Array = NDArray[np.float64]
+
+_ALL = slice(None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlannerConfig:
+    """How near to walls the robot's centre may pass, and what nearness costs.
+
+    Clearance is the distance from the robot's centre to the nearest occupied cell's edge. Above the comfortable
+    one the robot may turn as it likes; below it, down to the tight one, only while its long side lies along the
+    path, which the follower sees to.
+    """
+
+    resolution_m: float = 0.1  # of the planning grid; made finer for a small robot
+    margin_m: float = 0.05  # comfortable: circumscribed radius + margin + 2σ of the position, capped
+    tight_margin_m: float = 0.07  # tight: inscribed radius + this + the same
+    max_sigma_margin_m: float = 0.05  # far from the start σ is large, and the walls nearby are no less certain
+    unknown_margin_m: float = 0.02  # from what is not known: inscribed radius + this
+    preferred_m: float = 0.2  # clearance beyond the comfortable one from which nearness costs nothing
+    near_cost: float = 1.0  # added to the price of a metre at the comfortable clearance
+    tight_cost: float = 3.0  # added again at the tight clearance
+    path_spacing_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("resolution_m", "preferred_m", "path_spacing_m"):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value > 0, f"PlannerConfig.{name} must be > 0, got {value}")
+        for name in (
+            "margin_m",
+            "max_sigma_margin_m",
+            "tight_margin_m",
+            "unknown_margin_m",
+            "near_cost",
+            "tight_cost",
+        ):
+            value = getattr(self, name)
+            require(math.isfinite(value) and value >= 0, f"PlannerConfig.{name} must be ≥ 0, got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class CostMap:
+    """The planning grid. Row = y, column = x; its outermost ring is unknown, so that no walk leaves it."""
+
+    classes: NDArray[np.int8]  # (rows, cols) UNKNOWN, FREE or OCCUPIED
+    clearance: NDArray[np.float32]  # (rows, cols) [m] from the cell's centre to the nearest occupied edge
+    weight: NDArray[np.float32]  # (rows, cols) price of a metre here, ≥ 1; 0 where the centre may not be
+    resolution: float  # [m]
+    origin: tuple[float, float]  # lower-left corner of cell (0, 0) in the belief's frame [m]
+    start: tuple[int, int]  # the robot's cell
+    suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
+
+    def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
+        """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
+        cells = np.asarray(cells, dtype=np.float64)
+        return np.asarray((cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin))
+
+    def to_cells(self, points: Array) -> NDArray[np.int64]:
+        """Return the cells ``(n, 2)`` (row, column) of points ``(n, 2)`` [m], held within the grid."""
+        index = np.floor((np.asarray(points) - np.asarray(self.origin)) / self.resolution).astype(np.int64)
+        limit = np.array(self.classes.shape, dtype=np.int64) - 1
+        return np.asarray(np.clip(index[:, ::-1], 0, limit))
+
+
+def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
+    """Return the grid's classes, all or a window, with what the robot's body has passed over taken for free."""
+    log_odds = belief.grid.log_odds[rows, cols]
+    classes = np.empty(log_odds.shape, dtype=np.int8)
+    _classify(log_odds, belief.grid.visited[rows, cols], CLASS_OF, classes)
+    return classes
+
+
+def clearance(log_odds: NDArray[np.int8], resolution: float) -> NDArray[np.float32]:
+    """Return each cell's distance [m] ``(rows, cols)`` from its centre to the nearest occupied cell's edge."""
+    distance = to_walls(log_odds)
+    # Half a cell: from the occupied cell's centre to its edge.
+    distance -= np.float32(0.5)
+    distance *= np.float32(resolution)
+    return np.minimum(distance, np.float32(FAR_M), out=distance)
+
+
+def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
+    """Return the planning grid of a belief for a body of this size."""
+    fine_resolution = belief.grid.resolution
+    wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
+    factor = max(1, round(wanted / fine_resolution))
+    resolution = factor * fine_resolution
+    rows, cols = _extent(belief)
+    # Blocks lie on the lattice of the frame, not of the grid's present corner.
+    corner = [
+        belief.grid.origin[0] + cols.start * fine_resolution,
+        belief.grid.origin[1] + rows.start * fine_resolution,
+    ]
+    col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
+    origin = (
+        corner[0] - (col_pad + factor) * fine_resolution,
+        corner[1] - (row_pad + factor) * fine_resolution,
+    )
+    blocks = coarsen(
+        belief.grid.log_odds[rows, cols],
+        belief.grid.visited[rows, cols],
+        resolution=fine_resolution,
+        factor=factor,
+        pads=(row_pad, col_pad),
+    )
+    classes, wall = blocks.classes, blocks.clearance
+    x, y = float(belief.pose[0]), float(belief.pose[1])
+    row = min(max(int((y - origin[1]) // resolution), 1), classes.shape[0] - 2)
+    col = min(max(int((x - origin[0]) // resolution), 1), classes.shape[1] - 2)
+    weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
+    # Wherever the robot stands, it is allowed to stand, and to leave.
+    reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
+    highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
+    _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
+    return CostMap(classes, wall, weight, resolution, origin, (row, col), blocks.suspect)
+
+
+def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
+    """Return the clearance [m] at which the robot may turn in place, for a position known to ``sigma_m``."""
+    return robot.circumscribed_radius_m + config.margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
+
+
+def tight_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
+    """Return the clearance [m] that the robot needs while its long side lies along the path."""
+    return robot.inscribed_radius_m + config.tight_margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
+
+
+def _extent(belief: Belief) -> tuple[slice, slice]:
+    """Rows and columns of the grid that hold anything known, and the robot: its spare rim costs time."""
+    grid = belief.grid
+    here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
+    row0, col0, row1, col1 = known_extent(grid.log_odds, grid.visited)
+    row, col = int(here[0]), int(here[1])
+    return slice(min(row0, row), max(row1, row + 1)), slice(min(col0, col), max(col1, col + 1))
+
+
+def position_sigma(pose_cov: Array) -> float:
+    """Largest standard deviation of the position [m]."""
+    block = np.asarray(pose_cov)[:2, :2]
+    mean = 0.5 * (block[0, 0] + block[1, 1])
+    spread = math.hypot(0.5 * (block[0, 0] - block[1, 1]), block[0, 1])
+    return math.sqrt(max(float(mean + spread), 0.0))
+
+
+def _weigh(
+    classes: NDArray[np.int8],
+    wall: NDArray[np.float32],
+    resolution: float,
+    config: PlannerConfig,
+    robot: RobotConfig,
+    sigma_m: float,
+) -> NDArray[np.float32]:
+    tight = tight_clearance(config, robot, sigma_m)
+    comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
+    unknown = _near_unknown(classes, (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5)
+    weight = np.zeros(classes.shape, dtype=np.float32)
+    _weigh_cells(
+        classes,
+        wall,
+        unknown,
+        np.array([tight, comfortable, comfortable + config.preferred_m]),
+        config.near_cost,
+        config.tight_cost,
+        weight,
+    )
+    return weight
+
+
+def _near_unknown(classes: NDArray[np.int8], reach: float) -> NDArray[np.uint8]:
+    """Return, not 0, the cells nearer than ``reach`` cells to an unknown one."""
+    side = 2 * math.ceil(reach) + 1
+    apart = np.ones((side, side), dtype=np.uint8)
+    apart[side // 2, side // 2] = 0
+    # A disc laid over each unknown cell: cheaper than the distance of every cell, of which none but this is asked.
+    disc = (cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_3) < np.float64(reach)).astype(np.uint8)
+    return np.asarray(cv2.dilate((classes == UNKNOWN).view(np.uint8), disc), dtype=np.uint8)
+
+
+@njit(cache=True, nogil=True)
+def _classify(
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], table: NDArray[np.int8], classes: NDArray[np.int8]
+) -> None:
+    for row in range(classes.shape[0]):
+        for col in range(classes.shape[1]):
+            kind = table[np.uint8(log_odds[row, col])]
+            classes[row, col] = FREE if kind == UNKNOWN and visited[row, col] != 0 else kind
+
+
+@njit(cache=True, nogil=True)
+def _weigh_cells(
+    classes: NDArray[np.int8],
+    wall: NDArray[np.float32],
+    near_unknown: NDArray[np.uint8],
+    levels: Array,
+    near_cost: float,
+    tight_cost: float,
+    weight: NDArray[np.float32],
+) -> None:
+    tight, comfortable, preferred = levels
+    for row in range(1, classes.shape[0] - 1):
+        for col in range(1, classes.shape[1] - 1):
+            distance = wall[row, col]
+            if classes[row, col] != FREE or distance < tight or near_unknown[row, col] != 0:
+                continue
+            if distance >= preferred:
+                weight[row, col] = 1.0
+            elif distance >= comfortable:
+                share = (preferred - distance) / (preferred - comfortable)
+                weight[row, col] = 1.0 + near_cost * share * share
+            else:
+                share = (comfortable - distance) / (comfortable - tight)
+                weight[row, col] = 1.0 + near_cost + tight_cost * share
+
+
+@njit(cache=True, nogil=True)
+def _free_start(
+    classes: NDArray[np.int8],
+    wall: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    row: int,
+    col: int,
+    reach: float,
+    body: float,
+    highest: float,
+) -> None:
+    """Let the robot out of where it stands: cells around it, never occupied ones, at the highest price."""
+    here = wall[row, col]
+    span = math.ceil(reach)
+    for r in range(max(row - span, 1), min(row + span + 1, classes.shape[0] - 1)):
+        for c in range(max(col - span, 1), min(col + span + 1, classes.shape[1] - 1)):
+            away = math.hypot(r - row, c - col)
+            if weight[r, c] > 0.0 or away > reach or classes[r, c] == OCCUPIED:
+                continue
+            # Beyond the body only what is known; and nowhere nearer to a wall than the robot is already.
+            if (away <= body or classes[r, c] == FREE) and wall[r, c] >= here - 0.01:
+                weight[r, c] = highest
+    weight[row, col] = max(weight[row, col], 1.0)

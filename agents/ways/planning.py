@@ -1,0 +1,274 @@
+"""Travel costs from the robot to everywhere at once, and the smooth path to one place.
+
+The costs come from Dijkstra's algorithm over the 8-connected planning grid with Dial's bucket queue: no edge is
+cheaper than one bucket is wide, so the nodes of the lowest bucket are final in any order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agents.ways.cost_map import CostMap
+
+__all__ = ["TravelCosts", "resample", "shortest_path", "travel_costs", "way_cells"]
+
+Array = NDArray[np.float64]
+
+# Neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8.
+_D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+_D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class TravelCosts:
+    """Cost of the cheapest way from the robot to each cell, and the step that way ends with."""
+
+    cost: NDArray[np.float32]  # (rows, cols) weighted metres, inf where it cannot get
+    step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where inf
+
+
+def travel_costs(cost_map: CostMap, max_cost_m: float = math.inf) -> TravelCosts:
+    """Return the travel costs from the robot's cell; what costs more than ``max_cost_m`` is left at infinity.
+
+    A step costs its length times the mean weight of its two cells. A diagonal step needs both cells beside it
+    free, so that no path slips between two walls that touch at a corner.
+    """
+    shape = cost_map.weight.shape
+    cost = np.full(shape, np.inf, dtype=np.float32)
+    step = np.full(shape, -1, dtype=np.int8)
+    highest = float(cost_map.weight.max())
+    buckets = math.ceil(math.sqrt(2.0) * highest) + 3
+    _dial(
+        cost_map.weight,
+        cost_map.start[0],
+        cost_map.start[1],
+        buckets,
+        max_cost_m / cost_map.resolution,
+        cost,
+        step,
+    )
+    cost *= np.float32(cost_map.resolution)
+    return TravelCosts(cost, step)
+
+
+def shortest_path(
+    cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], *, start: Array, spacing_m: float = 0.1
+) -> Array:
+    """Return the way ``(n, 2)`` [m] from ``start``, a point of the robot's cell, to the centre of ``cell``.
+
+    It is cut straight wherever that costs no more and comes no nearer to a wall, then sampled evenly.
+
+    Raises
+    ------
+    ValueError
+        If the cell cannot be reached.
+    """
+    if not math.isfinite(float(travel.cost[cell])):
+        raise ValueError(f"cell {cell} cannot be reached: choose one whose travel cost is finite")
+    cells = way_cells(travel, cell)
+    points = cost_map.to_points(cells)
+    points[0] = np.asarray(start, dtype=np.float64)[:2]
+    keep = _cut_straight(
+        points, cost_map.weight, cost_map.clearance, cost_map.resolution, np.asarray(cost_map.origin)
+    )
+    return resample(points[keep], spacing_m)
+
+
+def way_cells(travel: TravelCosts, cell: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the cells ``(n, 2)`` of the cheapest way from the robot to a cell, both included."""
+    return np.asarray(_chain(travel.step, int(cell[0]), int(cell[1])))
+
+
+def resample(path: Array, spacing_m: float) -> Array:
+    """Return a path ``(m, 2)`` with points at most ``spacing_m`` apart that keeps its ends and corners."""
+    pieces = [path[:1]]
+    for a, b in pairwise(path):
+        count = max(1, math.ceil(float(np.hypot(*(b - a))) / spacing_m - 1e-9))
+        pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
+    return np.vstack(pieces)
+
+
+@njit(cache=True, nogil=True)
+def _dial(
+    weight: NDArray[np.float32],
+    start_row: int,
+    start_col: int,
+    buckets: int,
+    max_cost: float,
+    cost: NDArray[np.float32],
+    step: NDArray[np.int8],
+) -> None:
+    """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
+
+    Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
+    before. Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack
+    again and left in the old one, where it is found to be done (or, in the same bucket, done over to no effect).
+    Entries taken off are used again, so that the lists stay as short as the front is long, and in the processor's
+    cache.
+    """
+    cols = weight.shape[1]
+    weights, costs, steps = weight.ravel(), cost.ravel(), step.ravel()
+    offsets = _D_ROW * cols + _D_COL
+    diagonal = 0.5 * math.sqrt(2.0)
+    ahead, ahead_count = _ahead()
+    # Each of its eight edges makes a node cheaper once at most. What is never written takes no memory.
+    node_of = np.empty(8 * weights.shape[0], dtype=np.int32)
+    below = np.empty(8 * weights.shape[0], dtype=np.int32)
+    top = np.full(buckets, -1, dtype=np.int32)
+    used, spare = 1, np.int32(-1)
+    start = start_row * cols + start_col
+    costs[start] = 0.0
+    node_of[0], below[0], top[0] = start, -1, 0
+    waiting = 1
+    bucket = place = 0  # place is bucket modulo buckets
+    while waiting > 0:
+        while top[place] >= 0:
+            entry = top[place]
+            node = np.int64(node_of[entry])
+            top[place] = below[entry]
+            below[entry] = spare
+            spare = entry
+            waiting -= 1
+            here = costs[node]
+            if int(here) != bucket:  # done, from a lower bucket
+                continue
+            own = weights[node]
+            least = here + np.float32(1.0)
+            way = np.int64(steps[node])  # −1, at the start, is the last row
+            for i in range(ahead_count[way]):
+                k = ahead[way, i]
+                other = node + offsets[k]
+                before = costs[other]
+                if before <= least:  # most neighbours: settled, at no more than the cheapest edge would make
+                    continue
+                price = weights[other]
+                if price <= 0.0:
+                    continue
+                total = here + np.float32((diagonal if k & 1 else 0.5) * (own + price))
+                if total >= before or total > max_cost:
+                    continue
+                if k & 1 and (
+                    weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0
+                ):
+                    continue
+                costs[other] = total
+                steps[other] = k
+                to = place + int(total) - bucket
+                if to >= buckets:
+                    to -= buckets
+                if spare >= 0:
+                    entry = spare
+                    spare = below[entry]
+                else:
+                    entry = np.int32(used)
+                    used += 1
+                node_of[entry] = other
+                below[entry] = top[to]
+                top[to] = entry
+                waiting += 1
+        bucket += 1
+        place = place + 1 if place + 1 < buckets else 0
+
+
+@njit(cache=True, nogil=True)
+def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last the start's.
+
+    Where a step has come from needs no look: the cell itself, and the two on either side of it, which are its
+    neighbours, too, and cheaper to reach from there: for all weights, the direct edge costs less than the step and
+    a second one, of which one is straight and the other diagonal.
+    """
+    ahead = np.zeros((9, 8), dtype=np.int64)
+    count = np.zeros(9, dtype=np.int64)
+    for way in range(9):
+        for k in range(8):
+            turn = (k - way) % 8
+            if way == 8 or turn <= 2 or turn >= 6:
+                ahead[way, count[way]] = k
+                count[way] += 1
+    return ahead, count
+
+
+@njit(cache=True, nogil=True)
+def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
+    count = 1
+    r, c = row, col
+    while step[r, c] >= 0:
+        k = step[r, c]
+        r, c = r - _D_ROW[k], c - _D_COL[k]
+        count += 1
+    cells = np.empty((count, 2), dtype=np.int64)
+    r, c = row, col
+    for i in range(count - 1, -1, -1):
+        cells[i, 0], cells[i, 1] = r, c
+        k = step[r, c]
+        if k >= 0:
+            r, c = r - _D_ROW[k], c - _D_COL[k]
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def _segment(
+    a: Array,
+    b: Array,
+    weight: NDArray[np.float32],
+    wall: NDArray[np.float32],
+    resolution: float,
+    origin: Array,
+) -> tuple[float, float]:
+    """Price of the straight line a–b (inf where it leaves passable cells) and its smallest clearance."""
+    length = math.hypot(b[0] - a[0], b[1] - a[1])
+    count = max(1, math.ceil(length / (0.5 * resolution)))
+    total, nearest = 0.0, np.inf
+    for i in range(count + 1):
+        share = i / count
+        col = math.floor((a[0] + share * (b[0] - a[0]) - origin[0]) / resolution)
+        row = math.floor((a[1] + share * (b[1] - a[1]) - origin[1]) / resolution)
+        if weight[row, col] <= 0.0:
+            return np.inf, 0.0
+        # Trapezoidal rule: the ends count half.
+        total += weight[row, col] * (0.5 if i == 0 or i == count else 1.0)
+        nearest = min(nearest, wall[row, col])
+    return total * length / count, nearest
+
+
+@njit(cache=True, nogil=True)
+def _cut_straight(
+    points: Array,
+    weight: NDArray[np.float32],
+    wall: NDArray[np.float32],
+    resolution: float,
+    origin: Array,
+) -> NDArray[np.int64]:
+    """Return the indices of the points to keep."""
+    n = points.shape[0]
+    keep = np.empty(n, dtype=np.int64)
+    keep[0] = 0
+    count = 1
+    span = 64  # cells looked ahead: longer straight lines are kept in pieces
+    so_far = np.empty(n)
+    lowest = np.empty(n)
+    i = 0
+    while i < n - 1:
+        last = min(i + span, n - 1)
+        so_far[i], lowest[i] = 0.0, wall[0, 0]
+        for j in range(i + 1, last + 1):
+            price, nearest = _segment(points[j - 1], points[j], weight, wall, resolution, origin)
+            so_far[j] = so_far[j - 1] + price
+            lowest[j] = min(nearest, lowest[j - 1])
+        j = last
+        while j > i + 1:
+            price, nearest = _segment(points[i], points[j], weight, wall, resolution, origin)
+            if price <= so_far[j] * 1.01 and nearest >= lowest[j] - 0.01:
+                break
+            j -= 1
+        keep[count] = j
+        count += 1
+        i = j
+    return keep[:count]

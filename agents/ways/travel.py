@@ -1,0 +1,62 @@
+"""Travel costs between many places at once: exactly for some, by the tree of shortest ways for the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from agents.ways.cost_map import CostMap
+from agents.ways.planning import TravelCosts, travel_costs
+
+__all__ = ["between"]
+
+Array = NDArray[np.float64]
+
+# Neighbours in the order that TravelCosts.step counts them in.
+_D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
+_D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+
+_CELLS = 100_000  # that may be searched for exact costs in one call: some 5 ms
+
+
+def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64], *, searched: int = _CELLS) -> Array:
+    """Return the travel costs ``(n, n)`` [weighted m] between reachable cells ``(n, 2)``, the robot's first.
+
+    The way back along the tree of shortest ways from the robot is one that exists; it is the shortest wherever
+    rooms hang on corridors like leaves on twigs. As many of the first cells are searched from exactly as there are
+    ``searched`` cells of the map for; from the robot's own it is exact in any case.
+    """
+    costs = _along_tree(travel.cost, travel.step, cells)
+    exact = min(len(cells), searched // cost_map.classes.size + 1)
+    for i in range(1, exact):
+        row, col = int(cells[i, 0]), int(cells[i, 1])
+        own = travel_costs(replace(cost_map, start=(row, col))).cost[tuple(cells.T)]
+        costs[i] = np.minimum(costs[i], own)
+        costs[:, i] = np.minimum(costs[:, i], own)
+    return costs
+
+
+@njit(cache=True, nogil=True)
+def _along_tree(cost: NDArray[np.float32], step: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
+    n = len(cells)
+    out = np.zeros((n, n))
+    passed = np.full(cost.shape, -1, dtype=np.int32)
+    for i in range(n):
+        row, col = cells[i, 0], cells[i, 1]
+        while True:
+            passed[row, col] = i
+            k = step[row, col]
+            if k < 0:
+                break
+            row, col = row - _D_ROW[k], col - _D_COL[k]
+        for j in range(i):
+            row, col = cells[j, 0], cells[j, 1]
+            while passed[row, col] != i and step[row, col] >= 0:
+                k = step[row, col]
+                row, col = row - _D_ROW[k], col - _D_COL[k]
+            out[i, j] = cost[cells[i, 0], cells[i, 1]] + cost[cells[j, 0], cells[j, 1]] - 2.0 * cost[row, col]
+            out[j, i] = out[i, j]
+    return out

@@ -1,0 +1,4 @@
+"""The physics: the mecanum robot, the floor under its wheels, and the pymunk space it drives in.
+
+``world`` steps them together; ``robot`` is kinematics and dynamics, ``collisions`` contacts, ``floor`` what slips.
+"""

@@ -1,0 +1,347 @@
+"""The world: static walls and obstacles, the robot's body, the floor under its wheels, and collisions.
+
+Wheels, motors and traction are integrated by :func:`mecanum_env.physics.robot.wheel_dynamics`; contacts are
+pymunk's. In each physics step the kernel advances the body's velocity, and pymunk moves the body at its mean
+velocity over that step, so that where nothing is touched the path is the kernel's own. For as long as nothing
+*can* be touched, which a distance field and then the exact geometry tell, pymunk is left out: the result is the
+same.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from mecanum_env.config import NoiseConfig, RobotConfig
+from mecanum_env.physics.collisions import CONTACT_GAP_S, Contacts, add_robot, build_space
+from mecanum_env.physics.floor import build_floor
+from mecanum_env.physics.robot import (
+    INCREMENTS,
+    POSE,
+    STATE_SIZE,
+    SUBSTEP_S,
+    TWIST,
+    WHEELS,
+    dynamics_constants,
+    motor_constants,
+    turn_wheels,
+    wheel_positions,
+)
+from mecanum_env.rooms.floor_plan import FloorPlanError
+from slam.geometry import wrap_scalar
+
+if TYPE_CHECKING:
+    from mecanum_env.rooms.floor_plan import FloorPlan
+
+__all__ = ["CONTACT_GAP_S", "MAX_TRAVEL_M", "World"]
+
+Array = NDArray[np.float64]
+
+MAX_TRAVEL_M = 0.005
+"""pymunk's steps are cut so that the robot, at its limits, goes no further in one: hence no deeper into a wall."""
+
+_MARGIN_M = 1e-3  # nothing within it: no contact, whatever the rounding
+_AHEAD = 64  # control steps whose slip is drawn at once: a draw of four numbers takes 1.5 µs, of 256 two
+_PERSISTENCE = 4  # steps after which pymunk has forgotten a contact (its collision_persistence is 3)
+
+
+# What the kernels carry beside the state, in one array: each argument of a call takes 80 ns to unpack.
+_STATE = slice(0, STATE_SIZE)
+_TARGETS = slice(18, 22)  # commanded wheel speeds [rad/s]
+_LOST = slice(22, 26)  # this control step's slip of each wheel, as a share of twice the mean
+_GROUND_RADII = slice(26, 30)  # ``_RADII``, each less what is lost to slip [m]
+_MOTION = slice(30, 33)  # of the last physics step: displacement [m, m], rotation [rad]
+_MU = slice(33, 37)  # friction under each wheel
+_MOTOR = slice(37, 44)  # from :func:`mecanum_env.physics.robot.motor_constants`
+_UNDO = slice(44, 44 + STATE_SIZE)  # the state before the physics step
+_WRAPPED = slice(62, 65)  # the pose, its heading in [-π, π)
+_WORK_SIZE = 65
+# … and what stays the same for a whole episode.
+_RADII = slice(0, 4)  # [m]
+_CONSTANTS = slice(4, 14)  # from :func:`mecanum_env.physics.robot.dynamics_constants`
+_RASTER = slice(14, 17)  # the floor's: x, y of its corner [m], cells a metre
+_WHEELS_X, _WHEELS_Y = slice(17, 21), slice(21, 25)  # in the body frame [m]
+_HALF_X, _HALF_Y, _SLIP = 25, 26, 27
+_FIXED_SIZE = 28
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
+    """Run :func:`wheel_dynamics` over a physics step with the μ that the wheels stand on at its start."""
+    state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
+    wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
+    c, s = math.cos(state[2]), math.sin(state[2])
+    rows, cols = friction.shape
+    for i in range(4):
+        x = state[0] + c * wheels_x[i] - s * wheels_y[i]
+        y = state[1] + s * wheels_x[i] + c * wheels_y[i]
+        col = min(max(int((x - raster[0]) * raster[2]), 0), cols - 1)
+        row = min(max(int((y - raster[1]) * raster[2]), 0), rows - 1)
+        mu[i] = friction[row, col]
+    turn_wheels(
+        state, work[_TARGETS], work[_GROUND_RADII], mu, fixed[_CONSTANTS], work[_MOTOR], h, substeps, work[_MOTION]
+    )
+
+
+@njit(cache=True, nogil=True)
+def _box_is_clear(
+    x: float, y: float, theta: float, half_x: float, half_y: float, segments: Array, circles: Array
+) -> bool:
+    """Tell whether no surface comes into a rectangle [m] about a pose (separating axes; exact)."""
+    c, s = math.cos(theta), math.sin(theta)
+    reach = half_x + half_y
+    for i in range(segments.shape[0]):
+        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
+        if min(ax, bx) > reach or max(ax, bx) < -reach or min(ay, by) > reach or max(ay, by) < -reach:
+            continue
+        ax, ay = c * ax + s * ay, c * ay - s * ax
+        bx, by = c * bx + s * by, c * by - s * bx
+        if min(ax, bx) > half_x or max(ax, bx) < -half_x or min(ay, by) > half_y or max(ay, by) < -half_y:
+            continue
+        ex, ey = bx - ax, by - ay
+        if abs(ax * ey - ay * ex) <= half_x * abs(ey) + half_y * abs(ex):
+            return False
+    for i in range(circles.shape[0]):
+        dx, dy = circles[i, 0] - x, circles[i, 1] - y
+        outside_x = max(abs(c * dx + s * dy) - half_x, 0.0)
+        outside_y = max(abs(c * dy - s * dx) - half_y, 0.0)
+        if outside_x * outside_x + outside_y * outside_y <= circles[i, 2] * circles[i, 2]:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _drive_clear(
+    work: Array, fixed: Array, friction: NDArray[np.float32], clearance: NDArray[np.float32], segments: Array,
+    circles: Array, dt: float, substeps: int, steps: int,
+) -> int:  # fmt: skip
+    """Run up to ``steps`` physics steps for as long as nothing can be touched in them.
+
+    pymunk looks for contacts each time it has moved the body. Where nothing is within a step's travel of the
+    body at the step's end, it would have found none. Returns the number of steps taken; the one in which
+    something may be touched is undone. What ``work`` holds of the control step is filled for whoever goes on.
+    """
+    state, undo, motion, wrapped = work[_STATE], work[_UNDO], work[_MOTION], work[_WRAPPED]
+    state[INCREMENTS] = 0.0
+    radii, ground_radii, lost = fixed[_RADII], work[_GROUND_RADII], work[_LOST]
+    for i in range(4):
+        ground_radii[i] = radii[i] * (1.0 - 2.0 * fixed[_SLIP] * lost[i])
+    h = dt / substeps
+    motor_constants(fixed[_CONSTANTS], h, work[_MOTOR])
+    raster, half_x, half_y = fixed[_RASTER], fixed[_HALF_X], fixed[_HALF_Y]
+    rows, cols = clearance.shape
+    circumscribed = math.sqrt(half_x * half_x + half_y * half_y)
+    for step in range(steps):
+        undo[:] = state
+        _wheel_step(work, fixed, friction, h, substeps)
+        # As pymunk does it: mean velocity first, then velocity times time.
+        x, y = state[0] + motion[0] / dt * dt, state[1] + motion[1] / dt * dt
+        theta = state[2] + motion[2] / dt * dt
+        travel = math.sqrt(motion[0] ** 2 + motion[1] ** 2) + abs(motion[2]) * circumscribed + _MARGIN_M
+        col = math.floor((x - raster[0]) * raster[2])
+        row = math.floor((y - raster[1]) * raster[2])
+        far = 0 <= row < rows and 0 <= col < cols and clearance[row, col] > circumscribed + travel
+        if not far and not _box_is_clear(x, y, theta, half_x + travel, half_y + travel, segments, circles):
+            state[:] = undo
+            steps = step
+            break
+        state[0], state[1], state[2] = x, y, theta
+    wrapped[0], wrapped[1], wrapped[2] = state[0], state[1], wrap_scalar(state[2])
+    return steps
+
+
+@lru_cache(maxsize=16)
+def _divide(step_s: float, physics_step_s: float) -> tuple[int, float, int]:
+    """Return how many physics steps a control step has, their length [s], and the substeps of each."""
+    steps = max(1, round(step_s / physics_step_s))
+    dt = step_s / steps
+    return steps, dt, max(1, math.ceil(dt / SUBSTEP_S - 1e-9))
+
+
+class World:
+    """A robot in a floor plan, moved by its wheels, stopped by walls and obstacles.
+
+    Parameters
+    ----------
+    plan
+        Walls, polygons, circles, the raster of free space, and the start.
+    robot, noise
+        The nominal robot; of ``noise`` the slip, the floor's friction and its patches.
+    rng
+        Draws the patches now and four numbers per control step: the wheels' slip, 64 steps ahead. The same
+        generator state and the same actions give the same path to the last bit, in any process.
+    true_radii, true_lever
+        The robot's true wheel radii ``(4,)`` [m] and lever [m], where they differ from the nominal ones
+        (:class:`mecanum_env.sensing.sensors.WheelEncoders` draws them).
+    start
+        Pose ``(3,)`` instead of the plan's own.
+    shortcut
+        Leave pymunk out while nothing can be touched. The path is the same without, only slower.
+
+    Raises
+    ------
+    FloorPlanError
+        Where the start is not in free space or the robot would touch something there.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        robot: RobotConfig,
+        noise: NoiseConfig,
+        rng: np.random.Generator,
+        *,
+        true_radii: ArrayLike | None = None,
+        true_lever: float | None = None,
+        start: ArrayLike | None = None,
+        shortcut: bool = True,
+    ) -> None:
+        self.plan, self.robot, self.noise = plan, robot, noise
+        self.floor = build_floor(plan, noise, rng)
+        self._rng = rng
+        self._slips, self._slips_left = np.empty((_AHEAD, 4)), 0
+        self._shortcut = shortcut
+        self._fixed = fixed = np.zeros(_FIXED_SIZE)
+        fixed[_RADII] = robot.wheel_radius_m if true_radii is None else true_radii
+        fixed[_CONSTANTS] = dynamics_constants(robot, lever_m=true_lever)
+        fixed[_RASTER] = self.floor.raster
+        fixed[_WHEELS_X], fixed[_WHEELS_Y] = wheel_positions(robot).T
+        fixed[_HALF_X], fixed[_HALF_Y], fixed[_SLIP] = 0.5 * robot.length_m, 0.5 * robot.width_m, noise.slip
+        self._fastest = max(
+            robot.max_speed_m_s, robot.max_turn_rate_rad_s * robot.circumscribed_radius_m
+        )  # [m/s] of any point of the body
+        self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
+        self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
+        self._work = np.zeros(_WORK_SIZE)
+        self._work[POSE] = plan.start if start is None else start
+        self._wrap_pose()
+        self._contacts = Contacts()
+        self._space = build_space(plan, self._contacts)
+        self._body = add_robot(self._space, robot)
+        self._body_is_behind = True
+        self._forgotten = _PERSISTENCE  # pymunk's steps since it last found a contact
+        self._check_start()
+
+    def _check_start(self) -> None:
+        x, y, theta = self._work[POSE].tolist()
+        at = f"the start ({x:.2f}, {y:.2f}, {theta:.2f})"
+        if not self.plan.is_free(np.array([[x, y]]))[0]:
+            raise FloorPlanError(f"{at} is not in the free space of {self.plan.name!r}; choose another")
+        self._place_body()
+        (shape,) = self._body.shapes
+        shape.cache_bb()
+        if self._space.shape_query(shape):
+            raise FloorPlanError(f"{at} in {self.plan.name!r} has the robot touch something; choose another")
+
+    def step(self, wheel_targets: ArrayLike, step_s: float, physics_step_s: float) -> None:
+        """Drive for one control step.
+
+        Parameters
+        ----------
+        wheel_targets
+            Commanded wheel speeds ``(4,)`` [rad/s], held.
+        step_s, physics_step_s
+            Length of the control step and of the physics steps it consists of [s].
+        """
+        steps, dt, substeps = _divide(step_s, physics_step_s)
+        self._work[_TARGETS] = wheel_targets
+        if self._slips_left == 0:
+            self._rng.random(out=self._slips)  # even where slip is zero: the stream must not depend on it
+            self._slips_left = _AHEAD
+        self._work[_LOST] = self._slips[-self._slips_left]
+        self._slips_left -= 1
+        clear = self._shortcut and self._forgotten >= _PERSISTENCE
+        done = self._drive_clear(dt, substeps, steps if clear else 0)
+        if done:
+            self._body_is_behind = True
+            self._contacts.pass_clear(done * dt)
+        if done < steps:
+            for _ in range(steps - done):
+                self._drive_near(dt, substeps)
+            self._wrap_pose()
+
+    def _wrap_pose(self) -> None:
+        x, y, theta = self._work[POSE].tolist()
+        self._work[_WRAPPED] = x, y, wrap_scalar(theta)
+
+    def _drive_clear(self, dt: float, substeps: int, steps: int) -> int:
+        floor = self.floor
+        return _drive_clear(
+            self._work, self._fixed, floor.friction, floor.clearance, self._segments, self._circles, dt, substeps,
+            steps,
+        )  # fmt: skip
+
+    def _drive_near(self, dt: float, substeps: int) -> None:
+        """Take one physics step through pymunk."""
+        if self._body_is_behind:
+            self._place_body()
+        state, body, contacts = self._work[_STATE], self._body, self._contacts
+        _wheel_step(self._work, self._fixed, self.floor.friction, dt / substeps, substeps)
+        # Always the same number of parts: pymunk scales the impulses it starts from with the ratio of one step's
+        # length to the last one's, and a wall struck in a short step throws the robot back in a long one.
+        parts = max(1, math.ceil(self._fastest * dt / MAX_TRAVEL_M))
+        dx, dy, turn = self._work[_MOTION].tolist()
+        body.velocity = dx / dt, dy / dt
+        body.angular_velocity = turn / dt
+        for _ in range(parts):
+            self._space.step(dt / parts)
+        x, y = body.position
+        angle = body.angle
+        state[0], state[1], state[2] = x, y, angle
+        self._forgotten += parts
+        impulse = 0.0
+        if contacts.touched:
+            self._forgotten = 0
+            # The contact has the last word on the velocity; elsewhere it is the kernel's, at the step's end.
+            vx, vy = body.velocity
+            c, s = math.cos(angle), math.sin(angle)
+            ahead, aside = c * vx + s * vy, c * vy - s * vx
+            impulse = self.robot.mass_kg * math.hypot(ahead - state[3], aside - state[4])
+            state[3], state[4], state[5] = ahead, aside, body.angular_velocity
+        contacts.close_step(dt, impulse)
+
+    def _place_body(self) -> None:
+        x, y, theta = self._work[POSE].tolist()
+        self._body.position = x, y
+        self._body.angle = theta
+        self._body_is_behind = False
+
+    @property
+    def pose(self) -> Array:
+        """The robot's true pose ``(3,)`` in the world frame: x [m], y [m], θ [rad] in [-π, π)."""
+        return self._work[_WRAPPED].copy()
+
+    @property
+    def twist(self) -> Array:
+        """The true body twist ``(3,)``: vx, vy [m/s], ω [rad/s]."""
+        return self._work[TWIST].copy()
+
+    @property
+    def wheel_speeds(self) -> Array:
+        """The wheels' speeds ``(4,)`` [rad/s]."""
+        return self._work[WHEELS].copy()
+
+    @property
+    def wheel_increments(self) -> Array:
+        """How far each wheel turned in the last control step ``(4,)`` [rad], with whatever slipped."""
+        return self._work[INCREMENTS].copy()
+
+    @property
+    def collisions(self) -> int:
+        """Contacts so far: touching again within :data:`CONTACT_GAP_S`, or several things at once, is one."""
+        return self._contacts.count
+
+    @property
+    def last_impulse(self) -> float:
+        """The hardest blow of the last contact [N·s]: the largest impulse of one physics step in it."""
+        return self._contacts.peak
+
+    @property
+    def last_impulse_total(self) -> float:
+        """All of the last contact's impulse so far [N·s], with the pressing and rubbing after the blow."""
+        return self._contacts.total

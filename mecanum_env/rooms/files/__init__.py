@@ -1,0 +1,1 @@
+"""Floor plans from files: ROS map_server maps and plain images, read with distrust."""

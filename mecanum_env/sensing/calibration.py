@@ -1,0 +1,74 @@
+"""What the estimators are told of the simulated robot: V from its declared noise, and where its lidar sits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
+from slam.motion import LastingErrors, OdometryNoise
+from slam.settings import to_mapping
+
+__all__ = ["backend_settings", "odometry_noise"]
+
+# A wheel's radius error stays for the whole episode, while a filter without it as a state takes it for white. Over
+# the most of a second that it takes the landmarks to correct a drift, eight steps' errors add up instead of
+# averaging.
+_PERSISTENCE = 8.0
+
+# What is left of the wheels' creep when its mean is taken out (mecanum_env.sensing.sensors.creep), and some more:
+# a robot that stands must not become certain of where it is.
+_FLOOR_M_S = 0.0001
+
+
+def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
+    """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
+
+    Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
+    within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
+    weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
+    ``python -m training.studies.calibrate`` measures V on the simulated robot.
+    """
+    white = noise.encoder**2 + noise.slip**2 / 3.0
+    as_white = _PERSISTENCE * (noise.radius_error**2 / 3.0)
+    per_wheel = math.sqrt((white + as_white) / 4.0)
+    # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
+    base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
+    white_share = math.sqrt(white / 4.0)
+    return OdometryNoise(
+        lever_m=robot.lever_m,
+        speed_floor_m_s=_FLOOR_M_S,
+        turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
+        speed_share=per_wheel,
+        turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
+        lasting=LastingErrors(
+            radius_sigma=noise.radius_error / math.sqrt(3.0),
+            lever_sigma=noise.base_error / math.sqrt(3.0),
+            white_speed_share=white_share,
+            white_turn_share_rad_m=white_share / robot.lever_m,
+        ),
+    )
+
+
+def backend_settings(config: EnvConfig) -> dict[str, Any]:
+    """Return a backend's settings as the environment's parts imply them, ``slam_config`` laid over them."""
+    settings: dict[str, Any] = {
+        "lidar_offset_m": config.lidar.offset_m,
+        "body_radius_m": 0.5 * (config.robot.inscribed_radius_m + config.robot.circumscribed_radius_m),
+        "grid_resolution_m": config.grid_resolution_m,
+        "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
+        "features": {"range_sigma_m": config.noise.range_sigma_m},
+    }
+    given = config.slam_config.get("odometry", {})
+    if "lasting" not in given and given.keys() & {"speed_share", "turn_share_rad_m"}:
+        del settings["odometry"]["lasting"]  # these speak of V as a whole
+    return _overlay(settings, config.slam_config)
+
+
+def _overlay(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    out = dict(base)
+    for key, value in over.items():
+        inner = out.get(key)
+        out[key] = _overlay(inner, value) if isinstance(inner, dict) and isinstance(value, Mapping) else value
+    return out

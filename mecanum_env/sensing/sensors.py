@@ -1,0 +1,262 @@
+"""What the robot senses: a planar lidar, and encoders on its wheels; with the noise that the config declares.
+
+Each sensor draws the same number of random numbers every step, whatever there is to see: two runs with the same
+seed have the same noise even where another agent or estimator takes the robot elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
+from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
+from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
+from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from slam.odometry.filters import OdometryFilter
+from slam.types import Odometry, Scan
+
+__all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)
+def _measure(
+    ranges: Array,
+    normals: Array,
+    uniforms: Array,
+    sigma: float,
+    dropout: float,
+    range_min: float,
+    range_max: float,
+) -> None:
+    """Turn true ranges [m] into measured ones, in place (REP 117: ``inf`` no return, ``nan`` no measurement)."""
+    for k in range(ranges.shape[0]):
+        measured = ranges[k] + sigma * normals[k]
+        if measured > range_max:
+            measured = np.inf
+        if uniforms[k] < dropout or measured < range_min:
+            measured = np.nan
+        ranges[k] = measured
+
+
+@njit(cache=True, nogil=True)
+def _sweep(
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, normals: Array,
+    uniforms: Array, out: Array,
+) -> None:  # fmt: skip
+    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes.
+
+    ``limits`` are those of :class:`Lidar`.
+    """
+    offset, angle_min, angle_increment = limits[0], limits[1], limits[2]
+    range_max, range_min, sigma, dropout = limits[3], limits[4], limits[5], limits[6]
+    theta = pose[2]
+    x, y = pose[0] + offset * math.cos(theta), pose[1] + offset * math.sin(theta)
+    cast_rays(segments, circles, x, y, theta, directions, angle_min, angle_increment, range_max, out)
+    _measure(out, normals, uniforms, sigma, dropout, range_min, range_max)
+
+
+@njit(cache=True, nogil=True)
+def _noisy_sweep(
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, words: NDArray[np.uint64],
+    out: Array,
+) -> None:  # fmt: skip
+    """Draw the noise of a sweep from the words of a :class:`NoiseStream`, and do :func:`_sweep`."""
+    noise = np.empty((2, out.shape[0]))
+    fill_normal(words, noise[0])
+    fill_uniform(words, noise[1])
+    _sweep(segments, circles, pose, directions, limits, noise[0], noise[1], out)
+
+
+class Lidar:
+    """A planar lidar at A, ``offset_m`` ahead of the robot's centre (theory.md A).
+
+    Parameters
+    ----------
+    config
+        Beams, field of view, range limits and mounting.
+    noise
+        ``range_sigma_m`` and ``dropout``.
+    """
+
+    def __init__(self, config: LidarConfig, noise: NoiseConfig) -> None:
+        self.config = config
+        self.noise = noise
+        self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
+        self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
+        # One array, since each argument of a call takes time to unpack.
+        self._limits = np.array([
+            config.offset_m, self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m,
+            noise.range_sigma_m, noise.dropout,
+        ])  # fmt: skip
+        self._beams = config.beams
+        self._of_scan = self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m
+
+    def true_ranges(self, segments: Array, circles: Array, pose: ArrayLike) -> Array:
+        """Return the exact range of each beam ``(beams,)`` [m], ``inf`` beyond ``range_max_m``.
+
+        Parameters
+        ----------
+        segments, circles
+            Surfaces ``(n, 4)`` and discs ``(c, 3)`` in the world frame [m]: ``FloorPlan.segments``, ``.circles``.
+        pose
+            Of the robot's centre in the world frame ``(3,)``; the sensor is ``offset_m`` ahead of it.
+        """
+        config = self.config
+        x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
+        out = np.empty(config.beams)
+        cast_rays(
+            segments,
+            circles,
+            x + config.offset_m * math.cos(theta),
+            y + config.offset_m * math.sin(theta),
+            theta,
+            self._directions,
+            self._angle_min,
+            self._angle_increment,
+            config.range_max_m,
+            out,
+        )
+        return out
+
+    def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: RandomNumbers) -> Scan:
+        """Return one sweep from a robot at ``pose``; arguments as in :meth:`true_ranges`.
+
+        ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
+        """
+        ranges, pose = np.empty(self._beams), np.asarray(pose, dtype=np.float64)
+        if isinstance(rng, NoiseStream):
+            _noisy_sweep(segments, circles, pose, self._directions, self._limits, rng.words, ranges)
+        else:
+            normals, uniforms = rng.standard_normal(self._beams), rng.random(self._beams)
+            _sweep(segments, circles, pose, self._directions, self._limits, normals, uniforms, ranges)
+        return Scan(ranges, *self._of_scan)
+
+
+def creep(robot: RobotConfig, noise: NoiseConfig) -> Array:
+    """Return by how much of a second's acceleration the wheels run ahead of the body ``(3,)`` [s]: vx, vy, ω.
+
+    A wheel drives by slipping a little: each passes on μ N / s₀ times its slip along the roller's axis
+    (:mod:`mecanum_env.physics.robot`), a quarter of the force at 45° to it.
+    """
+    linear = 2.0 * robot.slip_speed_m_s / (noise.friction * GRAVITY_M_S2)
+    return np.array([linear, linear, linear * robot.inertia_kg_m2 / (robot.mass_kg * robot.lever_m**2)])
+
+
+class WheelEncoders:
+    """Encoders on the four wheels, and the systematic errors of the robot they are mounted on.
+
+    Odometry is reckoned with the nominal wheel radius and lever, less the mean share that is lost to slip and the
+    creep of wheels that accelerate, as one who has calibrated it would. The true ones differ, each wheel's radius
+    and the lever by a relative error drawn uniformly when this is built: once an episode.
+
+    Parameters
+    ----------
+    robot
+        The nominal robot.
+    noise
+        ``encoder``, ``radius_error`` and ``base_error``.
+    rng
+        Yields five uniform numbers.
+
+    Attributes
+    ----------
+    true_radii
+        ``(4,)`` [m], for :class:`mecanum_env.physics.world.World`.
+    true_lever
+        [m], likewise.
+    """
+
+    def __init__(self, robot: RobotConfig, noise: NoiseConfig, rng: np.random.Generator) -> None:
+        self.robot = robot
+        self.noise = noise
+        self._forward = forward_matrix(robot)  # (3, 4)
+        self._sigma, self._rolling = noise.encoder, 1.0 - noise.slip
+        self._creep = creep(robot, noise)
+        self._last = np.zeros(3)  # what the wheels said in the step before
+        u = rng.uniform(-1.0, 1.0, size=5)
+        self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
+        self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
+
+    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
+        """Return the body twist that the wheels' measured rotation stands for.
+
+        Parameters
+        ----------
+        wheel_increments
+            How far each wheel turned ``(4,)`` [rad].
+        dt
+            In what time [s].
+        rng
+            Yields four normal numbers: a measured increment is the true one times 1 + ``encoder`` · N(0, 1).
+        """
+        increments = np.asarray(wheel_increments, dtype=np.float64)
+        twist = np.empty(3)
+        if isinstance(rng, NoiseStream):
+            _read_noisy_encoders(
+                self._forward,
+                increments,
+                rng.words,
+                self._sigma,
+                self._rolling,
+                self._creep,
+                dt,
+                self._last,
+                twist,
+            )
+        else:
+            _read_encoders(
+                self._forward, increments, rng.standard_normal(4), self._sigma, self._rolling, self._creep, dt,
+                self._last, twist,
+            )  # fmt: skip
+        return Odometry(twist, dt)
+
+
+class FilteredEncoders:
+    """Wheel encoders with a filter behind them, reset when this is built: once an episode."""
+
+    def __init__(self, encoders: WheelEncoders, behind: OdometryFilter) -> None:
+        self._encoders, self._filter = encoders, behind
+        behind.reset()
+
+    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
+        """Return the filtered twist; see :meth:`WheelEncoders.odometry`."""
+        return self._filter.filter(self._encoders.odometry(wheel_increments, dt, rng))
+
+
+@njit(cache=True, nogil=True)
+def _read_encoders(
+    forward: Array, increments: Array, normals: Array, sigma: float, rolling: float, creep: Array, dt: float,
+    last: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Write the body's twist: forward · increments (1 + σ normals), less what is lost to slip and to creep.
+
+    ``last`` is what the wheels said a step ago, and becomes what they say now.
+    """
+    for i in range(3):
+        total = 0.0
+        for k in range(4):
+            total += forward[i, k] * (increments[k] * (1.0 + sigma * normals[k]))
+        twist[i] = rolling / dt * total
+    vx, vy, omega = twist[0], twist[1], twist[2]
+    # The acceleration of a body whose axes turn with it.
+    twist[0] -= creep[0] * ((vx - last[0]) / dt - omega * vy)
+    twist[1] -= creep[1] * ((vy - last[1]) / dt + omega * vx)
+    twist[2] -= creep[2] * ((omega - last[2]) / dt)
+    last[0], last[1], last[2] = vx, vy, omega
+
+
+@njit(cache=True, nogil=True)
+def _read_noisy_encoders(
+    forward: Array, increments: Array, words: NDArray[np.uint64], sigma: float, rolling: float, creep: Array,
+    dt: float, last: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Draw the normals from the words of a :class:`NoiseStream`, and do :func:`_read_encoders`."""
+    normals = np.empty(4)
+    fill_normal(words, normals)
+    _read_encoders(forward, increments, normals, sigma, rolling, creep, dt, last, twist)

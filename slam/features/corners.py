@@ -1,0 +1,185 @@
+"""Straight surfaces → the corners where they meet or visibly end, with covariances from the fits (kernels)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.features.surfaces import (
+    EDGE_FACE,
+    EDGE_JUMP,
+    EDGE_LENGTH,
+    EDGE_POINTS,
+    EDGE_SIGMA,
+    EDGE_SPACING,
+    FIRST,
+    FLOOR,
+    LAST,
+    MAX_GAP,
+    MX,
+    MY,
+    NX,
+    NY,
+    POINTS,
+    SIGMA,
+    SIN_MIN_ANGLE,
+    SPLIT_FLOOR,
+    SPLIT_SIGMAS,
+    T0,
+    T1,
+    VAR_OFFSET,
+    VAR_SLOPE,
+    R,
+)
+from slam.types import CONCAVE, CONVEX
+
+Array = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def all_on(xy: Array, first: int, last: int, one: Array, two: Array, limits: Array) -> bool:
+    """Tell whether every point from ``first`` to ``last`` lies on one of two lines."""
+    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
+    for i in range(first, last + 1):
+        off_one = abs(one[NX] * xy[i, 0] + one[NY] * xy[i, 1] - one[R])
+        off_two = abs(two[NX] * xy[i, 0] + two[NY] * xy[i, 1] - two[R])
+        if min(off_one, off_two) > near:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def meet(one: Array, two: Array, increment: float, limits: Array, corner: Array) -> int:
+    """Write the corner of two surfaces that follow each other in the scan; return 1 if there is one."""
+    cross = one[NX] * two[NY] - one[NY] * two[NX]
+    if abs(cross) < limits[SIN_MIN_ANGLE]:
+        return 0
+    x = (one[R] * two[NY] - two[R] * one[NY]) / cross
+    y = (two[R] * one[NX] - one[R] * two[NX]) / cross
+    s1 = -one[NY] * (x - one[MX]) + one[NX] * (y - one[MY])
+    s2 = -two[NY] * (x - two[MX]) + two[NX] * (y - two[MY])
+    # The corner must lie where one surface ends and the other begins, up to the beams' own spacing.
+    rho = math.sqrt(x * x + y * y)
+    gap = limits[MAX_GAP] + 4.0 * rho * increment
+    if abs(s1 - one[T1]) > gap or abs(s2 - two[T0]) > gap:
+        return 0
+    # Each line's offset at the corner: n·p = r there, with this variance.
+    v1 = one[VAR_OFFSET] + s1 * s1 * one[VAR_SLOPE]
+    v2 = two[VAR_OFFSET] + s2 * s2 * two[VAR_SLOPE]
+    # p = N⁻¹ (r1, r2)  ⇒  cov p = N⁻¹ diag(v1, v2) N⁻ᵀ
+    a, b = two[NY] / cross, -one[NY] / cross
+    c, d = -two[NX] / cross, one[NX] / cross
+    floor = limits[FLOOR] ** 2
+    cxx = a * a * v1 + b * b * v2 + floor
+    cxy = a * c * v1 + b * d * v2
+    cyy = c * c * v1 + d * d * v2 + floor
+    # Unit vectors from the corner along both surfaces.
+    f = math.copysign(1.0, -s1)
+    g = math.copysign(1.0, -s2)
+    ax, ay = -one[NY] * f, one[NX] * f
+    bx, by = -two[NY] * g, two[NX] * g
+    # The scan runs counter-clockwise round the sensor: a left turn is a corner of the room, a right turn
+    # one that stands out into it.
+    left = (-ax) * by - (-ay) * bx > 0.0
+    sign = 1.0 if left else -1.0
+    direction = math.atan2(sign * (ay + by), sign * (ax + bx))
+    _to_polar(x, y, cxx, cxy, cyy, CONCAVE if left else CONVEX, direction, 0, corner)
+    return 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _to_polar(
+    x: float, y: float, cxx: float, cxy: float, cyy: float, kind: int, direction: float, edge: int, corner: Array
+) -> None:
+    """Write a point and its covariance as range and bearing."""
+    rho = math.sqrt(x * x + y * y)
+    ux, uy = x / rho, y / rho
+    # The Jacobian's rows are (ux, uy) and (-uy, ux)/ρ.
+    corner[0], corner[1] = rho, math.atan2(y, x)
+    corner[2] = ux * ux * cxx + 2.0 * ux * uy * cxy + uy * uy * cyy
+    corner[3] = (-ux * uy * cxx + (ux * ux - uy * uy) * cxy + ux * uy * cyy) / rho
+    corner[4] = (uy * uy * cxx - 2.0 * ux * uy * cxy + ux * ux * cyy) / (rho * rho)
+    corner[5], corner[6], corner[7] = kind, direction, edge
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meets(line: Array, ray: Array) -> float:
+    """Return where a beam meets a line, along it from its centroid."""
+    reach = line[R] / (line[NX] * ray[0] + line[NY] * ray[1])
+    return float(-line[NY] * (reach * ray[0] - line[MX]) + line[NX] * (reach * ray[1] - line[MY]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def edge(
+    line: Array, side: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array,
+    corner: Array,
+) -> int:  # fmt: skip
+    """Write the corner at which a surface ends in front of something farther away; return 1 if there is one.
+
+    Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
+    beams, uniformly. A short end face may show in between (a wall is as thick as that), all of it behind the
+    line; hidden or not, it is taken to recede at a right angle. (Where a beam stops short of the line, something
+    nearer hides the surface: the rim of a shadow, no landmark.)
+    """
+    if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
+        return 0
+    n = ranges.shape[0]
+    step = 1 if side == 1 else -1
+    index = int(line[LAST]) if side == 1 else int(line[FIRST])
+    full = n * increment > 2.0 * math.pi - 1.5 * increment
+    # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
+    end = _meets(line, rays[index])
+    t = missed = 0.0
+    faces = 0
+    while True:
+        index += step
+        if index < 0 or index >= n:
+            if not full:
+                return 0
+            index %= n
+        reach = ranges[index]
+        if math.isnan(reach):
+            continue
+        across = line[NX] * rays[index, 0] + line[NY] * rays[index, 1]
+        if across < 0.05:
+            return 0
+        missed = line[R] / across  # range at which the beam would meet the line
+        if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
+            return 0
+        if faces == 0:
+            t = _meets(line, rays[index])
+        if reach > missed + limits[EDGE_JUMP]:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            depth = line[NX] * px + line[NY] * py - line[R]
+            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+            if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
+                break  # past the end face, or there is none to see
+        else:
+            px, py = reach * rays[index, 0], reach * rays[index, 1]
+            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+            if beyond > limits[EDGE_FACE]:
+                return 0  # the surface goes on, a little off the line
+        faces += 1
+        if faces > 40:
+            return 0
+    spacing = abs(t - end)
+    if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
+        return 0
+    s = 0.5 * (t + end)
+    x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
+    # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still. And what
+    # was seen of an end face: its points pass for the surface's while they lie within a few σ of it, so the end is
+    # seen too far or, the line tilted by them, too near. That is much the same from look to look; as noise of each
+    # look it is counted for more than it is, and so adds up to no less (docs/consistency.md).
+    along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + 4.0 * limits[SIGMA] ** 2
+    off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
+    nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
+    direction = math.atan2(step * ay - ny, step * ax - nx)
+    _to_polar(
+        x, y, along * ax * ax + off * nx * nx, along * ax * ay + off * nx * ny, along * ay * ay + off * ny * ny,
+        CONVEX, direction, 1, corner,
+    )  # fmt: skip
+    return 1

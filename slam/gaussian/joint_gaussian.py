@@ -1,0 +1,148 @@
+"""The joint Gaussian of the robot and its landmarks: adding to it and reading it, as Numba kernels.
+
+The covariance is the upper triangle of a square array, the robot's three states first; landmark ``i`` stands at
+index 3 + 2i. Association reads it, too (:mod:`slam.landmarks.association`); :mod:`slam.gaussian.stacked_update`
+corrects it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.geometry import wrap_scalar
+from slam.types import LINE
+
+__all__ = [
+    "OBSERVED_LIMIT",
+    "add_landmark",
+    "landmark_by_pose",
+    "near_landmarks",
+    "read_block",
+    "symmetric_block",
+]
+
+Array = NDArray[np.float64]
+
+OBSERVED_LIMIT = 1e4
+"""Bound of what :func:`near_landmarks` writes, m and m²: Gymnasium asks for finite spaces."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
+    """Append a landmark seen at (ρ, φ) = z[:2] with covariance z[2:5] (theory.md A, add a landmark)."""
+    if z[5] == LINE:
+        _add_line(x, p, n, z, offset)
+        return
+    c, s = math.cos(x[2]), math.sin(x[2])
+    cb, sb = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
+    rx, ry = offset * c + z[0] * cb, offset * s + z[0] * sb
+    x[n], x[n + 1] = x[0] + rx, x[1] + ry
+    # Gr = [[1, 0, -ry], [0, 1, rx]];  cross = Gr P_r:, written into the new columns of the upper triangle.
+    for j in range(n):
+        p0 = p[0, j]
+        p1 = p[1, j] if j >= 1 else p[0, 1]
+        p2 = p[2, j] if j >= 2 else p[j, 2]
+        p[j, n] = p0 - ry * p2
+        p[j, n + 1] = p1 + rx * p2
+    # Gz = [[cb, -ρ sb], [sb, ρ cb]]
+    a, b, d, e = cb, -z[0] * sb, sb, z[0] * cb
+    r00 = a * a * z[2] + 2.0 * a * b * z[3] + b * b * z[4]
+    r01 = a * d * z[2] + (a * e + b * d) * z[3] + b * e * z[4]
+    r11 = d * d * z[2] + 2.0 * d * e * z[3] + e * e * z[4]
+    p[n, n] = p[0, n] - ry * p[2, n] + r00
+    p[n, n + 1] = p[0, n + 1] - ry * p[2, n + 1] + r01
+    p[n + 1, n + 1] = p[1, n + 1] + rx * p[2, n + 1] + r11
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_line(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
+    """Append a line (α, r) seen at distance z[0] and bearing z[1]: α = θ + φ, r = ρ + n(α)ᵀ s."""
+    alpha = wrap_scalar(x[2] + z[1])
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    c, s = math.cos(x[2]), math.sin(x[2])
+    sx, sy = x[0] + offset * c, x[1] + offset * s
+    lever = nx * sy - ny * sx  # (J n)ᵀ s: by how much r grows with α
+    turn = lever + offset * (ny * c - nx * s)
+    x[n], x[n + 1] = alpha, z[0] + nx * sx + ny * sy
+    # Gr = [[0, 0, 1], [nx, ny, turn]], Gz (by distance, bearing) = [[0, 1], [1, lever]]
+    for j in range(n):
+        p0 = p[0, j]
+        p1 = p[1, j] if j >= 1 else p[0, 1]
+        p2 = p[2, j] if j >= 2 else p[j, 2]
+        p[j, n] = p2
+        p[j, n + 1] = nx * p0 + ny * p1 + turn * p2
+    p[n, n] = p[2, n] + z[4]
+    p[n, n + 1] = p[2, n + 1] + z[3] + lever * z[4]
+    p[n + 1, n + 1] = (
+        nx * p[0, n + 1] + ny * p[1, n + 1] + turn * p[2, n + 1]
+        + z[2] + 2.0 * lever * z[3] + lever * lever * z[4]
+    )  # fmt: skip
+
+
+def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:
+    """Return Gr ``(2, 3)``, the Jacobian by the pose of the landmark that :func:`add_landmark` appends."""
+    x, y, theta = pose[:3].tolist()
+    is_line = z[5] == LINE
+    away_x = offset * math.cos(theta) + (0.0 if is_line else z[0] * math.cos(theta + z[1]))
+    away_y = offset * math.sin(theta) + (0.0 if is_line else z[0] * math.sin(theta + z[1]))
+    if not is_line:
+        return np.array([[1.0, 0.0, -away_y], [0.0, 1.0, away_x]])
+    nx, ny = math.cos(theta + z[1]), math.sin(theta + z[1])
+    turn = nx * (y + away_y) - ny * (x + away_x) + ny * away_x - nx * away_y
+    return np.array([[0.0, 0.0, 1.0], [nx, ny, turn]])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def symmetric_block(p: Array, out: Array) -> None:
+    """Write the leading block of an upper triangle as the full symmetric matrix."""
+    for i in range(out.shape[0]):
+        for j in range(i, out.shape[0]):
+            out[i, j] = out[j, i] = p[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+    """Write the block at these rows and columns of the symmetric matrix whose upper triangle is p."""
+    for a in range(rows.shape[0]):
+        for b in range(a, rows.shape[0]):
+            i, j = min(rows[a], rows[b]), max(rows[a], rows[b])
+            out[a, b] = out[b, a] = p[i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -> None:
+    """Write the nearest point landmarks in the robot frame, by insertion into a list sorted by distance."""
+    out[:] = 0.0
+    c, s = math.cos(x[2]), math.sin(x[2])
+    size = out.shape[0]
+    nearest, distance = np.empty(size, np.int64), np.empty(size)
+    filled = 0
+    for i in range(marks.shape[0]):
+        if marks[i, 0] == LINE:
+            continue
+        dx, dy = x[3 + 2 * i] - x[0], x[4 + 2 * i] - x[1]
+        d2 = dx * dx + dy * dy
+        j = filled if filled < size else size - 1
+        if filled == size and d2 >= distance[j]:
+            continue
+        while j > 0 and distance[j - 1] > d2:
+            nearest[j], distance[j] = nearest[j - 1], distance[j - 1]
+            j -= 1
+        nearest[j], distance[j] = i, d2
+        filled = min(filled + 1, size)
+    for j in range(filled):
+        k = 3 + 2 * nearest[j]
+        dx, dy = x[k] - x[0], x[k + 1] - x[1]
+        a, b, d = p[k, k], p[k, k + 1], p[k + 1, k + 1]
+        out[j, 0] = c * dx + s * dy
+        out[j, 1] = -s * dx + c * dy
+        out[j, 2] = c * c * a + 2.0 * c * s * b + s * s * d
+        out[j, 3] = -c * s * a + (c * c - s * s) * b + c * s * d
+        out[j, 4] = s * s * a - 2.0 * c * s * b + c * c * d
+        for q in range(5):
+            out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
+        out[j, 5] = 1.0

@@ -1,0 +1,166 @@
+"""The wheels' lasting errors as states of the filter: each wheel's radius and the lever, off by as much all along.
+
+A wheel a hundredth too large claims a hundredth too little in every step. A filter that takes that for white noise
+is too unsure at first, when little has added up, and too sure in the end. With the errors e as states, which stay
+as they are, the twist is
+
+    u = ũ + B(ũ) e,   B's column of wheel i: uᵢ/4 (1, yᵢ, tᵢ/l),  of the lever: (0, 0, ω)
+
+ũ being the twist that the wheels claim and uᵢ = vx + yᵢ vy + tᵢ l ω how fast wheel i rolls. e is correlated with
+the robot and every landmark. Its own covariance E and the cross-covariance C stand beside P:
+
+    predict   C_r ← C_r Fxᵀ + E Dᵀ,   P_rm += D C_m,   P_rr += D C_r Fxᵀ + (D C_r Fxᵀ)ᵀ + D E Dᵀ,   D = Fu B
+    update    W_e = L⁻¹ H Cᵀ,   e += W_eᵀ L⁻¹ ν,   C −= W_eᵀ W,   E −= W_eᵀ W_e
+
+(theory.md A with the state enlarged; W and L are :mod:`slam.gaussian.stacked_update`'s). Driving one way
+shows one combination of the four radii; twists in all three components show all five errors.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.gaussian.lanes import LANES, aligned_zeros
+from slam.gaussian.stacked_update import solve
+from slam.gaussian.tiles import add_combination, subtract
+from slam.motion import LastingErrors
+
+__all__ = ["WheelErrors"]
+
+Array = NDArray[np.float64]
+
+_STATES = 5
+# The rollers' directions: every combination of signs occurs on one wheel; which one, e does not mind.
+_SIDE = np.array([-1.0, 1.0, 1.0, -1.0])
+_TURN = np.array([-1.0, 1.0, -1.0, 1.0])
+
+
+class WheelErrors:
+    """Estimates of the five errors, and how they hang together with everything else."""
+
+    def __init__(self, declared: LastingErrors, lever_m: float, observations: int, size: int) -> None:
+        self._lever_m = lever_m
+        self.mean = np.zeros(_STATES)
+        self.cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
+        self.cross = aligned_zeros(_STATES, size)  # C: of each error with the robot and the landmarks
+        self._w = aligned_zeros(2 * observations, 2 * LANES)  # W_e; solve takes two vectors of a row at a time
+        self._b = np.zeros((3, _STATES))
+
+    def snapshot(self) -> tuple[Array, Array, Array]:
+        """Return what :meth:`restore` takes."""
+        return self.mean.copy(), self.cov.copy(), self.cross.copy()
+
+    def restore(self, kept: tuple[Array, Array, Array]) -> None:
+        """Go back to what was kept."""
+        self.mean[:], self.cov[:], self.cross[:] = kept
+
+    def corrected(self, twist: Array) -> Array:
+        """Return the twist ``(3,)`` of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""
+        _twist_by_errors(twist, self._lever_m, self._b)
+        return np.asarray(twist + self._b @ self.mean)
+
+    def predict(self, p: Array, n: int, before: Array, after: Array, omega: float, dt: float) -> None:
+        """Carry on a step's errors, after :func:`slam.motion.predict_robot` and :meth:`corrected` of its twist."""
+        _predict(p, n, self.cross, self.cov, self._b, before, after, omega, dt)
+
+    def correct(self, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array, rows: int) -> None:
+        """Correct by a stacked update that :func:`slam.gaussian.stacked_update.whiten` has prepared."""
+        _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows)
+
+    def reset(self, n: int, a: Array) -> None:
+        """Go along with the invariant filter's reset; ``a`` ``(3, ≥ n)`` is A's columns by θ, x and y."""
+        _reset(self.cross, n, a)
+
+    def add(self, n: int, gr: Array) -> None:
+        """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""
+        self.cross[:, n : n + 2] = self.cross[:, :3] @ gr.T
+
+    def drop(self, n: int, i: int) -> None:
+        """Leave out the two states from ``i`` on."""
+        self.cross[:, i : n - 2] = self.cross[:, i + 2 : n].copy()
+
+    def enlarge(self, size: int) -> None:
+        """Make room for a larger state."""
+        cross = aligned_zeros(_STATES, size)
+        cross[:, : self.cross.shape[1]] = self.cross
+        self.cross = cross
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _twist_by_errors(twist: Array, lever: float, b: Array) -> None:
+    """Write B, the Jacobian ``(3, 5)`` of the twist by the errors."""
+    for i in range(4):
+        quarter = 0.25 * (twist[0] + _SIDE[i] * twist[1] + _TURN[i] * lever * twist[2])
+        b[0, i], b[1, i], b[2, i] = quarter, _SIDE[i] * quarter, _TURN[i] * quarter / lever
+    b[2, 4] = twist[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict(
+    p: Array, n: int, cross: Array, cov: Array, b: Array, before: Array, after: Array, omega: float, dt: float
+) -> None:
+    """C_r ← C_r Fxᵀ + E Dᵀ, and what the errors add to the robot's rows of P."""
+    # Fx's entries by θ are J times the step, Fu's a rotation by the heading half way and half of Fx's.
+    fx, fy = -(after[1] - before[1]), after[0] - before[0]
+    middle = before[2] + 0.5 * omega * dt
+    c, s = math.cos(middle) * dt, math.sin(middle) * dt
+    d = np.empty((3, _STATES))
+    for i in range(_STATES):
+        d[0, i] = c * b[0, i] - s * b[1, i] + 0.5 * dt * fx * b[2, i]
+        d[1, i] = s * b[0, i] + c * b[1, i] + 0.5 * dt * fy * b[2, i]
+        d[2, i] = dt * b[2, i]
+        cross[i, 0] += fx * cross[i, 2]
+        cross[i, 1] += fy * cross[i, 2]
+    for q in range(3):
+        for i in range(_STATES):
+            for j in range(3, n):
+                p[q, j] += d[q, i] * cross[i, j]
+    ed = np.zeros((_STATES, 3))  # E Dᵀ
+    for i in range(_STATES):
+        for q in range(3):
+            for j in range(_STATES):
+                ed[i, q] += cov[i, j] * d[q, j]
+    for q in range(3):
+        for r in range(q, 3):
+            for i in range(_STATES):
+                p[q, r] += d[q, i] * (cross[i, r] + ed[i, r]) + cross[i, q] * d[r, i]
+    cross[:, :3] += ed
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _correct(
+    mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
+    we: Array, rows: int,
+) -> None:  # fmt: skip
+    """W_e = L⁻¹ H Cᵀ, e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
+    a = 0
+    for k in range(match.shape[0]):
+        if match[k] < 0:
+            continue
+        m = 3 + 2 * match[k]
+        for e in range(2):
+            g = h[a // 2, e]
+            for i in range(_STATES):
+                c = cross[i]
+                we[a + e, i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3] * c[m] + g[4] * c[m + 1]
+        a += 2
+    solve(s, we, _STATES, rows)
+    add_combination(mean, _STATES, s[:rows, rows], we)
+    subtract(cross, _STATES, n, we, w, rows)
+    for i in range(_STATES):
+        for j in range(_STATES):
+            for k in range(rows):
+                cov[i, j] -= we[k, i] * we[k, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reset(cross: Array, n: int, a: Array) -> None:
+    """C ← C (I + A S)ᵀ, S taking θ, x and y (invariant-ekf.md, Reset)."""
+    for i in range(_STATES):
+        theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
+        for j in range(n):
+            cross[i, j] += theta * a[0, j] + x * a[1, j] + y * a[2, j]

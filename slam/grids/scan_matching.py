@@ -1,0 +1,193 @@
+"""Scan matching: where a scan fits a map of surfaces best, and how well that is known.
+
+The map is a likelihood field: every cell holds exp(-d²/2s²), d the distance to the nearest surface point. A match
+first searches a bounded window over x, y and θ exhaustively (Olson 2009, "Real-time correlative scan matching": a
+coarse table of maxima bounds blocks of poses, so that few are looked at closely), then climbs to the top between
+the cells (Gauss-Newton on the interpolated field, as Kohlbrecher et al. 2011, "A flexible and scalable SLAM
+system with full 3D motion estimation"; by a quadratic spline, since between two cells the same distance from a
+wall a bilinear field is flat, and says nothing of where between them the wall is). Each beam counts by Welsch's
+robust loss, so what the map does not know yet, people and lost beams pull little or not at all.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.grids.match_kernels import BLOCK, climb, correlate, splat
+from slam.settings import require
+from slam.types import Scan
+
+__all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search", "stamps_of"]
+
+Array = NDArray[np.float64]
+Values = NDArray[np.float32]
+
+_PHASES = 8  # sub-cell positions a side at which a surface point is drawn
+_FLAT_INFO = 1e-3  # [1/m², 1/rad²] added so that a featureless scan still has a (very wide) covariance
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchConfig:
+    """The field, the window of the search, and how much a beam is believed."""
+
+    cell_m: float = 0.05
+    smooth_m: float = 0.1  # s: reach of a surface in the field
+    window_m: float = 0.3  # the search goes as far as this to either side …
+    window_rad: float = 0.25
+    step_rad: float = 0.0125  # … in steps of one cell and of this
+    sigma_m: float = 0.03  # of a beam's end against the map: range noise and the map's own error
+    # A scan's beams err together (edges of cells, bent walls, a moving robot): each counts as this part of one.
+    beam_weight: float = 0.2
+    beams: int = 180  # used at most, evenly thinned
+    reach_m: float = 20.0  # beams that end farther are not used
+    iterations: int = 12
+
+    def __post_init__(self) -> None:
+        for name in ("cell_m", "smooth_m", "step_rad", "sigma_m", "beam_weight", "reach_m"):
+            require(getattr(self, name) > 0, f"MatchConfig.{name} must be > 0")
+        require(self.smooth_m >= self.cell_m, "MatchConfig.smooth_m must be at least MatchConfig.cell_m")
+        require(self.window_m >= 0 and self.window_rad >= 0, "MatchConfig.window_* must be ≥ 0")
+        require(self.beams >= 1 and self.iterations >= 1, "MatchConfig.beams and iterations must be at least 1")
+
+    @property
+    def gain(self) -> float:
+        """What a beam's field value is worth in nat: 1 - L ≈ d²/2s², and a Gaussian's exponent is d²/2σ²."""
+        return self.beam_weight * (self.smooth_m / self.sigma_m) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Where a scan fits best."""
+
+    pose: Array  # (3,) x [m], y [m], θ [rad] in the field's frame
+    cov: Array  # (3, 3) from the curvature there, prior included
+    score: float  # mean field value over the beams: 1 where every beam ends on a surface
+    log_likelihood: float  # [nat] relative to a perfect fit, prior not included
+
+
+class LikelihoodField:
+    """A window of the plane whose cells hold exp(-d²/2s²), d the distance to the nearest surface point.
+
+    Attributes
+    ----------
+    values : NDArray[np.float32]
+        ``(rows, cols)`` in [0, 1]; rows run along y.
+    x0, y0 : float
+        Centre of cell (0, 0) [m].
+    """
+
+    def __init__(self, config: MatchConfig, low: tuple[float, float], high: tuple[float, float]) -> None:
+        """Make an empty field over the box from ``low`` to ``high`` [m]."""
+        cell = config.cell_m
+        self.cell_m, self.stamps = cell, stamps_of(config)
+        col, row = math.floor(low[0] / cell), math.floor(low[1] / cell)
+        shape = (math.floor(high[1] / cell) - row + 1, math.floor(high[0] / cell) - col + 1)
+        self.x0, self.y0 = (col + 0.5) * cell, (row + 0.5) * cell
+        self.values = np.zeros(shape, np.float32)
+        self._bounds: Values | None = None
+
+    @classmethod
+    def of_points(cls, config: MatchConfig, points: Array, *, margin_m: float = 1.0) -> LikelihoodField:
+        """Draw surface points ``(n, 2)`` [m] into a field that encloses them with a margin."""
+        if not len(points):
+            return cls(config, (0.0, 0.0), (0.0, 0.0))
+        low, high = points.min(axis=0) - margin_m, points.max(axis=0) + margin_m
+        field = cls(config, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+        field.add(points)
+        return field
+
+    def add(self, points: Array) -> None:
+        """Draw surface points ``(n, 2)`` [m]; what lies outside is left out."""
+        splat(self.values, self.x0, self.y0, self.cell_m, self.stamps, np.asarray(points, dtype=np.float64))
+        self._bounds = None
+
+    @property
+    def bounds(self) -> Values:
+        """Cell (r, c): the largest value of the block of 4 × 4 cells that begins there."""
+        if self._bounds is None:
+            kernel = np.ones((BLOCK, BLOCK), np.uint8)
+            self._bounds = np.asarray(
+                cv2.dilate(self.values, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0.0),
+                np.float32,
+            )
+        return self._bounds
+
+
+_STAMPS: dict[tuple[float, float], Values] = {}
+
+
+def stamps_of(config: MatchConfig) -> Values:
+    """Return what a surface point looks like in the cells around it, ``(phases, phases, size, size)``."""
+    key = (config.cell_m, config.smooth_m)
+    if key not in _STAMPS:
+        half = math.ceil(2.5 * config.smooth_m / config.cell_m)
+        offset = np.arange(-half, half + 1) * config.cell_m
+        phase = ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5) * config.cell_m
+        d2 = (offset[None, :] - phase[:, None]) ** 2  # (phases, size)
+        distance2 = d2[:, None, :, None] + d2[None, :, None, :]
+        _STAMPS[key] = np.exp(-0.5 * distance2 / config.smooth_m**2).astype(np.float32)
+    return _STAMPS[key]
+
+
+def body_points(scan: Scan, config: MatchConfig, *, offset_m: float = 0.0) -> Array:
+    """Return where beams ended ``(n, 2)`` [m] in the body frame, the sensor ``offset_m`` ahead of its centre.
+
+    Lost beams (``nan``), those without return (``inf``, or at ``range_max``), those below ``range_min`` and those
+    beyond ``reach_m`` are left out; if more are left than ``beams``, evenly spaced ones are taken.
+    """
+    ranges = np.asarray(scan.ranges, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        good = (ranges < min(scan.range_max, config.reach_m)) & (ranges >= scan.range_min) & (ranges > 0.0)
+    index = np.flatnonzero(good)
+    if len(index) > config.beams:
+        index = index[(np.arange(config.beams) * len(index)) // config.beams]
+    angle = scan.angle_min + scan.angle_increment * index
+    r = ranges[index]
+    return np.column_stack([offset_m + r * np.cos(angle), r * np.sin(angle)])
+
+
+def match(
+    field: LikelihoodField, points: Array, guess: Array, config: MatchConfig, *, prior_info: Array | None = None,
+) -> Match:  # fmt: skip
+    """Search the window around ``guess`` ``(3,)``, then refine; ``points`` ``(n, 2)`` are in the body frame.
+
+    ``prior_info`` ``(3, 3)`` is the information of the guess itself, none where it is left out.
+    """
+    return refine(field, points, search(field, points, guess, config, prior_info=prior_info), config,
+                  prior=guess, prior_info=prior_info)  # fmt: skip
+
+
+def search(
+    field: LikelihoodField, points: Array, guess: Array, config: MatchConfig, *, prior_info: Array | None = None,
+) -> Array:  # fmt: skip
+    """Return the best pose ``(3,)`` of the window, to a cell and ``step_rad``: exhaustive, by bounds (Olson)."""
+    info = np.zeros((3, 3)) if prior_info is None else np.asarray(prior_info, dtype=np.float64)
+    shifts = math.ceil(config.window_m / config.cell_m)
+    turns = math.ceil(config.window_rad / config.step_rad)
+    return correlate(
+        field.values, field.bounds, field.x0, field.y0, field.cell_m, points, np.asarray(guess, dtype=np.float64),
+        shifts, turns, config.step_rad, config.gain, info,
+    )  # fmt: skip
+
+
+def refine(
+    field: LikelihoodField, points: Array, guess: Array, config: MatchConfig, *, prior: Array | None = None,
+    prior_info: Array | None = None,
+) -> Match:  # fmt: skip
+    """Climb from ``guess`` ``(3,)`` to the nearest best fit; a prior pose with its information pulls along."""
+    pose = np.array(guess, dtype=np.float64)
+    info = np.zeros((3, 3)) if prior_info is None else np.array(prior_info, dtype=np.float64)
+    mean = pose.copy() if prior is None else np.asarray(prior, dtype=np.float64)
+    curvature = np.zeros((3, 3))
+    total = climb(
+        field.values, field.x0, field.y0, field.cell_m, points, pose, mean, info, config.gain,
+        config.iterations, curvature,
+    )  # fmt: skip
+    cov = np.linalg.inv(curvature + np.eye(3) * _FLAT_INFO)
+    n = len(points)
+    return Match(pose, 0.5 * (cov + cov.T), total / n if n else 0.0, config.gain * (total - n))

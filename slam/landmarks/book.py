@@ -1,0 +1,377 @@
+"""The book of landmarks: tentative → confirmed → dropped.
+
+A corner seen once may be noise or a passing shape; only one that was seen again at the same place, of the same
+kind, enters the estimator's state. One that the scan keeps looking *through* was never there, or is gone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.geometry import wrap_scalar
+from slam.landmarks.association import UNMATCHED
+from slam.settings import require
+from slam.types import LINE, Scan
+
+__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy"]
+
+Array = NDArray[np.float64]
+
+KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
+
+# Columns of ``marks``, one row a landmark.
+_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN, _FROM, _TO = range(8)
+_RECENT = 3  # updates
+_WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may become one landmark
+# Columns of the tentative ones.
+_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
+_TENTATIVE = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class LandmarkPolicy:
+    """When a corner becomes a landmark, and when it ceases to be one."""
+
+    confirm_after: int = 3  # sightings …
+    edge_confirm_after: int = 8  # … of a surface's visible end, which a round table can feign, more of them …
+    edge_baseline_m: float = 0.2  # … and from two places this far apart
+    forget_after: int = 20  # updates without a sighting, while tentative
+    tentative_gate_m: float = 0.1  # two sightings farther apart are two corners
+    new_distance_m: float = 0.2  # a new corner is at least this far from a landmark of its kind
+    drop_after: int = 15  # contradictions more than sightings
+    overlook_after: int = 25  # dropped when overlooked, in plain view, more often than this …
+    overlook_ratio: float = 5.0  # … and this many times the sightings
+    clear_margin_m: float = 0.3  # a beam that goes this far beyond a landmark contradicts it
+
+    def __post_init__(self) -> None:
+        require(self.confirm_after >= 1, "LandmarkPolicy.confirm_after must be at least 1")
+        require(self.drop_after >= 1, "LandmarkPolicy.drop_after must be at least 1")
+
+
+class LandmarkBook:
+    """What is known of each landmark beside its position, which the estimator keeps."""
+
+    def __init__(self, policy: LandmarkPolicy) -> None:
+        self.policy = p = policy
+        self.count = 0
+        self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
+        self._next_id = 0
+        self._now = 0  # updates reviewed
+        self._ids = np.zeros(32, np.int64)
+        self._marks = np.zeros((32, 8))
+        self._tentative = np.zeros((_TENTATIVE, 8))
+        self._tentative_count = 0
+        self._new = np.zeros(256, np.int64)
+        self._limits = np.array([
+            p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
+            p.clear_margin_m, p.drop_after, p.overlook_after, p.overlook_ratio,
+        ])  # fmt: skip
+
+    @property
+    def marks(self) -> Array:
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to ``(n, 8)``.
+
+        A wall goes from one to the other [m], along it from its foot. A view.
+        """
+        return self._marks[: self.count]
+
+    @property
+    def now(self) -> int:
+        """The number of updates reviewed."""
+        return self._now
+
+    @property
+    def ids(self) -> NDArray[np.int64]:
+        """Ids ``(n,)``; an id is never used twice. A view."""
+        return self._ids[: self.count]
+
+    def kinds(self) -> NDArray[np.int8]:
+        """Return CONVEX, CONCAVE or 0 (unknown) per landmark ``(n,)``."""
+        return self.marks[:, _KIND].astype(np.int8)
+
+    def directions(self) -> Array:
+        """Return the direction per landmark ``(n,)`` [rad], nan where the kind is unknown."""
+        return np.where(self.marks[:, _KIND] == 0, np.nan, self.marks[:, _DIRECTION])
+
+    def times_seen(self) -> NDArray[np.int64]:
+        """Return the number of sightings per landmark ``(n,)``."""
+        return self.marks[:, _SEEN].astype(np.int64)
+
+    def row(self, landmark_id: int) -> int:
+        """Return the row of a landmark, or -1."""
+        if 0 <= landmark_id < len(self.row_of_id):
+            return int(self.row_of_id[landmark_id])
+        return -1
+
+    def add(
+        self, kind: float, direction: float, known_id: int | None, *, extent: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        """Append a landmark; without a known id it gets the next one. A wall has an extent along it [m]."""
+        new_id = self._next_id if known_id is None else known_id
+        if new_id < 0:
+            raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
+        if self.count == len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        while new_id >= len(self.row_of_id):
+            self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
+        self._ids[self.count] = new_id
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now, *extent)
+        self.row_of_id[new_id] = self.count
+        self._next_id = max(self._next_id, new_id + 1)
+        self.count += 1
+
+    def drop(self, row: int) -> None:
+        """Take a landmark out; those after it move up."""
+        n = self.count
+        self.row_of_id[self._ids[row]] = -1
+        self._ids[row : n - 1] = self._ids[row + 1 : n]
+        self._marks[row : n - 1] = self._marks[row + 1 : n]
+        self.count = n - 1
+        self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
+
+    def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
+        """Have these landmarks ``(n,)``, with these marks ``(n, 8)``, instead of those it has."""
+        self.row_of_id[self.ids] = -1
+        count = len(ids)
+        while count > len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        self._ids[:count], self._marks[:count] = ids, marks
+        self.row_of_id[ids] = np.arange(count)
+        self.count = count
+
+    def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
+        """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
+        recent, still = count_recent(self.marks, match, self._now)
+        return recent, still
+
+    def just_seen(self) -> NDArray[np.int64]:
+        """Return the rows ``(k,)`` of the points that the last update showed."""
+        return _points_seen_at(self._marks, self.count, self._now)
+
+    def count_sightings(self, match: NDArray[np.int64]) -> None:
+        """Count an update in which these rows (negative: none) were seen, all of them known from outside."""
+        self._now += 1
+        seen = match[match >= 0]
+        self._marks[seen, _SEEN] += 1.0
+        self._marks[seen, _LAST_SEEN] = self._now
+
+    def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Count sightings; return which observations are new landmarks by now.
+
+        ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their landmarks.
+        """
+        self._now += 1
+        if len(self._new) < len(z):
+            self._new = np.zeros(len(z), np.int64)
+        count, self._tentative_count = _review(
+            x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count, self._limits,
+            False, self._new,
+        )  # fmt: skip
+        return self._new[:count]
+
+    def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
+        """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
+        doubtful = _look_through(
+            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks, self._limits
+        )
+        return self._to_drop() if doubtful else []
+
+    def review_scan(
+        self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan
+    ) -> tuple[list[int], list[int]]:
+        """Do :meth:`review` and :meth:`contradicted` in one call of a kernel; return the results of both.
+
+        Looking for contradictions first and adding what is new after is the same: what is new was just seen.
+        """
+        self._now += 1
+        if len(self._new) < len(z):
+            self._new = np.zeros(len(z), np.int64)
+        count, self._tentative_count, doubtful = _review_scan(
+            x, offset, z, match, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks,
+            self._tentative, self._tentative_count, self._limits, self._new,
+        )  # fmt: skip
+        return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
+
+    def _to_drop(self) -> list[int]:
+        p, marks = self.policy, self.marks
+        passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
+        overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
+        return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
+
+
+@njit(cache=True, nogil=True)
+def _points_seen_at(marks: Array, count: int, now: float) -> NDArray[np.int64]:
+    out = np.empty(count, np.int64)
+    found = 0
+    for row in range(count):
+        out[found] = row
+        found += marks[row, _LAST_SEEN] == now and marks[row, _KIND] != LINE
+    return out[:found]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
+    """Stretch wall ``row`` to the piece of it that is seen, and take over its direction from the state."""
+    alpha = x[3 + 2 * row]
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    sx, sy = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
+    c, s = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
+    for e in range(8, 10):
+        t = nx * (sy + z[0] * s + z[e] * c) - ny * (sx + z[0] * c - z[e] * s)
+        mark[_FROM], mark[_TO] = min(mark[_FROM], t), max(mark[_TO], t)
+    mark[_DIRECTION] = alpha
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
+    """Count what :meth:`LandmarkBook.recently_seen` returns."""
+    recent = still = 0
+    for i in range(marks.shape[0]):
+        if marks[i, _LAST_SEEN] > now - _RECENT:
+            recent += 1
+    for k in range(match.shape[0]):
+        if match[k] >= 0 and marks[match[k], _LAST_SEEN] > now - _RECENT:
+            still += 1
+    return recent, still
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _review(
+    x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
+    n: int, limits: Array, at_once: bool, new: NDArray[np.int64],
+) -> tuple[int, int]:  # fmt: skip
+    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are.
+
+    With ``at_once``, what is seen where features meet is a landmark at its first sighting.
+    """
+    gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
+    forget_after = limits[4]
+    c, s = math.cos(x[2]), math.sin(x[2])
+    found = 0
+    for i in range(n):
+        tentative[i, _AGE] += 1.0
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            marks[match[k], _SEEN] += 1.0
+            marks[match[k], _LAST_SEEN] = now
+            if z[k, KIND] == LINE:
+                _lengthen(x, offset, z[k], match[k], marks[match[k]])
+            continue
+        if match[k] != UNMATCHED:
+            continue
+        bearing = x[2] + z[k, 1]
+        px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
+        py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
+        turn = wrap_scalar(x[2] + z[k, 6])
+        if z[k, KIND] == LINE:
+            # The middle of the piece that is seen stands for it; another piece of the same wall counts, too.
+            middle = 0.5 * (z[k, 8] + z[k, 9])
+            px, py = px - middle * math.sin(bearing), py + middle * math.cos(bearing)
+        nearest, best = -1, gate * gate
+        for i in range(n):
+            dx, dy = tentative[i, _X] - px, tentative[i, _Y] - py
+            if z[k, KIND] == LINE:
+                d2 = (dx * math.cos(turn) + dy * math.sin(turn)) ** 2
+                if tentative[i, _T_KIND] != LINE or dx * dx + dy * dy > _WALL_REACH_M**2:
+                    continue
+            else:
+                d2 = dx * dx + dy * dy
+            same = tentative[i, _T_KIND] == z[k, 5] and (
+                z[k, 5] == 0.0 or abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
+            )
+            if same and d2 < best:
+                nearest, best = i, d2
+        if nearest < 0:
+            if n == tentative.shape[0]:
+                continue
+            nearest = n
+            n += 1
+            tentative[nearest, _COUNT] = 0.0
+            t = tentative[nearest]
+            t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
+        # Compared with where it was first seen: what wanders with the robot never settles.
+        t = tentative[nearest]
+        # This very scan has made it a landmark already. Another piece of a wall is the same wall; another corner,
+        # seen at once with the first, is another one.
+        if t[_AGE] == np.inf and z[k, KIND] == LINE:
+            continue
+        t[_T_DIRECTION] = turn
+        t[_COUNT] += 1.0
+        t[_AGE] = 0.0
+        moved = (x[0] - t[_FROM_X]) ** 2 + (x[1] - t[_FROM_Y]) ** 2
+        settled = t[_COUNT] >= edge_confirm_after and moved >= baseline * baseline
+        if settled or (z[k, EDGE] == 0.0 and (at_once or t[_COUNT] >= confirm_after)):
+            new[found] = k
+            found += 1
+            t[_AGE] = np.inf
+    kept = 0
+    for i in range(n):
+        if tentative[i, _AGE] <= forget_after:
+            if kept != i:
+                tentative[kept] = tentative[i]
+            kept += 1
+    return found, kept
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look_through(
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
+    limits: Array,
+) -> bool:  # fmt: skip
+    """Count, for each landmark near by, whether three beams pass it or one ends at it; tell if any is doubtful."""
+    margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
+    c, s = math.cos(x[2]), math.sin(x[2])
+    sx, sy = x[0] + offset * c, x[1] + offset * s
+    beams = ranges.shape[0]
+    circle = round(2.0 * math.pi / increment)
+    full = beams >= circle
+    doubtful = False
+    for i in range(marks.shape[0]):
+        if marks[i, _LAST_SEEN] == now or marks[i, _KIND] == LINE:
+            continue
+        dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
+        d2 = dx * dx + dy * dy
+        # Farther away, an uncertain heading moves the beams past a corner that is there.
+        if d2 > 25.0:
+            continue
+        rho = math.sqrt(d2)
+        b = round(wrap_scalar(math.atan2(dy, dx) - x[2] - angle_min) / increment)
+        if b < 0:
+            b += circle
+        passed, ended = 0, 0
+        for q in range(b - 1, b + 2):
+            j = q % beams if full else q
+            if 0 <= j < beams:
+                if ranges[j] > rho + margin:
+                    passed += 1
+                elif abs(ranges[j] - rho) < 0.5 * margin:
+                    ended += 1
+        if passed == 3:
+            marks[i, _MISSED] += 1.0
+        elif ended > 0:
+            marks[i, _UNSEEN] += 1.0
+        if (
+            marks[i, _MISSED] - marks[i, _SEEN] > drop_after
+            or marks[i, _UNSEEN] > overlook_after + overlook_ratio * marks[i, _SEEN]
+        ):
+            doubtful = True
+    return doubtful
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _review_scan(
+    x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
+    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, new: NDArray[np.int64],
+) -> tuple[int, int, bool]:  # fmt: skip
+    # The first scan is taken at the start, whose pose is known. Landmarks that had to wait for two more would be
+    # placed from where the wheels alone have the robot by then, and pass that on to all that is mapped later:
+    # over apartments with slippery floors it was four fifths of the whole.
+    found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, now == 1, new)
+    return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)

@@ -1,0 +1,124 @@
+"""Old landmarks seen again from an uncertain place: taken for what they are only together (kernels).
+
+A gate says that an observation *could* be a landmark. Whether it is, is another matter where the gate is wider
+than features stand apart: after a long way the one landmark inside it may be the neighbour of the one that is
+seen, which is not in the map yet, and individual gating finds nothing ambiguous in that. One wall taken for the
+next, half a metre beside it, bends the map for good, at a likelihood that no test notices. So such pairings are
+put off until several of one scan agree: jointly compatible (Neira and Tardós 2001), and so many that some of them
+are *predicted*, narrowly, by the others. The first ones only fix the pose, and any pose would do for those.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.landmarks.association import IGNORED, extend, joint_compatibility, predicted
+from slam.types import LINE
+
+__all__ = ["agreeing", "put_off"]
+
+Array = NDArray[np.float64]
+
+_LAST_SEEN = 5  # column of marks
+_OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company
+_HOLD = 3  # other landmarks seen, that old ones can wait for company
+_LEAST = 3  # old landmarks that the others predict narrowly, for them all to be taken
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _variance(z: Array, s00: float, s01: float, s11: float) -> float:
+    """Return the variance [m²] of where an observation is expected, from that of range and bearing.
+
+    Of a wall, across it and in the middle of the piece that is seen: it turns about its foot.
+    """
+    if z[5] == LINE:
+        t = 0.5 * (z[8] + z[9])
+        return float(s00 - 2.0 * t * s01 + t * t * s11)
+    across = z[0] * z[0] * s11
+    half = 0.5 * (s00 - across)
+    return float(0.5 * (s00 + across) + math.sqrt(half * half + z[0] * z[0] * s01 * s01))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _expected_variance(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
+    """Return the variance [m²] of where landmark ``i`` should be seen, the observation's own noise left out."""
+    predicted(x, i, z[5], offset, h)
+    s00 = s01 = s11 = 0.0
+    for a in range(5):
+        ia = a if a < 3 else 2 * i + a
+        for b in range(5):
+            ib = b if b < 3 else 2 * i + b
+            v = p[ia, ib] if ia <= ib else p[ib, ia]
+            s00 += h[0, a] * v * h[0, b]
+            s01 += h[0, a] * v * h[1, b]
+            s11 += h[1, a] * v * h[1, b]
+    return _variance(z, s00, s01, s11)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def put_off(
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float,
+    match: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Set to IGNORED the matches with old landmarks that are not expected to within ``sigma`` [m]; count them."""
+    h = np.empty((2, 5))
+    doubtful = np.zeros(z.shape[0], np.bool_)
+    count = held = 0
+    for k in range(z.shape[0]):
+        i = match[k]
+        if i < 0:
+            continue
+        old = now - marks[i, _LAST_SEEN] > _OLD
+        doubtful[k] = old and _expected_variance(x, p, i, offset, z[k], h) > sigma * sigma
+        count += doubtful[k]
+        held += not doubtful[k]
+    # They can wait while others hold the pose. Where nothing else is seen, leaving them out would be going blind.
+    if held < _HOLD:
+        return 0
+    for k in range(z.shape[0]):
+        if doubtful[k]:
+            match[k] = IGNORED
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def agreeing(
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float,
+    gates: Array, near: float, max_turn: float, most_nodes: int, match: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Match old landmarks that are not expected to within ``sigma`` [m] if enough of them agree; return how many.
+
+    ``match`` ``(m,)`` is filled. Enough of the pairings must be expected to within ``sigma`` once those before
+    them are taken for true. The other arguments are :func:`slam.landmarks.association.joint_compatibility`'s.
+    """
+    m = z.shape[0]
+    match[:] = IGNORED
+    if m <= _LEAST:  # the first is never expected any better
+        return 0
+    joint_compatibility(x, p, marks.shape[0], offset, z, marks, gates, near, max_turn, most_nodes, match)
+    h = np.zeros((m, 2, 5))
+    landmark = np.zeros(m, np.int64)
+    factor, y = np.zeros((2 * m, 2 * m)), np.zeros(2 * m)
+    pairs = confirmed = 0
+    for k in range(m):
+        i = match[k]
+        if i < 0:
+            continue
+        if now - marks[i, _LAST_SEEN] <= _OLD or _expected_variance(x, p, i, offset, z[k], h[pairs]) <= sigma**2:
+            match[k] = IGNORED
+            continue
+        landmark[pairs] = i
+        extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
+        row = 2 * pairs
+        a, b, c = factor[row, row], factor[row + 1, row], factor[row + 1, row + 1]
+        narrow = _variance(z[k], a * a, a * b, b * b + c * c) <= sigma**2
+        confirmed += narrow and y[row] ** 2 + y[row + 1] ** 2 < gates[1]
+        pairs += 1
+    if confirmed < _LEAST:
+        match[:] = IGNORED
+        return 0
+    return pairs

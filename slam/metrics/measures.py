@@ -1,0 +1,398 @@
+"""How good a belief is: the only place where metrics are computed. Pure functions of arrays.
+
+Trajectories, consistency, corners, maps and coverage; ``docs/metrics.md`` has the equations on one page. A
+metric of nothing (no landmark, no cell) is ``nan``, so that it can be told from a bad one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from slam.geometry import transform_points, wrap, wrap_scalar
+from slam.metrics.chi_square import chi2_quantile
+from slam.metrics.relations import (
+    RelationScore,
+    closing_relations,
+    local_relations,
+    relation_errors,
+    relation_score,
+)
+
+__all__ = [
+    "CornerDeviation",
+    "MapScore",
+    "RelationScore",
+    "RelativeError",
+    "align_se2",
+    "anees",
+    "ate",
+    "ate_aligned",
+    "chi2_quantile",
+    "closing_relations",
+    "compare_walls",
+    "corner_deviation",
+    "coverage",
+    "fraction_in_band",
+    "free_space_iou",
+    "heading_errors",
+    "local_relations",
+    "nees",
+    "nees_band",
+    "nees_pose",
+    "nees_pose_invariant",
+    "nis",
+    "relation_errors",
+    "relation_score",
+    "rpe",
+    "time_to",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# ---------------------------------------------------------------------------------------------------------
+# Trajectories (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)
+
+
+class RelativeError(NamedTuple):
+    """Root mean square drift over a fixed number of steps."""
+
+    translation_m: float
+    rotation_rad: float
+
+
+def ate(true_poses: ArrayLike, est_poses: ArrayLike) -> float:
+    """Return the absolute trajectory error: RMS distance [m] between poses ``(n, ≥ 2)``, without alignment.
+
+    The start pose is the origin of both, so the error at the end is drift that the user feels.
+    """
+    true, est = _trajectories(true_poses, est_poses, columns=2)
+    return _rms(true[:, :2] - est[:, :2])
+
+
+def ate_aligned(true_poses: ArrayLike, est_poses: ArrayLike) -> float:
+    """Return the absolute trajectory error [m] after the best rigid alignment (:func:`align_se2`)."""
+    true, est = _trajectories(true_poses, est_poses, columns=2)
+    return _rms(true[:, :2] - transform_points(align_se2(true, est), est[:, :2]))
+
+
+def align_se2(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
+    """Return the transform ``(3,)`` that brings estimated positions nearest to the true ones.
+
+    Least squares over SE(2), no scale: Horn 1987, Umeyama 1991; in the plane the rotation is one arctangent.
+    """
+    true, est = _trajectories(true_poses, est_poses, columns=2)
+    true_centre, est_centre = true[:, :2].mean(axis=0), est[:, :2].mean(axis=0)
+    t, e = true[:, :2] - true_centre, est[:, :2] - est_centre
+    angle = math.atan2(float(np.sum(e[:, 0] * t[:, 1] - e[:, 1] * t[:, 0])), float(np.sum(e * t)))
+    turned = transform_points(np.array([0.0, 0.0, angle]), est_centre[None])[0]
+    return np.array([*(true_centre - turned), wrap_scalar(angle)])
+
+
+def rpe(true_poses: ArrayLike, est_poses: ArrayLike, *, delta: int = 1) -> RelativeError:
+    """Return the relative pose error over ``delta`` steps of poses ``(n, 3)``, n > delta.
+
+    The motion from pose i to i + delta, in the body frame of pose i, estimated against true: RMS of the
+    difference in translation [m] and in heading [rad].
+    """
+    true, est = _trajectories(true_poses, est_poses, columns=3)
+    if not 1 <= delta < len(true):
+        raise ValueError(f"rpe of {len(true)} poses needs delta in 1 … {len(true) - 1}, got {delta}")
+    translation, rotation = (e - t for t, e in zip(_motions(true, delta), _motions(est, delta), strict=True))
+    return RelativeError(_rms(translation), _rms(wrap(rotation)[:, None]))
+
+
+def heading_errors(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
+    """Return estimated minus true heading ``(n,)`` [rad] in [-π, π) of poses ``(n, 3)``."""
+    true, est = _trajectories(true_poses, est_poses, columns=3)
+    return wrap(est[:, 2] - true[:, 2])
+
+
+def _trajectories(true_poses: ArrayLike, est_poses: ArrayLike, *, columns: int) -> tuple[Array, Array]:
+    true, est = np.asarray(true_poses, np.float64), np.asarray(est_poses, np.float64)
+    if true.ndim != 2 or true.shape != est.shape or len(true) == 0 or true.shape[1] < columns:
+        raise ValueError(f"needs two equal arrays of poses (n ≥ 1, {columns}), got {true.shape} and {est.shape}")
+    return true, est
+
+
+def _motions(poses: Array, delta: int) -> tuple[Array, Array]:
+    step = poses[delta:] - poses[:-delta]
+    c, s = np.cos(poses[:-delta, 2]), np.sin(poses[:-delta, 2])
+    return np.stack([c * step[:, 0] + s * step[:, 1], c * step[:, 1] - s * step[:, 0]], axis=1), step[:, 2]
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Consistency (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 5.4)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _pivot_vanishes(pivot: float, variance: float) -> bool:
+    # What elimination leaves of a variance below its own rounding is nothing: the matrix is singular.
+    return abs(pivot) <= 1e-14 * abs(variance)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _term(residual: float, pivot: float, variance: float) -> float:
+    """Return one diagonal term of eᵀ P⁻¹ e after L D Lᵀ: the limit for P + εI, ε → 0, where P is singular."""
+    if _pivot_vanishes(pivot, variance):
+        return 0.0 if residual == 0.0 else residual * residual * math.inf
+    return residual * residual / pivot if pivot > 0.0 else math.nan
+
+
+@njit(cache=True, nogil=True)
+def _pose_form(x: float, y: float, theta: float, cov: Array) -> float:
+    """Return eᵀ P⁻¹ e for e = (x, y, θ), by the L D Lᵀ factors of P written out."""
+    p00, p01, p02, p11, p12, p22 = cov[0, 0], cov[0, 1], cov[0, 2], cov[1, 1], cov[1, 2], cov[2, 2]
+    l10 = l20 = l21 = 0.0
+    if not _pivot_vanishes(p00, p00):
+        l10, l20 = p01 / p00, p02 / p00
+    d1, d2 = p11 - l10 * p01, p22 - l20 * p02
+    m21 = p12 - l20 * p01
+    if not _pivot_vanishes(d1, p11):
+        l21 = m21 / d1
+        d2 -= l21 * m21
+    y -= l10 * x
+    theta -= l20 * x + l21 * y
+    return _term(x, p00, p00) + _term(y, d1, p11) + _term(theta, d2, p22)
+
+
+@njit(cache=True, nogil=True)
+def nees_pose(est: Array, cov: Array, true: Array) -> float:
+    """Return the NEES of one pose: eᵀ P⁻¹ e, e = true − est with the heading wrapped (a kernel).
+
+    Parameters
+    ----------
+    est, cov, true : (3,), (3, 3), (3,)
+        Estimate, its covariance [m², m·rad, rad²] and the truth, in one frame.
+
+    Returns
+    -------
+    float
+        Of a singular covariance: ``inf`` for an error that it rules out, else the form over what it allows.
+        ``nan`` where the matrix is no covariance (an indefinite one) or something is not finite.
+    """
+    return _pose_form(true[0] - est[0], true[1] - est[1], wrap_scalar(true[2] - est[2]), cov)
+
+
+@njit(cache=True, nogil=True)
+def nees_pose_invariant(est: Array, cov: Array, true: Array) -> float:
+    """Return the NEES of one pose in the right-invariant error ξ, for filters that retract along it.
+
+    true = Exp(ξ) est, θ: ξθ = wrap(θ − θ̂), ξp = V(ξθ)⁻¹ (p − Exp(ξθ) p̂). The covariance of ξ is T⁻¹ P T⁻ᵀ,
+    T ξ = (ξp + J p̂ ξθ, ξθ), so the form is that of T ξ under P (invariant-EKF SLAM: Zhang et al. 2017).
+    Arguments and result as :func:`nees_pose`.
+    """
+    t = wrap_scalar(true[2] - est[2])
+    c, s = math.cos(t), math.sin(t)
+    a, b = (s / t, (1.0 - c) / t) if abs(t) > 1e-6 else (1.0 - t * t / 6.0, 0.5 * t)
+    dx, dy = true[0] - (c * est[0] - s * est[1]), true[1] - (s * est[0] + c * est[1])
+    scale = 1.0 / (a * a + b * b)
+    return _pose_form((a * dx + b * dy) * scale - est[1] * t, (a * dy - b * dx) * scale + est[0] * t, t, cov)
+
+
+@njit(cache=True, nogil=True)
+def _forms(errors: Array, covs: Array) -> Array:
+    """Return eᵀ P⁻¹ e for each row of ``(n, k)`` under ``(n, k, k)``, by L D Lᵀ in one scratch matrix."""
+    n, k = errors.shape
+    out, residual, work = np.zeros(n), np.empty(k), np.empty((k, k))
+    for i in range(n):
+        residual[:] = errors[i]
+        work[:] = covs[i]
+        for j in range(k):
+            pivot, variance = work[j, j], covs[i, j, j]
+            out[i] += _term(residual[j], pivot, variance)
+            if _pivot_vanishes(pivot, variance):
+                continue
+            for r in range(j + 1, k):
+                factor = work[r, j] / pivot
+                residual[r] -= factor * residual[j]
+                for c in range(j + 1, r + 1):
+                    work[r, c] -= factor * work[c, j]
+    return out
+
+
+def nees(error: ArrayLike, cov: ArrayLike) -> Array:
+    """Return the normalised estimation error squared of poses, eᵀ P⁻¹ e: mean 3 for a consistent filter.
+
+    Parameters
+    ----------
+    error, cov : (…, 3), (…, 3, 3)
+        Pose errors [m, m, rad], headings wrapped here, and claimed covariances.
+
+    Returns
+    -------
+    (…,) array, singular covariances as in :func:`nees_pose`.
+    """
+    errors = np.array(error, np.float64)
+    if errors.ndim < 1 or errors.shape[-1] != 3:
+        raise ValueError(f"nees is of pose errors (…, 3), got {errors.shape}")
+    errors[..., 2] = wrap(errors[..., 2])
+    return nis(errors, cov)
+
+
+def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
+    """Return the normalised innovation squared νᵀ S⁻¹ ν: mean k for a consistent filter.
+
+    Parameters
+    ----------
+    innovation, cov : (…, k), (…, k, k)
+        Innovations, bearings already wrapped, and their covariances S.
+    """
+    v, s = np.asarray(innovation, np.float64), np.asarray(cov, np.float64)
+    if v.ndim < 1 or s.shape != (*v.shape, v.shape[-1]):
+        raise ValueError(f"needs vectors (…, k) and covariances (…, k, k), got {v.shape} and {s.shape}")
+    k = v.shape[-1]
+    values: Array = _forms(v.reshape(-1, k), s.reshape(-1, k, k)).reshape(v.shape[:-1])
+    return values
+
+
+def anees(values: ArrayLike, *, dof: int = 3, axis: int | None = None) -> Array:
+    """Return the average of NEES (or NIS) values divided by ``dof``: ideal 1, above it overconfident.
+
+    ``axis=0`` of values ``(runs, steps)`` gives the Monte-Carlo average of each step ``(steps,)``. Undefined
+    (nan) values are left out; nan where none is left.
+    """
+    v = np.asarray(values, np.float64)
+    defined = ~np.isnan(v)
+    with np.errstate(invalid="ignore"):
+        mean: Array = np.sum(v, axis=axis, where=defined) / np.sum(defined, axis=axis) / dof
+    return mean
+
+
+def nees_band(dof: int, runs: int, *, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the two-sided band in which :func:`anees` of independent runs lies if the filter is consistent.
+
+    The sum of ``runs`` values is χ² with ``runs · dof`` degrees of freedom; the band is that of the average
+    divided by ``dof``: [0.79, 1.24] for dof 3, 50 runs, 95 %.
+    """
+    total, tail = dof * runs, 0.5 * (1.0 - confidence)
+    return chi2_quantile(tail, total) / total, chi2_quantile(1.0 - tail, total) / total
+
+
+def fraction_in_band(averages: ArrayLike, *, dof: int, runs: int, confidence: float = 0.95) -> float:
+    """Return the share of steps whose Monte-Carlo average (:func:`anees`) lies in :func:`nees_band`."""
+    low, high = nees_band(dof, runs, confidence=confidence)
+    v = np.asarray(averages, np.float64)
+    return float(np.mean((v >= low) & (v <= high))) if v.size else math.nan
+
+
+# ---------------------------------------------------------------------------------------------------------
+# Maps
+
+
+class CornerDeviation(NamedTuple):
+    """Distances of mapped corners from the true ones [m]."""
+
+    mean: float
+    max: float
+    each: Array  # (n,)
+
+
+class MapScore(NamedTuple):
+    """How well walls of a map match the true ones, each in [0, 1]."""
+
+    iou: float
+    precision: float
+    recall: float
+
+
+@njit(cache=True, nogil=True)
+def _nearest_distances(points: Array, targets: Array) -> Array:
+    out = np.full(len(points), np.inf)
+    for i in range(len(points)):
+        for j in range(len(targets)):
+            dx, dy = points[i, 0] - targets[j, 0], points[i, 1] - targets[j, 1]
+            out[i] = min(out[i], dx * dx + dy * dy)
+        out[i] = math.sqrt(out[i])
+    return out
+
+
+def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
+    """Return paper D's r: the distance of each mapped corner ``(n, 2)`` from the nearest true one ``(m, 2)``.
+
+    No alignment: the start pose is the origin of both frames (theory.md, paper D). nan where either is empty.
+    """
+    points = np.asarray(estimated, np.float64).reshape(-1, 2)
+    targets = np.asarray(true, np.float64).reshape(-1, 2)
+    if len(points) == 0 or len(targets) == 0:
+        return CornerDeviation(math.nan, math.nan, np.full(len(points), math.nan))
+    each: Array = _nearest_distances(points, targets)
+    return CornerDeviation(float(each.mean()), float(each.max()), each)
+
+
+def compare_walls(
+    belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float, region: Mask | None = None
+) -> MapScore:
+    """Compare the walls of two rasters on one lattice, forgiving displacements up to a tolerance.
+
+    A belief cell is *right* when a true wall cell lies within the tolerance, a true cell *found* when a
+    belief cell does (distances between cell centres). precision = right / belief, recall = found / true, and
+    with TP = found true cells, FP = wrong belief cells, FN = true cells not found,
+    iou = TP / (TP + FP + FN): at tolerance 0 the plain intersection over union.
+
+    Parameters
+    ----------
+    belief_occupied, true_wall : (rows, cols) bool
+        Cells believed, and known, to hold a wall.
+    tolerance_cells : float
+        Greatest distance [cells] that still counts as a match.
+    region : (rows, cols) bool, optional
+        Cells that are counted, such as what can be seen; matches may lie outside it.
+    """
+    belief, true, counted = _rasters(belief_occupied, true_wall, region)
+    right = int(np.count_nonzero(belief & counted & _within(true, tolerance_cells)))
+    found = int(np.count_nonzero(true & counted & _within(belief, tolerance_cells)))
+    believed, walls = int(np.count_nonzero(belief & counted)), int(np.count_nonzero(true & counted))
+    # TP + FN is all the true cells.
+    return MapScore(_ratio(found, walls + believed - right), _ratio(right, believed), _ratio(found, walls))
+
+
+def free_space_iou(belief_free: Mask, true_free: Mask, *, region: Mask | None = None) -> float:
+    """Return |A ∩ B| / |A ∪ B| of the free cells ``(rows, cols)`` believed and true, within ``region``."""
+    belief, true, counted = _rasters(belief_free, true_free, region)
+    both, either = np.count_nonzero(belief & true & counted), np.count_nonzero((belief | true) & counted)
+    return _ratio(int(both), int(either))
+
+
+def coverage(belief_free: Mask, visible_free: Mask) -> float:
+    """Return the share of the free cells that can be seen which the belief rightly has as free."""
+    belief, visible, _ = _rasters(belief_free, visible_free, None)
+    return _ratio(int(np.count_nonzero(belief & visible)), int(np.count_nonzero(visible)))
+
+
+def time_to(coverage_curve: ArrayLike, times: ArrayLike, *, level: float) -> float | None:
+    """Return the first of ``times`` (n,) at which the curve ``(n,)`` has reached ``level``, None if never."""
+    curve, t = np.asarray(coverage_curve, np.float64), np.asarray(times, np.float64)
+    if curve.ndim != 1 or curve.shape != t.shape:
+        raise ValueError(f"needs a curve (n,) and its times (n,), got {curve.shape} and {t.shape}")
+    reached = np.flatnonzero(curve >= level)
+    return float(t[reached[0]]) if len(reached) else None
+
+
+def _rasters(belief: Mask, true: Mask, region: Mask | None) -> tuple[Mask, Mask, Mask]:
+    a, b = np.asarray(belief, np.bool_), np.asarray(true, np.bool_)
+    counted = np.ones(a.shape, np.bool_) if region is None else np.asarray(region, np.bool_)
+    if a.ndim != 2 or not a.shape == b.shape == counted.shape:
+        raise ValueError(f"rasters must share one lattice, got {a.shape}, {b.shape} and {counted.shape}")
+    return a, b, counted
+
+
+def _within(cells: Mask, tolerance: float) -> Mask:
+    if not cells.any():  # then there is no distance to measure
+        return np.zeros(cells.shape, np.bool_)
+    distance = cv2.distanceTransform((~cells).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(distance <= tolerance + 1e-4)  # distances are float32
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan

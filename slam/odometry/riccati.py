@@ -1,0 +1,295 @@
+"""The Riccati equation of paper C's filter as a recurrence on spectra, re-expanded where need be (theory.md C).
+
+    η' = F η + η Fᵀ - η Hᵀ H η / R + G Q Gᵀ,    x̂' = F x̂ + K (z - H x̂),    K = η Hᵀ / R,    H = [1, 0, …]
+
+Where the step would leave what the spectra can tell, it ends there and they are taken anew about its end
+(:func:`advance`). The kernels know no numbers' type: as plain Python they run on numbers that count what is done
+with them, too. Equations and figures: ``docs/differential_transform.md``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.odometry.differential_transform import fill_model, fit_pade
+from slam.settings import require, unknown_name
+
+__all__ = [
+    "MOST_EXPANSIONS",
+    "RECOVERIES",
+    "Tolerances",
+    "Workspace",
+    "advance",
+    "covariance_spectrum",
+    "estimate_spectrum",
+    "expand",
+    "recover",
+]
+
+Array = NDArray[np.float64]
+
+RECOVERIES = ("pade", "series")
+_SAFETY = 0.9  # of the step that the error estimate allows
+_RADIUS_SHARE = 0.5  # of the radius of convergence that a step may use, whatever the estimate says
+MOST_EXPANSIONS = 1_000_000  # of one step
+_DENOMINATOR_LEFT = 0.2  # a Padé denominator may fall from 1 to no less than this within the step
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerances:
+    """How exactly the differential equations are solved, and how the original is recovered.
+
+    The error of one expansion may be ``relative`` · √(ηᵢᵢ ηⱼⱼ) + ``absolute`` in ηᵢⱼ, and for x̂ᵢ as many of its σ
+    (and of its own size).
+    """
+
+    recovery: str = "pade"  # or "series"
+    order: int = 6  # the highest discrete used, even; Padé [order/2, order/2]
+    relative: float = 1e-9
+    absolute: float = 1e-15  # [m²], …
+
+    def __post_init__(self) -> None:
+        if self.recovery not in RECOVERIES:
+            raise unknown_name("recovery", self.recovery, RECOVERIES)
+        require(2 <= self.order <= 30 and self.order % 2 == 0, "Tolerances.order must be even, from 2 to 30")
+        require(0 < self.relative < 1, "Tolerances.relative must be in (0, 1)")
+        require(self.absolute > 0, "Tolerances.absolute must be > 0")
+
+
+class Workspace:
+    """Room for the spectra of one filter, so that no kernel allocates.
+
+    Attributes
+    ----------
+    f, eta, x
+        Spectra of F ``(K, n, n)``, η ``(K, n, n)`` and x̂ ``(K, n)``, K = order + 2: one discrete more than is used
+        tells of the error. ``eta[0]`` and ``x[0]`` are the values now. Without an ``estimate`` ``x`` is
+        ``(K, 0)``, and the covariance alone is solved for.
+    z
+        ``(2,)``: the measurement now, and its change over what is left of the step.
+    """
+
+    def __init__(self, n: int, order: int, *, dtype: type = np.float64, estimate: bool = True) -> None:
+        count, half, entries = order + 2, order // 2, n * (n + 1) // 2 + n
+        self.f: Array = np.zeros((count, n, n), dtype)
+        self.eta: Array = np.zeros((count, n, n), dtype)
+        self.x: Array = np.zeros((count, n if estimate else 0), dtype)
+        self.z: Array = np.zeros(2, dtype)
+        self.column: Array = np.zeros(count, dtype)
+        self.system: Array = np.zeros((half, half + 1), dtype)
+        self.below: Array = np.zeros((entries, half), dtype)
+        self.is_fraction = np.zeros(entries, np.bool_)
+
+
+# ---- kernels ---------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def covariance_spectrum(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> None:
+    """Fill η(1) … from η(0), spectra ``(K, n, n)``: the Riccati equation as a recurrence (theory.md C).
+
+    (k + 1)/h η(k + 1) = Σ_l F(l) η(k - l) + η(k - l) F(l)ᵀ - η(l) Hᵀ H η(k - l) / R, and G Q Gᵀ in k = 0.
+    """
+    n = eta.shape[1]
+    for k in range(eta.shape[0] - 1):
+        share = h / (k + 1.0)
+        for i in range(n):
+            for j in range(i, n):
+                seen = eta[0, i, 0] * eta[k, 0, j]
+                for m in range(1, k + 1):
+                    seen += eta[m, i, 0] * eta[k - m, 0, j]
+                total = -(seen * inverse_r)
+                if k == 0 and noise[i, j] != 0.0:
+                    total += noise[i, j]
+                moved = 0.0
+                for m in range(k + 1):
+                    for a in range(n):
+                        if f[m, i, a] != 0.0:
+                            moved += f[m, i, a] * eta[k - m, a, j]
+                        if i != j and f[m, j, a] != 0.0:
+                            moved += f[m, j, a] * eta[k - m, i, a]
+                total += 2.0 * moved if i == j else moved
+                eta[k + 1, i, j] = share * total
+                eta[k + 1, j, i] = eta[k + 1, i, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def estimate_spectrum(f: Array, inverse_r: float, h: float, eta: Array, z: Array, x: Array) -> None:
+    """Fill X(1) … of x̂ ``(K, n)`` from X(0) and all of η: (k + 1)/h X(k + 1) = Σ_l F(l) X(k - l) + K(l) E(k - l).
+
+    E is the innovation z - x̂₁, of a measurement that changes linearly within the step.
+    """
+    n = x.shape[1]
+    for k in range(x.shape[0] - 1):
+        share = h / (k + 1.0)
+        for i in range(n):
+            seen = eta[k, i, 0] * (z[0] - x[0, 0])
+            for m in range(k):
+                e = z[1] - x[1, 0] if k - m == 1 else -x[k - m, 0]
+                seen += eta[m, i, 0] * e
+            total = seen * inverse_r
+            for m in range(k + 1):
+                for a in range(n):
+                    if f[m, i, a] != 0.0:
+                        total += f[m, i, a] * x[k - m, a]
+            x[k + 1, i] = share * total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _allowed_share(c: Array, allowed: float, scale: float, try_pade: bool, system: Array, below: Array) -> float:
+    """Return how large a share θ of the scale h an entry allows: below zero by the fraction, else by the series.
+
+    ``c`` ``(K,)`` are its discretes, the last of which only tells of the error; ``allowed`` is what the error may
+    be and ``scale`` the entry's size. The radius of convergence is Jorba and Zou's (2005), from the last two.
+    """
+    count = c.shape[0]
+    last: float = abs(c[count - 1])
+    before: float = abs(c[count - 2])
+    # Of an even or odd function every other discrete vanishes: both have to be heard.
+    inverse: float = max((last / scale) ** (1.0 / (count - 1)), (before / scale) ** (1.0 / (count - 2)))
+    if inverse == 0.0:
+        return 1.0
+    radius = 1.0 / inverse
+    by_series: float = min(radius * (allowed / scale) ** (1.0 / (count - 1)), _RADIUS_SHARE * radius)
+    if by_series >= 1.0 or not try_pade:
+        return min(by_series, 1.0)
+    # Fitted for the scale radius · h, in which the discretes are of one size, so that a pivot tells something.
+    factor = 1.0
+    for k in range(count):
+        c[k] *= factor
+        factor *= radius
+    m = below.shape[0]
+    share = -1.0
+    if fit_pade(c, system, below):
+        missed = c[count - 1]
+        for j in range(m):
+            missed += below[j] * c[count - 2 - j]
+        share = _RADIUS_SHARE
+        if missed != 0.0:
+            share = min(share, (_DENOMINATOR_LEFT * allowed / abs(missed)) ** (1.0 / (count - 1)))
+        share = min(share, inverse)  # no more than h
+        while _lost(below, share) > 1.0 - _DENOMINATOR_LEFT:
+            share *= 0.8
+        share *= radius
+    factor = 1.0
+    for j in range(m):
+        factor *= inverse
+        below[j] *= factor
+    factor = 1.0
+    for k in range(count):
+        c[k] *= factor
+        factor *= inverse
+    return -share if share > by_series else by_series
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lost(below: Array, share: float) -> float:
+    """Return by how much the denominator 1 + n₁ θ + … can fall at most for any θ up to ``share``."""
+    total: float = 0.0
+    factor = 1.0
+    for j in range(below.shape[0]):
+        factor *= share
+        total += abs(below[j]) * factor
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def recover(c: Array, below: Array, is_fraction: bool, share: float) -> float:
+    """Return the original at t₀ + ``share`` · h from its discretes: by the fraction, or by the series (Horner)."""
+    if not is_fraction:
+        value: float = c[c.shape[0] - 2]
+        for k in range(c.shape[0] - 3, -1, -1):
+            value = value * share + c[k]
+        return value
+    m: int = below.shape[0]
+    above: float = c[m]
+    under: float = below[m - 1]
+    for j in range(m):
+        above += below[j] * c[m - 1 - j]
+    for i in range(m - 1, -1, -1):
+        term: float = c[i]
+        for j in range(i):
+            term += below[j] * c[i - 1 - j]
+        above = above * share + term
+        under = under * share + (below[i - 1] if i > 0 else 1.0)
+    return above / under
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step_share(
+    eta: Array, x: Array, relative: float, absolute: float, try_pade: bool, system: Array, below: Array,
+    is_fraction: NDArray[np.bool_],
+) -> float:  # fmt: skip
+    """Return the share of h that every entry of η and x̂ allows; note which to recover by a fraction."""
+    n = eta.shape[1]
+    share, entry = 1.0, 0
+    for i in range(n):
+        for j in range(i, n):
+            scale = (abs(eta[0, i, i] * eta[0, j, j])) ** 0.5 + absolute / relative
+            own = _allowed_share(eta[:, i, j], relative * scale, scale, try_pade, system, below[entry])
+            is_fraction[entry] = own < 0.0
+            share = min(share, abs(own))
+            entry += 1
+    for i in range(x.shape[1]):
+        scale = abs(x[0, i]) + (abs(eta[0, i, i]) + absolute / relative) ** 0.5
+        own = _allowed_share(x[:, i], relative * scale, scale, try_pade, system, below[entry])
+        is_fraction[entry] = own < 0.0
+        share = min(share, abs(own))
+        entry += 1
+    return share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def expand(
+    f: Array, noise: Array, inverse_r: float, h: float, eta: Array, x: Array, z: Array, relative: float,
+    absolute: float, try_pade: bool, system: Array, below: Array, is_fraction: NDArray[np.bool_],
+) -> float:  # fmt: skip
+    """Go as far towards t₀ + h as one expansion reaches; return which share of h that is.
+
+    The values at its end are then ``eta[0]`` and ``x[0]``, and ``z`` is what is left of the measurement's change.
+    """
+    n = eta.shape[1]
+    covariance_spectrum(f, noise, inverse_r, h, eta)
+    estimate_spectrum(f, inverse_r, h, eta, z, x)
+    share = step_share(eta, x, relative, absolute, try_pade, system, below, is_fraction)
+    if share < 1.0:
+        share = min(share * _SAFETY, 1.0)
+    entry = 0
+    for i in range(n):
+        for j in range(i, n):
+            eta[0, i, j] = recover(eta[:, i, j], below[entry], is_fraction[entry], share)
+            eta[0, j, i] = eta[0, i, j]
+            entry += 1
+    for i in range(x.shape[1]):
+        x[0, i] = recover(x[:, i], below[entry], is_fraction[entry], share)
+        entry += 1
+    z[0] += z[1] * share
+    z[1] *= 1.0 - share
+    return share
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def advance(
+    powers: Array, matrices: Array, noise: Array, inverse_r: float, t: float, span: float, f: Array, eta: Array,
+    x: Array, z: Array, column: Array, relative: float, absolute: float, try_pade: bool, system: Array,
+    below: Array, is_fraction: NDArray[np.bool_],
+) -> int:  # fmt: skip
+    """Solve from t to t + ``span`` [s] in as many expansions as it takes; return how many, -1 if they get stuck.
+
+    See :class:`Workspace` for the arrays, :class:`~slam.odometry.differential_transform.PowerModel` for the model.
+    """
+    end, now = t + span, t
+    for count in range(1, MOST_EXPANSIONS):
+        h = end - now
+        fill_model(powers, matrices, now, h, column, f)
+        share = expand(f, noise, inverse_r, h, eta, x, z, relative, absolute, try_pade, system, below, is_fraction)
+        if share >= 1.0:
+            return count
+        now += share * h
+        if not share * h > 0.0:
+            return -1
+    return -1

@@ -1,0 +1,170 @@
+"""How a scan fits a particle's own map: its surfaces near the scan's ends as a field, climbed and weighed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.geometry import wrap_scalar
+from slam.grids.match_kernels import climb, prior_loss
+from slam.grids.scan_matching import MatchConfig, Values, stamps_of
+from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
+
+__all__ = ["ParticleMatcher"]
+
+Array = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+
+_BLOCK = 4  # cells a side of what is read of a map at once, around each beam's end and one to every side
+_UNWANTED, _UNKNOWN, _KNOWN = 0, 1, 2
+
+
+class ParticleMatcher:
+    """Matches one scan after another to the maps of particles; its buffers are used again.
+
+    Only cells near the ends of the beams are read: at least 4 cells around each, which is as far as a scan can be
+    moved towards its best fit.
+    """
+
+    def __init__(self, config: MatchConfig) -> None:
+        self.config = config
+        self._values = np.zeros((1, 1), np.float32)
+        self._plane = np.zeros((1, 1), np.uint8)
+        self._cells = np.zeros((1, 2), np.int32)
+        self._evidence = np.zeros((1, 4), np.float32)
+        self._curvature = np.zeros((3, 3))
+
+    def fit(
+        self, grids: ParticleGrids, particle: int, points: Array, pose: Array, info: Array, *,
+        unknown: float, free: float,
+    ) -> tuple[Array, Array, float]:  # fmt: skip
+        """Move ``pose`` ``(3,)``, known to ``info`` ``(3, 3)``, to where the scan and that agree best.
+
+        Parameters
+        ----------
+        points : Array
+            ``(n, 2)`` ends of beams [m, body frame].
+        unknown, free : float
+            Likelihood, against 1 on a surface, of an end where the map knows nothing, and where it knows no
+            surface.
+
+        Returns
+        -------
+        The pose, the information there ``(3, 3)``, and the log-likelihood of scan and motion [nat].
+        """
+        lattice, config = grids.lattice, self.config
+        count, row, col = self._window(grids, points, pose)
+        cells, evidence = self._cells[:count], self._evidence[:count]
+        grids.read(particle, cells, evidence)
+        draw_surfaces(self._values, self._plane, row, col, cells, evidence, stamps_of(config))
+        cell = lattice.cell_m
+        x0, y0 = (lattice.col + col + 0.5) * cell, (lattice.row + row + 0.5) * cell
+        best, curvature = pose.copy(), np.zeros((3, 3))
+        climb(self._values, x0, y0, cell, points, best, pose, info, config.gain, config.iterations, curvature)
+        log_likelihood = weigh(
+            self._values, self._plane, x0, y0, cell, points, best, pose, info, config.beam_weight, unknown, free
+        )
+        wipe(self._values, self._plane, row, col, cells)
+        return best, curvature, log_likelihood
+
+    def _window(self, grids: ParticleGrids, points: Array, pose: Array) -> tuple[int, int, int]:
+        """List the wanted cells; return how many, and the array cell that the window begins at."""
+        cell, lattice = grids.lattice.cell_m, grids.lattice
+        reach = float(np.sqrt((points * points).sum(axis=1).max(initial=0.0)))
+        blocks = 2 * (math.ceil(reach / cell / _BLOCK) + 4)
+        side = blocks * _BLOCK
+        if self._values.shape[0] < side:
+            self._values, self._plane = np.zeros((side, side), np.float32), np.zeros((side, side), np.uint8)
+        most = 9 * (len(points) + 1) * _BLOCK * _BLOCK
+        if len(self._cells) < most:
+            self._cells, self._evidence = np.zeros((most, 2), np.int32), np.zeros((most, 4), np.float32)
+        row = math.floor(pose[1] / cell) - lattice.row - side // 2
+        col = math.floor(pose[0] / cell) - lattice.col - side // 2
+        rows, cols = lattice.shape
+        count = wanted_cells(points, pose, cell, lattice.row, lattice.col, rows, cols, row, col, side,
+                             self._plane, self._cells)  # fmt: skip
+        return count, row, col
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def wanted_cells(
+    points: Array, pose: Array, cell: float, row0: int, col0: int, rows: int, cols: int, row: int, col: int,
+    side: int, plane: Bytes, cells: Ints,
+) -> int:  # fmt: skip
+    """List the array cells of the blocks around the beams' ends, and mark them unknown in the window's plane."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    n = 0
+    for k in range(points.shape[0]):
+        j = math.floor((pose[0] + c * points[k, 0] - s * points[k, 1]) / cell) - col0 - col
+        i = math.floor((pose[1] + s * points[k, 0] + c * points[k, 1]) / cell) - row0 - row
+        for bi in range(i // _BLOCK - 1, i // _BLOCK + 2):
+            for bj in range(j // _BLOCK - 1, j // _BLOCK + 2):
+                if not (0 <= bi < side // _BLOCK and 0 <= bj < side // _BLOCK):
+                    continue
+                top, left = bi * _BLOCK, bj * _BLOCK
+                if plane[top, left] != _UNWANTED:
+                    continue
+                for y in range(top, top + _BLOCK):
+                    for x in range(left, left + _BLOCK):
+                        plane[y, x] = _UNKNOWN
+                        if 0 <= y + row < rows and 0 <= x + col < cols:
+                            cells[n, 0], cells[n, 1] = y + row, x + col
+                            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def draw_surfaces(
+    values: Values, plane: Bytes, row: int, col: int, cells: Ints, evidence: Floats, stamps: Values
+) -> None:
+    """Draw the surfaces among the cells into the wanted part of the window."""
+    phases, half = stamps.shape[0], stamps.shape[2] // 2
+    rows, cols = values.shape
+    for k in range(cells.shape[0]):
+        stops, passes = evidence[k, STOPS], evidence[k, PASSES]
+        if stops + passes <= 0.0:
+            continue
+        i, j = cells[k, 0] - row, cells[k, 1] - col
+        plane[i, j] = _KNOWN
+        if stops < OCCUPIED_SHARE * (stops + passes):
+            continue
+        u = min(int(evidence[k, SUM_X] / stops * phases), phases - 1)
+        v = min(int(evidence[k, SUM_Y] / stops * phases), phases - 1)
+        stamp = stamps[v, u]
+        for y in range(max(i - half, 0), min(i + half + 1, rows)):
+            line = stamp[y - i + half]
+            for x in range(max(j - half, 0), min(j + half + 1, cols)):
+                if plane[y, x] != _UNWANTED:
+                    values[y, x] = max(values[y, x], line[x - j + half])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weigh(
+    values: Values, plane: Bytes, x0: float, y0: float, cell: float, points: Array, pose: Array, prior: Array,
+    info: Array, beam_weight: float, unknown: float, free: float,
+) -> float:  # fmt: skip
+    """Return the log-likelihood of the beams' ends, less what the pose's own prior loses."""
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    total = 0.0
+    for k in range(points.shape[0]):
+        u = (pose[0] + c * points[k, 0] - s * points[k, 1] - x0) / cell + 0.5
+        v = (pose[1] + s * points[k, 0] + c * points[k, 1] - y0) / cell + 0.5
+        i, j = math.floor(v), math.floor(u)
+        value, state = 0.0, _UNKNOWN
+        if 0 <= i < values.shape[0] and 0 <= j < values.shape[1]:
+            value, state = values[i, j], plane[i, j]
+        floor = free if state == _KNOWN else unknown
+        total += math.log(floor + (1.0 - floor) * value)
+    dx, dy, dt = pose[0] - prior[0], pose[1] - prior[1], wrap_scalar(pose[2] - prior[2])
+    return beam_weight * total - prior_loss(info, dx, dy, dt)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def wipe(values: Values, plane: Bytes, row: int, col: int, cells: Ints) -> None:
+    """Make the window as it was: blocks that hold a listed cell are all there is in it."""
+    for k in range(cells.shape[0]):
+        values[cells[k, 0] - row, cells[k, 1] - col] = 0.0
+        plane[cells[k, 0] - row, cells[k, 1] - col] = _UNWANTED

@@ -1,0 +1,146 @@
+"""One episode of a benchmark: what is asked, and the row that it leaves."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.views.pictures import draw_map, episode_view
+from slam.metrics.measures import ate_aligned
+from training.episodes.explore import Episode, ExploreOptions, prepare, run
+from training.runs.errors import one_line
+from training.runs.running import plain
+
+__all__ = ["CURVE_POINTS", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "run_job"]
+
+Array = NDArray[np.float64]
+Curve = NDArray[np.float32]
+Key = tuple[str, str, int, str, str]  # suite, place, seed, agent, backend
+
+CURVE_POINTS = 128
+"""Points of a curve: coverage at so many times (or ways), evenly spaced from the episode's start to its end."""
+
+WALL_CLOCK = ("decision_ms_median", "decision_ms_p95", "wall_time_s")
+"""The metrics that the machine decides, too; all the others are the same in every run of a job."""
+
+_THUMBNAIL_PX = 220
+_OVERSAMPLED = 2  # drawn this much larger, then reduced: thin lines stay lines
+_LEVELS = 16  # of each colour: a thumbnail needs no more, and takes half the room
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeJob:
+    """One agent on one backend at one place with one seed."""
+
+    suite: str
+    place: str
+    seed: int
+    agent: str
+    slam: str
+    noise: str
+    rooms: str | None = None
+    floor_plan: Path | None = None
+    max_steps: int | None = None  # None: as `mecanum explore` has it, by the place's area
+
+    @property
+    def key(self) -> Key:
+        """What tells the job's row from every other."""
+        return self.suite, self.place, self.seed, self.agent, self.slam
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeRow:
+    """What an episode left."""
+
+    metrics: dict[str, Any]  # plain numbers and words, as JSON has them; None where not reached or not defined
+    coverage_by_time: Curve  # (CURVE_POINTS,) from 0 to metrics["time_s"]
+    coverage_by_path: Curve  # (CURVE_POINTS,) from 0 to metrics["path_length_m"]
+    nees: Curve  # (seconds,) pose NEES once a simulated second, ideally 3
+    thumbnail: bytes  # PNG: the believed map with the believed path
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeFailure:
+    """An episode that an error ended; there is no row of it."""
+
+    message: str
+
+
+def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
+    """Run one episode; an error in it is returned, so that the other episodes go on.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C: half an episode is no row.
+    """
+    try:
+        # Nothing is written there.
+        options = ExploreOptions(
+            out=Path(tempfile.gettempdir()), agent=job.agent, rooms=job.rooms, slam=job.slam, noise=job.noise,
+            seed=job.seed, floor_plan=job.floor_plan, max_steps=job.max_steps,
+        )  # fmt: skip
+        episode = prepare(options)
+        run(episode, lambda **_: None)
+        row = None if episode.interrupted else _row(episode)
+    except Exception as error:
+        return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
+    if row is None:
+        raise KeyboardInterrupt
+    return row
+
+
+def resampled(values: Array, along: Array) -> Curve:
+    """Return ``values`` ``(n,)`` at :data:`CURVE_POINTS` even places of ``along`` ``(n,)``, which never falls.
+
+    Between two rows the earlier one holds: a coverage is not had before it was reached.
+    """
+    places = np.linspace(along[0], along[-1], CURVE_POINTS)
+    # The last row that lies no farther than the place; rounding of the places shall not miss one.
+    rows = np.searchsorted(along, places + 1e-9 * max(float(along[-1]), 1.0), side="right") - 1
+    return np.asarray(values[np.clip(rows, 0, len(values) - 1)], np.float32)
+
+
+def _row(episode: Episode) -> EpisodeRow:
+    record = episode.env.truth.record
+    true_poses, coverage = record.true_poses, record.coverage
+    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true_poses[:, :2], axis=0).T))])
+    every = round(1.0 / episode.config.step_s)
+    return EpisodeRow(
+        metrics=_metrics(episode),
+        coverage_by_time=resampled(coverage, record.times),
+        coverage_by_path=resampled(coverage, path),
+        nees=record.nees[every::every].astype(np.float32),
+        thumbnail=_thumbnail(episode),
+    )
+
+
+def _metrics(episode: Episode) -> dict[str, Any]:
+    record, decisions = episode.env.truth.record, episode.decisions_ms
+    metrics = episode.metrics()
+    # The row's key says where and who; the limit is what an episode that never got there is counted with.
+    for name in ("agent", "slam", "rooms", "floor_plan", "seed", "interrupted"):
+        metrics.pop(name, None)
+    return metrics | {
+        "ate_aligned_rmse_m": plain(ate_aligned(record.true_poses, record.estimates)),
+        "decisions": len(decisions),
+        "decision_ms_p95": float(np.percentile(decisions, 95.0)) if decisions else None,
+        "limit_s": round(episode.run["max_steps"] * episode.config.step_s, 6),
+    }
+
+
+def _thumbnail(episode: Episode) -> bytes:
+    env = episode.env
+    view = episode_view(env.truth.ground, env.belief, longest_px=_OVERSAMPLED * _THUMBNAIL_PX)
+    picture = draw_map(env.belief, env.truth.record.estimates, view=view, robot=episode.config.robot)
+    size = (max(view.width // _OVERSAMPLED, 1), max(view.height // _OVERSAMPLED, 1))
+    small = cv2.resize(picture[: view.height], size, interpolation=cv2.INTER_AREA)
+    step = 255.0 / (_LEVELS - 1)
+    small = np.round(np.round(small / step) * step).astype(np.uint8)
+    return bytes(cv2.imencode(".png", small, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())

@@ -1,0 +1,207 @@
+"""What a benchmark's rows amount to: metrics of each agent on each suite, and agents against a baseline."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.benchmark.episode import EpisodeRow, Key
+from training.benchmark.evaluate import consistency_figures
+from training.figures.statistics import (
+    Comparison,
+    Estimate,
+    Interval,
+    compare,
+    estimate,
+    mean_interval,
+    ratio_of_sums,
+)
+
+__all__ = ["COMPARED", "METRICS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows", "merged"]
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]  # an episode's metrics
+
+
+@dataclass(frozen=True, kw_only=True)
+class Metric:
+    """One column of the tables."""
+
+    key: str
+    label: str
+    unit: str = ""
+    scale: float = 1.0  # from what is stored to the unit shown
+    digits: int = 2  # after the point, as shown
+    better: Literal["low", "high", ""] = "low"
+    # What stands in the tables, with its interval: the IQM, the mean (of shares) or the ratio of two sums.
+    centre: Literal["iqm", "mean", "ratio"] = "iqm"
+    # Never reached: counted as the episode's time limit in IQM and mean, as infinite in median and ranks.
+    may_be_missed: bool = False
+    of: Callable[[Row], float | bool | None] | None = None  # None: the stored value of that key
+
+    def value(self, row: Row) -> float:
+        """Return an episode's value; nan where it has none."""
+        found = row.get(self.key) if self.of is None else self.of(row)
+        return math.nan if found is None else float(found)
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric(key="coverage", label="coverage", unit="%", scale=100, better="high"),
+    Metric(
+        key="reached_95", label="reached 95 %", unit="%", scale=100, digits=0, better="high",
+        centre="mean", of=lambda row: row["time_to_95_s"] is not None,
+    ),
+    *(
+        Metric(key=f"time_to_{share}_s", label=f"time to {share} %", unit="s", digits=1, may_be_missed=True)
+        for share in (50, 90, 95, 99)
+    ),
+    Metric(key="time_s", label="time", unit="s", digits=1),
+    Metric(key="path_length_m", label="path", unit="m", digits=1),
+    Metric(
+        key="collisions_per_100_m", label="collisions", unit="per 100 m", centre="ratio",
+        of=lambda row: 100 * row["collisions"] / row["path_length_m"] if row["path_length_m"] else None,
+    ),
+    Metric(
+        key="collided", label="episodes with collision", unit="%", scale=100, digits=0, centre="mean",
+        of=lambda row: row["collisions"] > 0,
+    ),
+    Metric(key="map_iou", label="wall IoU", digits=3, better="high"),
+    Metric(key="corner_mean_m", label="corner error", unit="cm", scale=100),
+    Metric(key="ate_rmse_m", label="ATE", unit="cm", scale=100),
+    Metric(key="ate_aligned_rmse_m", label="ATE, aligned", unit="cm", scale=100),
+    Metric(key="final_position_error_m", label="final position error", unit="cm", scale=100),
+    Metric(key="final_heading_error_rad", label="final heading error", unit="°", scale=180 / math.pi),
+    Metric(key="anees", label="NEES / 3", better=""),
+    Metric(key="decision_ms_median", label="decision, median", unit="ms"),
+    Metric(key="decision_ms_p95", label="decision, 95th percentile", unit="ms"),
+)  # fmt: skip
+"""Every metric that is reported, in the order of the tables."""
+
+COMPARED = tuple(m for m in METRICS if m.centre == "iqm" and m.better)
+"""The metrics that an agent is compared with the baseline in."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Group:
+    """The episodes of one agent on one backend in one suite, by place and seed."""
+
+    suite: str
+    agent: str
+    slam: str
+    keys: tuple[Key, ...]
+    rows: tuple[EpisodeRow, ...]
+
+    @property
+    def strata(self) -> tuple[str, ...]:
+        """The place of every episode."""
+        return tuple(key[1] for key in self.keys)
+
+    def ends(self) -> dict[str, int]:
+        """Return how many episodes ended how, the commonest first."""
+        return dict(Counter(str(row.metrics["end"]) for row in self.rows).most_common())
+
+    def consistency(self) -> dict[str, Any]:
+        """Return ``nees_over_3_mean``, ``nees_band_95`` and ``fraction_in_band`` over all episodes' seconds."""
+        return consistency_figures([row.nees.tolist() for row in self.rows])
+
+    def values(self, metric: Metric) -> Array:
+        """Return every episode's value ``(n,)``, nan where it has none."""
+        return np.array([metric.value(row.metrics) for row in self.rows], np.float64)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A metric of a group: what stands in the tables, and the averages of the episodes that have a value."""
+
+    centre: Interval
+    averages: Estimate
+
+
+def group_rows(rows: Sequence[tuple[Key, EpisodeRow]]) -> list[Group]:
+    """Return the groups of rows, in the order in which their first rows come."""
+    members: dict[tuple[str, str, str], list[tuple[Key, EpisodeRow]]] = {}
+    for key, row in rows:
+        members.setdefault((key[0], key[3], key[4]), []).append((key, row))
+    return [
+        Group(
+            suite=suite, agent=agent, slam=slam, keys=tuple(k for k, _ in found), rows=tuple(r for _, r in found)
+        )
+        for (suite, agent, slam), found in members.items()
+    ]
+
+
+def merged(groups: Sequence[Group], *, suite: str) -> Group:
+    """Return one agent's episodes of several suites as those of one, with each suite's places as its strata."""
+    pairs = [(key, row) for group in groups for key, row in zip(group.keys, group.rows, strict=True)]
+    return Group(
+        suite=suite,
+        agent=groups[0].agent,
+        slam=groups[0].slam,
+        keys=tuple((suite, f"{key[0]}/{key[1]}", *key[2:]) for key, _ in pairs),
+        rows=tuple(row for _, row in pairs),
+    )
+
+
+def figures(group: Group) -> dict[str, Figure]:
+    """Return every metric of :data:`METRICS` by its key."""
+    return {metric.key: _figure(metric, group) for metric in METRICS}
+
+
+def comparisons(group: Group, baseline: Group) -> dict[str, Comparison]:
+    """Return every metric of :data:`COMPARED` against the baseline's, on the episodes that both have."""
+    theirs = {key[:3]: row for key, row in zip(baseline.keys, baseline.rows, strict=True)}
+    pairs = [
+        (key[1], row.metrics, theirs[key[:3]].metrics)
+        for key, row in zip(group.keys, group.rows, strict=True)
+        if key[:3] in theirs
+    ]
+    return {metric.key: _comparison(metric, pairs) for metric in COMPARED}
+
+
+def _figure(metric: Metric, group: Group) -> Figure:
+    values, rows = group.values(metric), [row.metrics for row in group.rows]
+    strata: Sequence[str] = group.strata
+    if metric.may_be_missed:
+        averages = estimate(_at_limit(values, rows), strata, for_median=_at_infinity(values))
+    else:
+        known = np.flatnonzero(np.isfinite(values))
+        averages = estimate(values[known], [strata[k] for k in known.tolist()])
+    if metric.centre == "iqm":
+        return Figure(averages.iqm, averages)
+    if metric.centre == "mean":
+        return Figure(mean_interval(values, strata), averages)
+    # Many short episodes without contact shall not outvote a long one with many.
+    contacts, ways = (np.array([row[name] for row in rows], np.float64) for name in _COLLISIONS)
+    return Figure(ratio_of_sums(100 * contacts, ways, strata), averages)
+
+
+_COLLISIONS = ("collisions", "path_length_m")
+
+
+def _comparison(metric: Metric, pairs: Sequence[tuple[str, Row, Row]]) -> Comparison:
+    our_rows, their_rows = [ours for _, ours, _ in pairs], [theirs for _, _, theirs in pairs]
+    ours, theirs = (np.array([metric.value(row) for row in rows]) for rows in (our_rows, their_rows))
+    lower = metric.better == "low"
+    if metric.may_be_missed:
+        strata = [place for place, _, _ in pairs]
+        ranks = _at_infinity(ours), _at_infinity(theirs)
+        ours, theirs = _at_limit(ours, our_rows), _at_limit(theirs, their_rows)
+        return compare(ours, theirs, strata, lower_is_better=lower, for_rank=ranks)
+    known = np.flatnonzero(np.isfinite(ours) & np.isfinite(theirs))
+    strata = [pairs[k][0] for k in known.tolist()]
+    return compare(ours[known], theirs[known], strata, lower_is_better=lower)
+
+
+def _at_limit(values: Array, rows: Sequence[Row]) -> Array:
+    limits = np.array([row["limit_s"] for row in rows], np.float64)
+    return np.where(np.isnan(values), limits, values)
+
+
+def _at_infinity(values: Array) -> Array:
+    return np.where(np.isnan(values), np.inf, values)

@@ -1,0 +1,105 @@
+"""What one agent has of the others' errors and times: ratios of means over the same seeds of a benchmark.
+
+Means, not interquartile means: a rare large error counts. ::
+
+    python -m training.benchmark.ratios out/benchmark --suite apartments-slippery --agent active
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.figures.statistics import Interval, interval
+from training.runs.errors import BadInput
+
+__all__ = ["main", "ratio", "table"]
+
+Array = NDArray[np.float64]
+
+COLUMNS = {
+    "time_to_95_s": ("time to 95 % [s]", 1.0, 1),
+    "time_s": ("to the end [s]", 1.0, 1),
+    "ate_rmse_m": ("ATE [mm]", 1e3, 1),
+    "corner_mean_m": ("corner error [mm]", 1e3, 1),
+}
+
+
+def ratio(ours: Array, theirs: Array) -> Interval:
+    """Return mean(ours) / mean(theirs) of pairs ``(n,)`` with its 95 % interval, pairs resampled together."""
+    return interval(lambda at: ours[at].mean(axis=-1) / theirs[at].mean(axis=-1), ["all"] * len(ours))
+
+
+def table(episodes: Path, suite: str, agent: str) -> str:
+    """Return a Markdown table: each agent's means, and what ``agent`` has of them.
+
+    Raises
+    ------
+    BadInput
+        Where the rows hold no such suite or agent.
+    """
+    values = _read(episodes, suite)
+    if agent not in values:
+        raise BadInput(f"{episodes} holds no rows of {agent} on {suite}; run mecanum benchmark with both")
+    names = [name for name, _, _ in COLUMNS.values()]
+    shares = [f"`{agent}`: {name.split(' [')[0]}" for name in names]
+    lines = [f"| {' | '.join([suite, *names, *shares])} |", f"|{'---|' * (1 + 2 * len(names))}"]
+    for other, theirs in values.items():
+        seeds = sorted(set(theirs) & set(values[agent]))
+        cells = []
+        for k, (_, factor, digits) in enumerate(COLUMNS.values()):
+            every = np.array([row[k] for row in theirs.values()])
+            cells.append(f"{factor * np.nanmean(every):.{digits}f}" if np.isfinite(every).any() else "–")
+        for k in range(len(COLUMNS)):
+            pairs = np.array([(values[agent][s][k], theirs[s][k]) for s in seeds])
+            pairs = pairs[np.isfinite(pairs).all(axis=1)]
+            if other == agent or not len(pairs):
+                cells.append("")
+                continue
+            found = ratio(pairs[:, 0], pairs[:, 1])
+            cells.append(f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]")
+        lines.append(f"| `{other}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _read(episodes: Path, suite: str) -> dict[str, dict[tuple[str, int], list[float]]]:
+    """Return the columns' values by agent and episode; a time that was not reached is the limit."""
+    values: dict[str, dict[tuple[str, int], list[float]]] = {}
+    try:
+        with episodes.open(encoding="utf-8", newline="") as file:
+            for row in csv.DictReader(file):
+                if row["suite"] != suite:
+                    continue
+                found = [float(row[key] or "nan") for key in COLUMNS]
+                found[0] = float(row["limit_s"]) if np.isnan(found[0]) else found[0]
+                values.setdefault(row["agent"], {})[row["place"], int(row["seed"])] = found
+    except (OSError, KeyError, ValueError) as error:
+        raise BadInput(f"cannot read {episodes}: {error}; give the folder of a mecanum benchmark") from error
+    return values
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.benchmark.ratios", description=__doc__.splitlines()[0]
+    )
+    parser.add_argument("folder", type=Path, help="of a mecanum benchmark")
+    parser.add_argument("--suite", default="apartments-slippery")
+    parser.add_argument("--agent", default="active")
+    given = parser.parse_args(arguments)
+    try:
+        print(table(given.folder / "episodes.csv", given.suite, given.agent))
+    except BadInput as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,336 @@
+"""A benchmark on one HTML page that needs nothing else: tables, curves, maps with the worst cases first."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from slam.formats import atomic_write
+from training.benchmark.episode import EpisodeRow, Key
+from training.benchmark.figures import METRICS, Metric
+from training.benchmark.markdown import AGAINST, HEADLINE
+from training.benchmark.output import Entry, Report, shown
+from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent
+from training.episodes.explore import ENDINGS
+from training.episodes.known_map import NAME as KNOWN_MAP
+from training.figures.page_style import STYLE
+from training.figures.statistics import Comparison, Interval
+
+__all__ = ["FILE", "page", "worst_first", "write_report"]
+
+FILE = "report.html"
+
+_CASES = 6  # maps shown of an agent in a suite
+_BY_KEY = {metric.key: metric for metric in METRICS}
+_READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
+and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
+reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
+
+_BOUND = f"""<p><b>{KNOWN_MAP}</b> is no agent: it plans on the true map, and stands here as a bound in practice
+for what agents can do.</p>"""
+
+
+def write_report(out: Path, report: Report) -> None:
+    """Write ``report.html`` beside the tables; it shows the ``config.toml`` that is there."""
+    config = out / "config.toml"
+    text = config.read_text("utf-8") if config.exists() else ""
+    atomic_write(out / FILE, page(report, config_text=text))
+
+
+def page(report: Report, *, config_text: str) -> str:
+    """Return the page."""
+    suites = report.suites()
+    colours = {name: k for k, name in enumerate(dict.fromkeys(entry.name for entry in report.entries))}
+    links = "".join(f'<a href="#{_anchor(name)}">{escape(name)}</a>' for name in suites)
+    body = [
+        "<h1>Exploration benchmark</h1>",
+        f'<p class="soft">{escape(_described(report))}</p>',
+        f"<nav>{links}<a href='#made'>configuration</a></nav>",
+        _READING,
+        _BOUND if any(entry.group.agent == KNOWN_MAP for entry in report.entries) else "",
+        _overview(report, suites),
+        *(
+            _against_table(found, f"Against {report.baseline}, {name.replace('-', ' ')} suites together")
+            for name, found in report.overall.items()
+        ),
+        *(_suite(name, entries, report, colours) for name, entries in suites.items()),
+        _made(report.config, config_text),
+    ]
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>Exploration benchmark</title><style>{STYLE}</style></head>\n<body>\n"
+        + "\n".join(body)
+        + "\n</body></html>\n"
+    )
+
+
+# ---- the parts of a suite --------------------------------------------------------------------------------------
+
+
+def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[str, int]) -> str:
+    counts = sorted({len(entry.group.rows) for entry in entries})
+    episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    backends = ", ".join(dict.fromkeys(entry.group.slam for entry in entries))
+    parts = [
+        f'<h2 id="{_anchor(name)}">{escape(name)}</h2>',
+        f'<p class="soft">{episodes} episodes an agent, {escape(backends)}</p>',
+        _figures_table(entries, [_BY_KEY[key] for key in HEADLINE], colours),
+        _against_table(
+            {entry.name: entry.against for entry in entries if entry.against},
+            f"Against {report.baseline}, on the same episodes",
+        ),
+        _charts(entries, colours),
+        "<h3>How the episodes ended</h3>",
+        _ends_table(entries),
+        "<h3>Is the robot's own uncertainty right?</h3>",
+        _consistency_table(entries),
+        "<h3>Maps, worst cases first</h3>",
+        '<p class="soft">Those that did not reach 95 %, the least covered first; then those with a collision, '
+        "then the others, the largest trajectory error first.</p>",
+        *(_cases(entry) for entry in entries),
+        "<details><summary>All metrics</summary>",
+        _figures_table(entries, METRICS, colours, medians=True),
+        "</details>",
+    ]
+    return "\n".join(parts)
+
+
+def _figures_table(
+    entries: Sequence[Entry], metrics: Sequence[Metric], colours: dict[str, int], *, medians: bool = False
+) -> str:
+    head = ["", *(_heading(m) + (f"<br>[{_unbroken(m.unit)}]" if m.unit else "") for m in metrics)]
+    best = {metric.key: _best(metric, entries) for metric in metrics}
+    rows = []
+    for entry in entries:
+        cells = [f"{_key(colours[entry.name])}{escape(entry.name)}"]
+        for metric in metrics:
+            figure = entry.figures[metric.key]
+            value = shown(metric, figure.centre.value)
+            if value == best[metric.key] and entry.group.agent != KNOWN_MAP:
+                value = f'<span class="best">{value}</span>'
+            text = f"{value}<small>{_limits(metric, figure.centre)}</small>"
+            if medians:
+                text += (
+                    f"<small>median {shown(metric, figure.averages.median.value)}, n {figure.averages.n}</small>"
+                )
+            cells.append(text)
+        rows.append(cells)
+    return _table(head, rows)
+
+
+def _against_table(against: Mapping[str, Mapping[str, Comparison]], title: str) -> str:
+    """Return a table of name → metric → comparison, nothing where there is none."""
+    metrics = [_BY_KEY[key] for key in AGAINST]
+    rows = []
+    for name, found in against.items():
+        cells = [escape(name)]
+        for metric in metrics:
+            c = found[metric.key]
+            cells.append(f"{_change(metric, c.ratio)}<small>{_better(c.probability)}</small>")
+        rows.append([*cells, str(found["time_to_95_s"].n)])
+    if not rows:
+        return ""
+    head = ["", *map(_heading, metrics), "episodes"]
+    return (
+        f"<h3>{escape(title)}</h3>"
+        '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
+        "change; below, in what share of the episodes it did better, ties counted half.</p>" + _table(head, rows)
+    )
+
+
+def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
+    groups = [entry.group for entry in entries]
+    charts = []
+    alongs: tuple[Along, ...] = ("time_s", "path_length_m")
+    for along in alongs:
+        high = extent(groups, along)
+        bands = [band(entry.group, name=entry.name, along=along, high=high) for entry in entries]
+        charts.append(coverage_chart(bands, along=along, colours=[colours[entry.name] for entry in entries]))
+    legend = "".join(f"<span>{_key(colours[e.name])}{escape(e.name)}</span>" for e in entries)
+    return (
+        "<h3>Coverage against time and way</h3>"
+        f'<p class="soft">Median, and the middle half of the episodes.</p><nav>{legend}</nav>'
+        f'<div class="charts">{"".join(charts)}</div>'
+    )
+
+
+def _ends_table(entries: Sequence[Entry]) -> str:
+    ends = {entry.name: entry.group.ends() for entry in entries}
+    kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
+    rows = [[escape(name), *(str(found.get(kind, "–")) for kind in kinds)] for name, found in ends.items()]
+    means = "; ".join(f"{kind}: {ENDINGS[kind]}" for kind in kinds if kind in ENDINGS)
+    return f'{_table(["", *map(escape, kinds)], rows)}<p class="soft">{escape(means)}</p>'
+
+
+def _consistency_table(entries: Sequence[Entry]) -> str:
+    rows = []
+    for entry in entries:
+        found = entry.group.consistency()
+        mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
+        average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
+        rows.append([
+            escape(entry.name), average, f"{low:.2f} … {high:.2f}", f"{100 * found['fraction_in_band']:.0f} %"
+        ])  # fmt: skip
+    head = ["", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]
+    return _table(head, rows)
+
+
+def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
+    """Return episodes with the worst first.
+
+    Those that did not reach 95 % by their coverage; of the others those with a collision, then those without, by
+    their trajectory error.
+    """
+
+    def rank(pair: tuple[Key, EpisodeRow]) -> tuple[bool, bool, float]:
+        m = pair[1].metrics
+        if m["time_to_95_s"] is None:
+            return False, False, m["coverage"] or 0.0
+        return True, m["collisions"] == 0, -(m["ate_rmse_m"] or 0.0)
+
+    return sorted(zip(keys, rows, strict=True), key=rank)
+
+
+def _cases(entry: Entry) -> str:
+    worst = worst_first(entry.group.keys, entry.group.rows)[:_CASES]
+    shown_cases = "".join(_case(key, row, several=len(set(entry.group.strata)) > 1) for key, row in worst)
+    return f'<details open><summary>{escape(entry.name)}</summary><div class="cases">{shown_cases}</div></details>'
+
+
+def _case(key: Key, row: EpisodeRow, *, several: bool) -> str:
+    m = row.metrics
+    where = f"{key[1]}, seed {key[2]}" if several else f"seed {key[2]}"
+    at = "95 % never" if m["time_to_95_s"] is None else f"95 % at {m['time_to_95_s']:.0f} s"
+    lines = [
+        f"<b>{escape(where)}</b>",
+        f"{100 * m['coverage']:.1f} %, {at}",
+        f"ATE {_cm(m['ate_rmse_m'])}, end {_cm(m['final_position_error_m'])}",
+        f"{escape(str(m['end']))} at {m['time_s']:.0f} s"
+        + (f', <span class="worse">{m["collisions"]} collisions</span>' if m["collisions"] else ""),
+    ]
+    data = base64.b64encode(row.thumbnail).decode("ascii")
+    return (
+        f'<figure><img loading="lazy" alt="believed map, {escape(where)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{'<br>'.join(lines)}</figcaption></figure>"
+    )
+
+
+# ---- all suites ------------------------------------------------------------------------------------------------
+
+
+def _overview(report: Report, suites: dict[str, list[Entry]]) -> str:
+    """Return time to 95 % of every agent on every suite, where there is more than one."""
+    if len(suites) < 2:
+        return ""
+    metric = _BY_KEY["time_to_95_s"]
+    names = dict.fromkeys(entry.name for entry in report.entries)
+    by_name = {(suite, e.name): e for suite, entries in suites.items() for e in entries}
+    best = {suite: _best(metric, entries) for suite, entries in suites.items()}
+    rows = []
+    for name in names:
+        cells = [escape(name)]
+        for suite in suites:
+            entry = by_name.get((suite, name))
+            if entry is None:
+                cells.append("–")
+                continue
+            centre = entry.figures[metric.key].centre
+            value = shown(metric, centre.value)
+            value = f'<span class="best">{value}</span>' if value == best[suite] else value
+            cells.append(f"{value}<small>{_limits(metric, centre)}</small>")
+        rows.append(cells)
+    head = ["", *(f'<a href="#{_anchor(suite)}">{escape(suite)}</a>' for suite in suites)]
+    return f"<h3>Time to 95 % coverage [s]</h3>{_table(head, rows)}"
+
+
+def _made(config: dict[str, Any], config_text: str) -> str:
+    lines = json.dumps(config, ensure_ascii=False, indent=1)
+    return (
+        '<h2 id="made">Configuration and versions</h2>'
+        '<p class="soft">Beside this page: episodes.csv (a row an episode), summary.csv, comparison.csv, '
+        "tables.md, results.sqlite, config.toml.</p>"
+        f"<details><summary>What was asked for, and versions</summary><pre>{escape(lines)}</pre></details>"
+        f"<details><summary>config.toml</summary><pre>{escape(config_text)}</pre></details>"
+    )
+
+
+# ---- small pieces ----------------------------------------------------------------------------------------------
+
+
+def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table that scrolls sideways; cells are HTML."""
+    lines = [
+        '<div class="wide"><table><thead><tr>',
+        *(f"<th>{cell}</th>" for cell in head),
+        "</tr></thead><tbody>",
+    ]
+    for row in rows:
+        lines.append(f"<tr><th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>")
+    return "".join([*lines, "</tbody></table></div>"])
+
+
+def _heading(metric: Metric) -> str:
+    return escape(metric.label.replace(" %", "\u00a0%"))
+
+
+def _unbroken(text: str) -> str:
+    return escape(text.replace(" ", "\u00a0"))
+
+
+def _best(metric: Metric, entries: Sequence[Entry]) -> str | None:
+    """Return the agents' best value as shown, None where there is nothing to choose between."""
+    values = [e.figures[metric.key].centre.value for e in entries if e.group.agent != KNOWN_MAP]
+    values = [v for v in values if not math.isnan(v)]
+    if not metric.better or len(values) < 2:
+        return None
+    return shown(metric, min(values) if metric.better == "low" else max(values))
+
+
+def _limits(metric: Metric, found: Interval) -> str:
+    return "" if math.isnan(found.low) else f"{shown(metric, found.low)} … {shown(metric, found.high)}"
+
+
+def _change(metric: Metric, ratio: Interval) -> str:
+    if math.isnan(ratio.value):
+        return "–"
+    text = f"{100 * (ratio.value - 1):+.1f} %"
+    if math.isnan(ratio.low):
+        return text
+    if not ratio.low <= 1.0 <= ratio.high:
+        good = (ratio.value < 1.0) == (metric.better == "low")
+        text = f'<span class="{"better" if good else "worse"}">{text}</span>'
+    return f"{text}<small>{100 * (ratio.low - 1):+.1f} … {100 * (ratio.high - 1):+.1f}</small>"
+
+
+def _better(p: Interval) -> str:
+    if math.isnan(p.value):
+        return "–"
+    limits = "" if math.isnan(p.low) else f" [{100 * p.low:.0f}, {100 * p.high:.0f}]"
+    return f"better in {100 * p.value:.0f} %{limits}"
+
+
+def _key(colour: int) -> str:
+    return f'<span class="key c{colour % COLOURS}{" dashed" if colour >= COLOURS else ""}"></span>'
+
+
+def _cm(metres: float | None) -> str:
+    return "–" if metres is None else f"{100 * metres:.1f} cm"
+
+
+def _anchor(name: str) -> str:
+    return "suite-" + "".join(c if c.isalnum() else "-" for c in name)
+
+
+def _described(report: Report) -> str:
+    config = report.config
+    version = config.get("mecanum-slam", "")
+    which = f"{config['split']} seeds" if config.get("split") else "chosen seeds"
+    suites = ", ".join(report.suites())
+    return f"{suites}: {', '.join(config['agents'])}; {which}; mecanum-slam {version}"

@@ -1,0 +1,261 @@
+"""``mecanum benchmark``: agents × backends × suites × seeds, kept row by row; ``docs/benchmark.md`` says how."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import tomli_w
+
+import agents
+import slam
+from mecanum_env.config import EnvConfig
+from mecanum_env.env import make_config
+from slam.formats import atomic_write
+from slam.settings import to_mapping, unknown_name
+from training.benchmark import store as benchmark_store
+from training.benchmark import suites
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, run_job
+from training.benchmark.figures import Group, group_rows
+from training.benchmark.markdown import markdown
+from training.benchmark.output import FILES, Report, write_tables
+from training.benchmark.suites import SPLITS, Place, Suite
+from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
+from training.episodes.known_map import NAME as KNOWN_MAP
+from training.episodes.known_map import KnownMap
+from training.episodes.room_pictures import parse_seeds
+from training.runs.campaign import backend_names, check_settings, run_all, write_settings
+from training.runs.errors import BadInput, bad_input, one_line
+from training.runs.provenance import code_digest, short_digest
+from training.runs.running import versions
+
+__all__ = ["BenchmarkPlan", "EpisodesFailed", "benchmark"]
+
+DEFAULT_BASELINE = "nearest-frontier"
+_MOST_SEEDS = 10_000
+_EPISODE = "training.benchmark.episode"  # the code that makes a row, with all that it imports
+
+
+class EpisodesFailed(Exception):
+    """Errors ended some of the episodes; the rows of the others are kept and their tables written.
+
+    Attributes
+    ----------
+    report : Report
+        Of the others.
+    """
+
+    def __init__(self, message: str, report: Report) -> None:
+        super().__init__(message)
+        self.report = report
+
+
+@dataclass(frozen=True, kw_only=True)
+class BenchmarkPlan:
+    """What was asked for, checked."""
+
+    suites: tuple[Suite, ...]
+    agents: tuple[str, ...]
+    backends: tuple[str, ...]
+    split: str
+    seeds: tuple[int, ...] | None  # None: the split's
+    baseline: str | None  # the agent that the others are compared with
+    max_steps: int | None
+
+    @classmethod
+    def parse(
+        cls, *, suite: str | None, agents: str, slam: str | None, split: str = "test", seeds: str | None = None,
+        baseline: str | None = None, floor_plans: Path | None = None, max_steps: int | None = None,
+    ) -> BenchmarkPlan:  # fmt: skip
+        """Check options as typed; :class:`BadInput` says what is allowed."""
+        with bad_input():
+            names = _agent_names(agents)
+            backends = tuple(backend_names(slam if slam is not None else EnvConfig().slam))
+            if split not in SPLITS:
+                raise unknown_name("split", split, SPLITS)
+            chosen = tuple(parse_seeds(seeds, most=_MOST_SEEDS)) if seeds is not None else None
+            if baseline is not None and baseline not in names:
+                raise ValueError(f"--baseline {baseline} is none of --agents {','.join(names)}; add it there")
+            if suite is None:
+                suite = "apartments" if floor_plans is None else suites.FLOOR_PLANS
+            which = suites.choose(suite, floor_plans=floor_plans)
+        if baseline is None and DEFAULT_BASELINE in names:
+            baseline = DEFAULT_BASELINE
+        return cls(
+            suites=which, agents=names, backends=backends, split=split, seeds=chosen, baseline=baseline,
+            max_steps=max_steps,
+        )  # fmt: skip
+
+    def settings(self) -> dict[str, Any]:
+        """Return what every row depends on, whichever it is."""
+        limit: Any = self.max_steps or {"least": LEAST_STEPS, "per_m2": STEPS_PER_M2}
+        return {"max_steps": limit, **versions()}
+
+    @cached_property
+    def jobs(self) -> tuple[EpisodeJob, ...]:
+        """Every episode; all agents get to a seed before any gets to the next."""
+        seeds = {suite.name: self.seeds or tuple(suite.seeds(self.split)) for suite in self.suites}
+        found = [
+            (rank, EpisodeJob(
+                suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend, noise=suite.noise,
+                rooms=place.rooms, floor_plan=place.floor_plan, max_steps=self.max_steps,
+            ))
+            for suite in self.suites
+            for place in suite.places
+            for backend in self.backends
+            for agent in self.agents
+            for rank, seed in enumerate(seeds[suite.name])
+        ]  # fmt: skip
+        return tuple(job for _, job in sorted(found, key=lambda pair: pair[0]))
+
+    def made_by(self) -> dict[tuple[str, str, str, str], str]:
+        """Return suite, place, agent, backend → digest of all that such rows are made by but the seed.
+
+        Raises
+        ------
+        BadInput
+            For an agent that cannot be made without settings of its own.
+        """
+        made = {name: _behind_agent(name) for name in self.agents}
+        modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
+        common = json.dumps(self.settings(), sort_keys=True)
+        out = {}
+        for agent in self.agents:
+            for backend in self.backends:
+                module, policy = made[agent]
+                code = code_digest(_EPISODE, module, modules_of_backends[backend])
+                for suite in self.suites:
+                    config = _config_text(suite, backend)
+                    for place in suite.places:
+                        parts = (code, policy, common, config, place.name, place.digest)
+                        out[suite.name, place.name, agent, backend] = short_digest(p.encode() for p in parts)
+        return out
+
+    def config_text(self) -> str:
+        """Return the effective configuration of the first suite and backend as TOML; [run] has what varies."""
+        run: dict[str, Any] = {
+            "suites": {
+                s.name: {"noise": s.noise, "places": [p.name for p in s.places]} for s in self.suites
+            },
+            "agents": list(self.agents),
+            "backends": list(self.backends),
+            "split": self.split if self.seeds is None else "given seeds",
+            "seeds": {s.name: list(self.seeds or s.seeds(self.split)) for s in self.suites},
+            "step_limit": self.settings()["max_steps"],
+            "versions": versions(),
+        }  # fmt: skip
+        if self.baseline is not None:
+            run["baseline"] = self.baseline
+        return _config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
+
+
+def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int) -> Report:
+    """Run the episodes that ``out`` does not hold yet, write the tables, and return what they hold.
+
+    Raises
+    ------
+    BadInput
+        For a folder that cannot be used, or rows in it that other code or settings made.
+    Interrupted
+        On Ctrl-C; running it again goes on.
+    EpisodesFailed
+        After the tables of the other episodes are written.
+    """
+    settings = plan.settings()
+    check_settings(out, settings, FILES)
+    made_by = plan.made_by()
+    write_settings(out, settings)
+    failures: list[tuple[EpisodeJob, str]] = []
+    with benchmark_store.Store(out / benchmark_store.FILE) as store:
+        missing = _missing(plan, store, made_by, out)
+        atomic_write(out / "config.toml", plan.config_text())
+
+        def keep(job: EpisodeJob, result: EpisodeRow | EpisodeFailure) -> None:
+            if isinstance(result, EpisodeFailure):
+                failures.append((job, result.message))
+            else:
+                store.add(job, result, made_by=made_by[job.suite, job.place, job.agent, job.slam])
+
+        # Even one worker is a process of its own: the libraries' threads, and with them the roundings, are the
+        # same in any number of workers.
+        run_all(missing, run_job, workers=workers, keep=keep, what="episodes", apart=True)
+        groups = _groups(plan, store)
+    report = Report.of(groups, baseline=plan.baseline, config=_described(plan))
+    write_tables(out, report)
+    atomic_write(out / "tables.md", markdown(report))
+    if failures:
+        job, message = failures[0]
+        raise EpisodesFailed(
+            f"{len(failures)} of {len(missing)} episodes failed, the first on {job.suite} ({job.place}) with seed "
+            f"{job.seed}, {job.agent}, {job.slam}: {message}; the others are kept in {out}",
+            report,
+        )
+    return report
+
+
+def _missing(
+    plan: BenchmarkPlan, store: benchmark_store.Store, made_by: dict[tuple[str, str, str, str], str], out: Path
+) -> list[EpisodeJob]:
+    there, missing = store.made_by(), []
+    for job in plan.jobs:
+        wanted = made_by[job.suite, job.place, job.agent, job.slam]
+        if job.key not in there:
+            missing.append(job)
+        elif there[job.key] != wanted:
+            raise BadInput(
+                f"{out} holds rows of {job.agent} with {job.slam} on {job.suite} that other code, configuration "
+                "or plans made; choose another --out"
+            )
+    return missing
+
+
+def _groups(plan: BenchmarkPlan, store: benchmark_store.Store) -> list[Group]:
+    order = {s.name: k for k, s in enumerate(plan.suites)}
+    jobs = sorted(plan.jobs, key=lambda job: order[job.suite])  # stable: agents as they were given, then seeds
+    return group_rows(list(store.rows(job.key for job in jobs)))
+
+
+def _agent_names(text: str) -> tuple[str, ...]:
+    chosen = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    for name in chosen:
+        agents.check(name, KNOWN_MAP)
+    return chosen
+
+
+def _behind_agent(name: str) -> tuple[str, str]:
+    """Return an agent's module, and a digest of the trained policy that it reads, if it does."""
+    if name == KNOWN_MAP:
+        return KnownMap.__module__, ""
+    try:
+        with bad_input():
+            agent = agents.make(name)
+    except (ImportError, AttributeError) as error:  # another package's, or one that needs what is not installed
+        raise BadInput(
+            f"cannot load agent {name} ({one_line(error)}); install what it needs, or leave it out"
+        ) from error
+    policy: Path | None = getattr(agent, "policy_path", None)
+    files = [] if policy is None else [policy, policy.with_suffix(".json")]
+    return type(agent).__module__, short_digest(file.read_bytes() for file in files)
+
+
+def _config_text(suite: Suite, backend: str) -> str:
+    place: Place = suite.places[0]
+    config = make_config(rooms=place.rooms, slam=backend, noise=suite.noise)
+    return tomli_w.dumps(to_mapping(config))
+
+
+def _described(plan: BenchmarkPlan) -> dict[str, Any]:
+    seeds: Sequence[int] | None = plan.seeds
+    return {
+        "suites": [suite.name for suite in plan.suites],
+        "agents": list(plan.agents),
+        "backends": list(plan.backends),
+        "split": plan.split if seeds is None else None,
+        "seeds": {s.name: list(seeds or s.seeds(plan.split)) for s in plan.suites},
+        "baseline": plan.baseline,
+        **plan.settings(),
+    }

@@ -1,0 +1,130 @@
+"""The rows of a benchmark, in one SQLite file: one transaction a row, one row a job."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from training.benchmark.episode import EpisodeJob, EpisodeRow, Key
+from training.runs.errors import BadInput
+
+__all__ = ["FILE", "Store"]
+
+FILE = "results.sqlite"
+
+_APPLICATION = 0x4D534C42  # "MSLB", in the file's header: this is a store of ours
+_VERSION = 1
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS episodes (
+    suite TEXT NOT NULL,
+    place TEXT NOT NULL,              -- the generator of the rooms, or the plan's file name
+    seed INTEGER NOT NULL,
+    agent TEXT NOT NULL,
+    slam TEXT NOT NULL,
+    made_by TEXT NOT NULL,            -- digest of the code, configuration and plan behind the row
+    metrics TEXT NOT NULL,            -- JSON: name -> number, word or null
+    coverage_by_time BLOB NOT NULL,   -- little-endian float32, evenly spaced from 0 to time_s
+    coverage_by_path BLOB NOT NULL,   -- the same, from 0 to path_length_m
+    nees BLOB NOT NULL,               -- little-endian float32, one each simulated second
+    thumbnail BLOB NOT NULL,          -- PNG: believed map and path
+    PRIMARY KEY (suite, place, seed, agent, slam)
+) STRICT
+"""
+_KEY = "suite, place, seed, agent, slam"
+_CURVES = ("coverage_by_time", "coverage_by_path", "nees")
+
+
+class Store:
+    """Rows by their key. Whatever kills the process leaves whole rows behind.
+
+    Parameters
+    ----------
+    path : Path
+        Made where it is not there.
+
+    Raises
+    ------
+    BadInput
+        For a file that is damaged, of another version, or no such store.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with self._blaming_the_file():
+            # Two runs of the same command wait for each other's rows.
+            self._connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
+            self._check()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+
+    def add(self, job: EpisodeJob, row: EpisodeRow, *, made_by: str) -> None:
+        """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same."""
+        metrics = json.dumps(row.metrics, ensure_ascii=False, allow_nan=False)
+        curves = [np.asarray(getattr(row, name), "<f4").tobytes() for name in _CURVES]
+        with self._blaming_the_file():
+            self._connection.execute(
+                "INSERT OR IGNORE INTO episodes VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (*job.key, made_by, metrics, *curves, row.thumbnail),
+            )
+
+    def made_by(self) -> dict[Key, str]:
+        """Return what every row was made by."""
+        with self._blaming_the_file():
+            rows = self._connection.execute(f"SELECT {_KEY}, made_by FROM episodes").fetchall()
+        return {tuple(row[:5]): row[5] for row in rows}
+
+    def rows(self, keys: Iterable[Key]) -> Iterator[tuple[Key, EpisodeRow]]:
+        """Yield the rows of keys that there are, in the order of the keys."""
+        columns = ("metrics", *_CURVES, "thumbnail")
+        query = f"SELECT {', '.join(columns)} FROM episodes WHERE ({_KEY}) = (?, ?, ?, ?, ?)"
+        for key in keys:
+            with self._blaming_the_file():
+                found = self._connection.execute(query, key).fetchone()
+                if found is not None:
+                    row = _decode(dict(zip(columns, found, strict=True)))
+            if found is not None:
+                yield key, row
+
+    def _check(self) -> None:
+        application, version = (
+            self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version")
+        )
+        if (application, version) == (0, 0) and not self._connection.execute(
+            "SELECT count(*) FROM sqlite_schema"
+        ).fetchone()[0]:
+            # All or nothing: a run killed here leaves an empty file, which is made again.
+            self._connection.executescript(
+                f"BEGIN IMMEDIATE; {_SCHEMA}; PRAGMA application_id = {_APPLICATION}; "
+                f"PRAGMA user_version = {_VERSION}; COMMIT;"
+            )
+            return
+        if application != _APPLICATION:
+            raise BadInput(f"{self._path} is no store of a benchmark; choose another --out")
+        if version != _VERSION:
+            raise BadInput(f"{self._path} is a store of version {version}, not {_VERSION}; choose another --out")
+        problem = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+        if problem != "ok":
+            raise sqlite3.DatabaseError(problem)
+
+    @contextmanager
+    def _blaming_the_file(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, ValueError) as error:
+            problem = " ".join(str(error).split())
+            raise BadInput(f"cannot use {self._path} ({problem}); choose another --out, or remove it") from error
+
+
+def _decode(columns: dict[str, Any]) -> EpisodeRow:
+    curves = {name: np.frombuffer(columns[name], "<f4").astype(np.float32) for name in _CURVES}
+    return EpisodeRow(metrics=json.loads(columns["metrics"]), thumbnail=columns["thumbnail"], **curves)

@@ -1,0 +1,121 @@
+"""``mecanum benchmark`` on the command line."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.cli.options import Json
+from training.runs.errors import BadInput, suggestion
+
+__all__ = ["benchmark"]
+
+
+def benchmark(
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="rooms, apartments, corridors, caves, mazes, each also with -slippery; separated by commas, or "
+            "all.  [default: apartments, or floor-plans where --floor-plans is given]"
+        ),
+    ] = None,
+    agents: Annotated[
+        str, typer.Option(help="Agents or policy files, separated by commas; known-map for a bound.")
+    ] = "nearest-frontier",
+    slam: Annotated[
+        str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")
+    ] = None,
+    split: Annotated[
+        str, typer.Option(help="Seeds: test (10000:10049), validation (1000:1049) or train (0:999).")
+    ] = "test",
+    seeds: Annotated[
+        str | None, typer.Option(help="Other seeds than the split's: 3, 0:9 (both included) or 1,4,7.")
+    ] = None,
+    floor_plans: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder of ROS maps or images: the suites floor-plans(-slippery)."),
+    ] = None,
+    baseline: Annotated[
+        str | None,
+        typer.Option(help="Agent to compare the others with.  [default: nearest-frontier, if it is one of them]"),
+    ] = None,
+    protocol: Annotated[
+        str | None,
+        typer.Option(help="dungeons: the published path-length protocol on --maps, instead of suites."),
+    ] = None,
+    maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of that protocol's PNG maps.")] = None,
+    scan: Annotated[
+        str, typer.Option(help="How that protocol looks around: way-points or continuous.")
+    ] = "way-points",
+    max_steps: Annotated[
+        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/benchmark"),
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write report.html, one page of all of it.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Let agents explore suites of rooms, and compare them with confidence intervals.
+
+    Writes into --out: results.sqlite with each episode as it comes, so that the same command goes on where it was
+    broken off and more agents, backends, suites or seeds are added to those that are there; episodes.csv,
+    summary.csv, comparison.csv, tables.md, summary.json, config.toml, settings.json and, with --report,
+    report.html. docs/benchmark.md says what is counted, and how.
+
+    \b
+    Examples:
+      mecanum benchmark
+      mecanum benchmark --suite rooms --agents random,nearest-frontier --seeds 10000:10004 --out out/try --report
+      mecanum benchmark --suite apartments,apartments-slippery --slam ekf,invariant-ekf --workers 2 --out out/two
+      mecanum benchmark --suite all --split validation --out out/validation --json
+      mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
+      mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
+    """  # noqa: D301
+    if protocol is not None or maps is not None:
+        suites_only = {
+            "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
+            "--baseline": baseline, "--max-steps": max_steps, "--report": report or None,
+        }  # fmt: skip
+        _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
+        assert maps is not None
+        from training.dungeons import protocol as dungeons
+
+        names = [part.strip() for part in agents.split(",")]
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers or os.cpu_count() or 1, scan=scan)
+        print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
+        return
+    from training.benchmark import run as task
+    from training.benchmark.output import as_json as as_mapping
+    from training.benchmark.output import table
+    from training.benchmark.report import write_report
+
+    plan = task.BenchmarkPlan.parse(
+        suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
+        floor_plans=floor_plans, max_steps=max_steps,
+    )  # fmt: skip
+    try:
+        result = task.benchmark(plan, out=out, workers=workers or os.cpu_count() or 1)
+    except task.EpisodesFailed as failed:
+        if report:
+            write_report(out, failed.report)
+        raise
+    if report:
+        write_report(out, result)
+    print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
+
+
+def _check_protocol(protocol: str | None, maps: Path | None, not_its: list[str]) -> None:
+    if protocol is None:
+        raise BadInput("--maps belongs to a protocol; give --protocol dungeons with it")
+    if protocol != "dungeons":
+        raise BadInput(f"unknown protocol {protocol!r}{suggestion(protocol, ['dungeons'])}; valid: dungeons")
+    if maps is None:
+        raise BadInput("--protocol dungeons needs its maps; give --maps DIR, a folder of PNG maps")
+    if not_its:
+        raise BadInput(f"--protocol dungeons has no {not_its[0]}; leave it out")

@@ -1,0 +1,82 @@
+"""``mecanum play`` on the command line."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Timer
+from typing import Annotated
+
+import typer
+
+from training.runs.errors import BadInput
+
+__all__ = ["play"]
+
+_PATIENCE_S = 4.0
+
+
+def play(
+    agent: Annotated[
+        str, typer.Option(help="Who drives when Space is pressed, or a policy file.")
+    ] = "nearest-frontier",
+    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
+    floor_plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
+    ] = None,
+    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
+    speed: Annotated[float, typer.Option(help="Times true speed, which is 10 steps a second.")] = 1.0,
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="End after so many steps.  [default: when you quit]")
+    ] = None,
+) -> None:
+    """Drive the robot yourself in a window, and watch what it believes.
+
+    W A S D drive and strafe, Q E turn, Space lets an agent drive, Tab takes the next SLAM backend, N the next
+    room, F1 shows all keys, Esc quits. A gamepad drives, too. Needs the extra `human`. docs/play.md has the
+    details.
+
+    \b
+    Examples:
+      mecanum play
+      mecanum play --rooms cave --slam fastslam2 --seed 3
+      mecanum play --agent ppo-frontier --speed 2
+      SDL_VIDEODRIVER=dummy mecanum play --frames 100
+    """  # noqa: D301
+    if not (math.isfinite(speed) and 0.01 <= speed <= 1000):
+        raise BadInput(f"--speed must be from 0.01 to 1000, got {speed}")
+    from training.play.game import Game, open_window
+    from training.play.session import PlayOptions, Session
+
+    options = PlayOptions(
+        agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
+    )
+    window = open_window()
+    try:
+        with _said_where_it_takes_long():
+            session = Session(options)
+        Game(session, window, speed=speed).run(frames)
+    finally:
+        window.close()
+    print(session.summary())
+
+
+@contextmanager
+def _said_where_it_takes_long() -> Iterator[None]:
+    """Say on standard error what there is to wait for, while the window is empty, where that is some seconds."""
+    text = "mecanum play: compiling; the first time on a computer that can take minutes"
+    timer = Timer(_PATIENCE_S, print, [text], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

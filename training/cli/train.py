@@ -1,0 +1,144 @@
+"""``mecanum train`` on the command line."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from training.runs.errors import BadInput, Interrupted, bad_input, check_writable, suggestion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from training.learning.config import TrainConfig
+    from training.learning.end_to_end.config import DriveConfig
+    from training.learning.end_to_end.run import DriveRun
+    from training.learning.ensemble import EnsembleRun
+    from training.learning.ppo import Run
+
+__all__ = ["train"]
+
+CONFIGS = Path(__file__).parents[1] / "learning" / "configs"
+
+
+def train(
+    config: Annotated[
+        str, typer.Option(help="Name of a configuration that comes with the package, or a TOML file.")
+    ] = "ppo-frontier",
+    seed: Annotated[int | None, typer.Option(min=0, help="Another seed than the configuration's.")] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=1024,
+            help="Processes of lessons and trials; members trained at once.  [default: one a core]",
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
+) -> None:
+    """Train a policy with PPO, after rehearsals or a warm start by imitation, as the configuration says.
+
+    Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
+    curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes
+    on from its last checkpoint with --resume, and ends as it would have without. docs/training.md has the details.
+
+    \b
+    Examples:
+      mecanum train --out out/frontier
+      mecanum train --config ppo --out out/ppo
+      mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
+      mecanum train --config my.toml --out out/mine --resume
+    """  # noqa: D301
+    check_writable(out)
+    settings = _read(config, seed)
+    begun = (out / "progress.json").exists()
+    if begun and not resume:
+        raise BadInput(f"{out} holds a run already; go on with it by --resume, or choose another --out")
+    if resume and not begun:
+        raise BadInput(f"{out} holds no run to go on with; leave out --resume")
+    try:
+        make_run = _runner(settings)
+    except ModuleNotFoundError as error:
+        raise BadInput(
+            f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
+        ) from error
+    with bad_input():
+        command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
+        run = make_run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)
+    try:
+        run.train()
+    except KeyboardInterrupt as error:
+        raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
+
+
+def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | EnsembleRun | DriveRun]:
+    from training.learning.end_to_end.config import DriveConfig
+
+    if isinstance(settings, DriveConfig):
+        from training.learning.end_to_end.run import DriveRun
+
+        return DriveRun
+    from training.learning.ensemble import EnsembleRun
+    from training.learning.ppo import Run
+
+    return Run if settings.members == 1 else EnsembleRun
+
+
+def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
+    from slam.settings import from_mapping
+    from training.learning.config import TrainConfig
+    from training.learning.end_to_end.config import DriveConfig
+
+    values = _tables(config)
+    if "base" in values:
+        values = _laid_over(_base(config, values.pop("base")), values)
+    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
+    with bad_input():
+        return from_mapping(kind, values if seed is None else values | {"seed": seed})
+
+
+def _base(config: str, name: object) -> dict[str, Any]:
+    """Read the configuration that another one names as its base: of the package, or a file beside it."""
+    if not isinstance(name, str):
+        raise BadInput(f"{config}: base is the name of a configuration or a file, not {name!r}")
+    beside = Path(config).parent / name
+    try:
+        base = _tables(str(beside) if beside.is_file() else name)
+    except BadInput as error:
+        raise BadInput(f"{config}: base: {error}") from error
+    if "base" in base:
+        raise BadInput(f"{config}: the base of a configuration has none itself")
+    return base
+
+
+def _tables(config: str) -> dict[str, Any]:
+    """Read a configuration by its name in the package, or from a file."""
+    shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
+    path = CONFIGS / f"{config}.toml" if config in shipped else Path(config)
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        hint = suggestion(config, shipped)
+        raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise BadInput(f"cannot read {path}: {error}") from error
+
+
+def _laid_over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return the base's tables with what the values say instead, table by table."""
+    tables = {
+        key: _laid_over(base[key], value)
+        for key, value in values.items()
+        if isinstance(value, dict) and isinstance(base.get(key), dict)
+    }
+    return base | values | tables
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

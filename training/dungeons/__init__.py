@@ -1,0 +1,5 @@
+"""The dungeons protocol: published maps, a lattice of stations, path lengths beside the published ones.
+
+``protocol`` runs it in ``world``, ``bound`` knows the map; ``plans``, ``walks``, ``lessons``, ``networks`` and
+``training`` make ``learned-tour``.
+"""

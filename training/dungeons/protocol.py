@@ -1,0 +1,268 @@
+"""The dungeons protocol: path length of exploration on generated indoor maps, beside the published table.
+
+``python -m training.dungeons.protocol --maps DIR --agents nearest-frontier,tour --out DIR`` runs what is missing
+in ``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and
+prints the table. What an episode is stands in :mod:`training.dungeons.episode`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import math
+import statistics
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import agents
+from slam.formats import atomic_write
+from slam.settings import unknown_name
+from training.dungeons.bound import BOUNDS
+from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
+from training.dungeons.world import Dungeon, layout, load
+from training.runs.campaign import check_settings, installed_version, run_all, write_settings
+from training.runs.errors import BadInput, Interrupted, bad_input
+
+__all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
+
+Row = dict[str, Any]
+
+BASELINE = "nearest-frontier"
+"""The agent that the others' ratios are taken to: the published rule, as far as it is known."""
+
+REFERENCES = (NEAREST_VIEW, "known-walls")
+"""What ratios are taken to besides, where it was run: a nearest frontier that needs less way, and the bound that
+is defined as the published one."""
+
+PUBLISHED: dict[str, tuple[float, float]] = {
+    "nearest frontier": (652.0, 76.0),
+    "NBVP": (645.0, 109.0),
+    "utility": (585.0, 79.0),
+    "ARiADNE": (579.0, 82.0),
+    "DARE": (563.0, 71.0),
+    "TARE local": (558.0, 67.0),
+    "known map": (499.0, 61.0),
+}
+"""Path length [m], mean and standard deviation, on that benchmark's 100 test maps (DARE, ICRA 2025)."""
+
+_STORE, _CSV, _SUMMARY = "rows.jsonl", "rows.csv", "summary.json"
+_COLUMNS = (
+    "agent", "map", "layout", "path_m", "hops", "coverage", "unseen_cells", "end", "path_to_250_m",
+    "decision_ms_median",
+)  # fmt: skip
+_RESAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class _Job:
+    agent: str
+    path: Path
+    digest: str  # of the file: another map of the same name is another map
+    scan: str
+
+
+def run_dungeons(
+    maps: Path, agent_names: Sequence[str], *, out: Path, workers: int = 1, scan: str = "way-points"
+) -> dict[str, Any]:
+    """Run every agent on every map that ``out`` does not hold yet, and return the summary of all asked for.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, and what to do.
+    """
+    with bad_input():
+        for name in agent_names:
+            agents.check(name, NEAREST, NEAREST_VIEW, *BOUNDS)
+    if scan not in SCANS:
+        raise BadInput(str(unknown_name("--scan", scan, SCANS)))
+    if workers < 1:
+        raise BadInput(f"--workers must be at least 1, got {workers}")
+    paths = _maps(maps)
+    settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
+    check_settings(out, settings, [_STORE, _CSV, _SUMMARY])
+    digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
+    # A map that cannot be used is found before any work is lost.
+    layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
+    write_settings(out, settings)
+    jobs = [_Job(name, path, digests[path], scan) for path in paths for name in dict.fromkeys(agent_names)]
+    done = {(row["agent"], row["digest"]): row for row in _read(out / _STORE)}
+    with (out / _STORE).open("a", encoding="utf-8") as file:
+
+        def keep(job: _Job, row: Row) -> None:
+            done[job.agent, job.digest] = row
+            # One write a row: what is killed in between leaves whole rows behind.
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+
+        missing = [job for job in jobs if (job.agent, job.digest) not in done]
+        run_all(missing, _run, workers=workers, keep=keep, what="episodes")
+    rows = [done[job.agent, job.digest] | {"map": job.path.stem, "layout": layouts[job.path]} for job in jobs]
+    summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
+    atomic_write(out / _CSV, _csv(rows))
+    atomic_write(out / _SUMMARY, json.dumps(summary, indent=1) + "\n")
+    return summary
+
+
+def summarise(rows: Sequence[Row]) -> dict[str, Row]:
+    """Return one summary per agent; ratios are of the mean paths over the maps that both have run.
+
+    Their intervals resample layouts: a map turned or mirrored, or moved by less than a tile, is no new one.
+    """
+    by_agent: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_agent.setdefault(row["agent"], {})[row["map"]] = row
+    out: dict[str, Row] = {}
+    for agent, own in by_agent.items():
+        paths = [row["path_m"] for row in own.values()]
+        decisions = [row["decision_ms_median"] for row in own.values() if row["decision_ms_median"] is not None]
+        out[agent] = {
+            "maps": len(own),
+            "layouts": len({row["layout"] for row in own.values()}),
+            "covered": sum(row["end"] == "covered" for row in own.values()),
+            "path_m_mean": statistics.fmean(paths),
+            "path_m_std": statistics.stdev(paths) if len(paths) > 1 else 0.0,
+            "coverage_mean": statistics.fmean(row["coverage"] for row in own.values()),
+            "coverage_least": min(row["coverage"] for row in own.values()),
+            "hops_mean": _mean([row["hops"] for row in own.values()]),
+            "path_to_250_m_mean": _mean([row["path_to_250_m"] for row in own.values()]),
+            "decision_ms_median": statistics.median(decisions) if decisions else None,
+        }
+        if BASELINE in by_agent:
+            out[agent] |= _ratio(own, by_agent[BASELINE])
+        out[agent]["to"] = {name: _ratio(own, by_agent[name]) for name in REFERENCES if name in by_agent}
+    return out
+
+
+def _mean(values: list[float | None]) -> float | None:
+    reached = [value for value in values if value is not None]
+    return statistics.fmean(reached) if len(reached) == len(values) else None
+
+
+def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
+    """Return the ratio of the means and its 95 % interval, resampling layouts, both agents' paths together."""
+    sums: dict[str, list[float]] = {}  # layout → both agents' paths, over its maps
+    for name in sorted(own.keys() & other.keys()):
+        both = sums.setdefault(own[name]["layout"], [0.0, 0.0])
+        both[0] += own[name]["path_m"]
+        both[1] += other[name]["path_m"]
+    ours, base = np.array(list(sums.values())).reshape(-1, 2).T
+    if base.sum() == 0:
+        return {"ratio": None, "ratio_low": None, "ratio_high": None}
+    picks = np.random.default_rng(0).integers(0, len(ours), (_RESAMPLES, len(ours)))
+    below = base[picks].sum(axis=1)
+    ratios = ours[picks].sum(axis=1) / np.where(below > 0, below, math.nan)
+    low, high = np.nanquantile(ratios, (0.025, 0.975))
+    return {"ratio": float(ours.sum() / base.sum()), "ratio_low": float(low), "ratio_high": float(high)}
+
+
+def table(summary: dict[str, Any]) -> str:
+    """Return our agents and the published ones as one Markdown table."""
+    references = [name for name in REFERENCES if name in summary["agents"]]
+    further = "".join(f"to {name} (95 %) | " for name in references)
+    lines = [
+        f"| agent | maps (layouts) | covered | path, mean ± std [m] | to {BASELINE} (95 %) "
+        f"| {further}decision [ms] |",
+        "|" + "---|" * (6 + len(references)),
+    ]
+    for name, own in summary["agents"].items():
+        ratios = [_ratio_text(own), *(_ratio_text(own["to"][name]) for name in references)]
+        decision = "" if own["decision_ms_median"] is None else f"{own['decision_ms_median']:.1f}"
+        lines.append(
+            f"| `{name}` | {own['maps']} ({own['layouts']}) | {own['covered']} "
+            f"| {own['path_m_mean']:.0f} ± {own['path_m_std']:.0f} | {' | '.join(ratios)} | {decision} |"
+        )
+    base, bound = PUBLISHED["nearest frontier"][0], PUBLISHED["known map"][0]
+    for name, (mean, std) in PUBLISHED.items():
+        ratios = [f"{mean / base:.3f}", *(f"{mean / bound:.3f}" if r in BOUNDS else "" for r in references)]
+        lines.append(f"| published: {name} | 100 others | | {mean:.0f} ± {std:.0f} | {' | '.join(ratios)} | |")
+    return "\n".join(lines)
+
+
+def _ratio_text(ratio: Row) -> str:
+    if ratio.get("ratio") is None:
+        return ""
+    return f"{ratio['ratio']:.3f} ({ratio['ratio_low']:.3f}–{ratio['ratio_high']:.3f})"
+
+
+def _maps(folder: Path) -> list[Path]:
+    """Return the maps of a folder, by number where their names are numbers."""
+    if not folder.is_dir():
+        raise BadInput(f"--maps {folder} is no folder; give the one that holds the PNG maps")
+    paths = [path for path in folder.iterdir() if path.suffix.lower() == ".png" and path.is_file()]
+    if not paths:
+        raise BadInput(f"--maps {folder} holds no PNG maps; give the folder that does")
+    return sorted(paths, key=lambda p: (not p.stem.isdigit(), int(p.stem) if p.stem.isdigit() else 0, p.stem))
+
+
+def _run(job: _Job) -> Row:
+    dungeon = load(job.path)
+    row = _bound(dungeon, job.agent) if job.agent in BOUNDS else explore(dungeon, job.agent, scan=job.scan)
+    return row | {"digest": job.digest}
+
+
+def _bound(dungeon: Dungeon, name: str) -> Row:
+    return dict.fromkeys(_COLUMNS) | {
+        "agent": name,
+        "map": dungeon.name,
+        "path_m": BOUNDS[name](dungeon),
+        "coverage": 1.0,
+        "unseen_cells": 0,
+        "end": "covered",
+    }
+
+
+def _read(store: Path) -> list[Row]:
+    rows = []
+    for line in store.read_text(encoding="utf-8").splitlines() if store.exists() else ():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue  # the row that was being written when the run was killed: it is run again
+    return rows
+
+
+def _csv(rows: Sequence[Row]) -> str:
+    def cell(value: Any) -> str:
+        if isinstance(value, float):
+            return f"{value:.6g}"
+        return "" if value is None else str(value)
+
+    lines = [",".join(_COLUMNS), *(",".join(cell(row[name]) for name in _COLUMNS) for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the module's command line; return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m training.dungeons.protocol", description=__doc__)
+    parser.add_argument("--maps", type=Path, required=True, help="folder of PNG maps")
+    parser.add_argument(
+        "--agents",
+        default="nearest-frontier,tour,learned-tour",
+        help=f"names, separated by commas; {' and '.join(BOUNDS)} are bounds, {NEAREST_VIEW} and {NEAREST} rules",
+    )
+    parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--scan", default="way-points", help=" or ".join(SCANS))
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON, nothing else")
+    options = parser.parse_args(argv)
+    names = [part.strip() for part in options.agents.split(",") if part.strip()]
+    try:
+        if not names:
+            raise BadInput("--agents names none; give some, separated by commas")
+        summary = run_dungeons(options.maps, names, out=options.out, workers=options.workers, scan=options.scan)
+    except (BadInput, Interrupted) as error:
+        print(f"training.dungeons.protocol: {error}", file=sys.stderr)
+        return 2 if isinstance(error, BadInput) else 130
+    print(json.dumps(summary) if options.json else table(summary))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

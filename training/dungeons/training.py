@@ -1,0 +1,338 @@
+"""Training of ``learned-tour``: lessons on plans like the benchmark's, and a network that foresees them.
+
+``python -m training.dungeons.training --out DIR`` gathers lessons (plans of seeds 0 …, validated on others from
+1000 on) in ``DIR/round-1``, driven by the tour, and trains. In the next round what was learned drives, and the
+network is trained anew on the lessons of both. It writes ``learned-tour.safetensors`` and ``.json``. A killed run
+goes on where it stopped: with the next plan, or after the last whole epoch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shlex
+import statistics
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+from safetensors.numpy import save
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from agents.learned.station_network import PLANES, opening_numbers, with_walls
+from agents.learned_tour import FORMAT, PRECISION
+from slam.formats import atomic_write, replacing
+from training.dungeons.episode import explore
+from training.dungeons.lessons import Lessons, gather, joined, read_lessons
+from training.dungeons.networks import StationNetwork
+from training.dungeons.plans import dungeon_plan
+from training.runs.campaign import check_settings, installed_version, write_settings
+from training.runs.errors import BadInput, Interrupted
+
+__all__ = ["Batch", "TrainingConfig", "batch_of", "main", "regret_m", "train", "turned"]
+
+Floats = NDArray[np.float32]
+
+_CHECKPOINT, _WEIGHTS = "checkpoint.safetensors", "learned-tour.safetensors"
+_SCORE_M = 20.0
+_VALIDATION = 1000  # seed of the first plan that is validated on
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingConfig:
+    """What a training depends on."""
+
+    rounds: int = 2  # of lessons, each driven by what was learned in the one before
+    plans: int = 1000  # seeds 0 … of the first round
+    later_plans: int = 380  # seeds 0 … of the others: a network takes more time to drive than the tour
+    validation_plans: int = 60  # seeds 1000 …
+    epochs: int = 12
+    batch: int = 64
+    rate: float = 1.5e-3
+    weight_decay: float = 1e-2
+    untold: float = 0.125  # share of the lessons that do not tell how far the plan extends
+    free_weight: float = 0.3  # of foreseeing what is free, besides what openings cost
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Lessons as the network takes them, and what it should say."""
+
+    planes: Floats  # (b, PLANES, n, n)
+    free: Floats  # (b, 4, n, n) share of each quarter that is free
+    targets: NDArray[np.int64]  # (b, c, 2) pixels
+    hops: NDArray[np.int64]  # (b, c, 2) pixels
+    numbers: Floats  # (b, c, 3)
+    paths: Floats  # (b, c) to the end, 20 m a unit, less the mean over the openings; 0 where there is none
+    there: Floats  # (b, c) 1 where there is an opening
+
+
+def batch_of(lessons: Lessons, rows: NDArray[np.int64], told: NDArray[np.bool_] | None = None) -> Batch:
+    """Return some of the lessons as a batch, with walls beyond the plan where ``told`` (everywhere by default)."""
+    planes = lessons.planes[rows].astype(np.float32) * np.float32(0.01)
+    beyond = lessons.outside[rows].astype(np.float32) * np.float32(0.01)
+    if told is not None:
+        beyond *= told[:, None, None, None]
+    paths = lessons.path_m[rows]
+    there = np.isfinite(paths)
+    mean = np.nanmean(paths, axis=1, keepdims=True)
+    return Batch(
+        with_walls(np.pad(planes, ((0, 0), (0, 1), (0, 0), (0, 0))), beyond),
+        lessons.free[rows].astype(np.float32) / np.float32(25.0),
+        lessons.targets[rows],
+        lessons.hops[rows],
+        opening_numbers(lessons.losses_m[rows], lessons.legs_m[rows]),
+        np.where(there, (paths - mean) / _SCORE_M, 0.0).astype(np.float32),
+        there.astype(np.float32),
+    )
+
+
+def turned(batch: Batch, quarters: int, mirrored: bool) -> Batch:
+    """Return the batch with its pictures turned by quarters of a circle, and mirrored after that."""
+    side = batch.planes.shape[-1]
+    planes, free = batch.planes, batch.free
+    targets, hops = batch.targets, batch.hops
+    for _ in range(quarters):
+        planes, free = (_each_quarter(x, lambda q: np.rot90(q, 1, axes=(1, 2))) for x in (planes, free))
+        planes, free = np.rot90(planes, 1, axes=(2, 3)), np.rot90(free, 1, axes=(2, 3))
+        targets, hops = (np.stack([side - 1 - at[..., 1], at[..., 0]], axis=-1) for at in (targets, hops))
+    if mirrored:
+        planes, free = (_each_quarter(x, lambda q: q[:, :, ::-1]) for x in (planes, free))
+        planes, free = planes[..., ::-1], free[..., ::-1]
+        targets, hops = (np.stack([at[..., 0], side - 1 - at[..., 1]], axis=-1) for at in (targets, hops))
+    return Batch(
+        np.ascontiguousarray(planes),
+        np.ascontiguousarray(free),
+        targets,
+        hops,
+        batch.numbers,
+        batch.paths,
+        batch.there,
+    )
+
+
+def _each_quarter(x: Floats, change: Any) -> Floats:
+    """Change the order of the quarters of a pixel, ``(b, 2, 2, n, n)``, in the planes that show them."""
+    x = x.copy()
+    for begin in (0, 4) if x.shape[1] == PLANES else (0,):
+        quarters = x[:, begin : begin + 4].reshape(len(x), 2, 2, *x.shape[2:])
+        x[:, begin : begin + 4] = change(quarters).reshape(len(x), 4, *x.shape[2:])
+    return x
+
+
+# ---- training --------------------------------------------------------------------------------------------------
+
+
+def _centred(scores: Tensor, there: Tensor) -> Tensor:
+    return (scores - (scores * there).sum(1, keepdim=True) / there.sum(1, keepdim=True)) * there
+
+
+def _losses(network: StationNetwork, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Return how far off the costs of openings are, and what is free where nothing is known yet."""
+    there, free = torch.tensor(batch.there), torch.tensor(batch.free)
+    planes = torch.tensor(batch.planes).contiguous(memory_format=torch.channels_last)
+    with torch.autocast("cpu", torch.bfloat16):
+        scores, odds = network(
+            planes, torch.tensor(batch.targets), torch.tensor(batch.hops), torch.tensor(batch.numbers)
+        )
+    scores, odds = scores.float(), odds.float()
+    off = nn.functional.smooth_l1_loss(_centred(scores, there), torch.tensor(batch.paths), reduction="sum")
+    unknown = (planes[:, -1:] > 0.5).float()
+    dark = nn.functional.binary_cross_entropy_with_logits(odds, free, reduction="none")
+    return off / there.sum(), (dark * unknown).sum() / (4.0 * unknown.sum()).clamp(min=1.0)
+
+
+def regret_m(network: StationNetwork, lessons: Lessons) -> tuple[float, float]:
+    """Return by how much the openings that it takes made paths longer than the tour's own [m], and the error."""
+    picked = []
+    with torch.no_grad():
+        for begin in range(0, len(lessons.planes), 256):
+            rows = np.arange(begin, min(begin + 256, len(lessons.planes)))
+            batch = batch_of(lessons, rows)
+            scores, _ = network(
+                torch.tensor(batch.planes), torch.tensor(batch.targets), torch.tensor(batch.hops),
+                torch.tensor(batch.numbers),
+            )  # fmt: skip
+            choice = np.where(batch.there > 0, scores.numpy(), np.inf).argmin(axis=1)
+            picked.append(lessons.path_m[rows, choice] - lessons.path_m[rows, 0])
+    longer = np.concatenate(picked)
+    return float(longer.mean()), float(longer.std() / math.sqrt(len(longer)))
+
+
+def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNetwork, list[dict[str, float]]]:
+    """Train on the lessons of all rounds up to one; return the network and its curve.
+
+    A run that was broken off goes on from its last whole epoch. What is validated on is the last round's.
+    """
+    folders = {k: _round(out, k) for k in range(1, number + 1)}
+    lessons = joined([read_lessons(folder / "lessons", _seeds(config, k)) for k, folder in folders.items()])
+    unseen = read_lessons(folders[number] / "lessons", _unseen(config))
+    out = folders[number]
+    torch.manual_seed(config.seed)
+    network = StationNetwork()
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+    curve = _resume(out / _CHECKPOINT, network, optimiser)
+    batches = len(lessons.planes) // config.batch
+    for epoch in range(len(curve), config.epochs):
+        begun = time.monotonic()
+        # Drawn anew from the epoch's number: a run that goes on draws what it would have drawn.
+        rng = np.random.default_rng([config.seed, epoch])
+        order = rng.permutation(len(lessons.planes))
+        sums = np.zeros(2)
+        for k in range(batches):
+            rows = order[k * config.batch : (k + 1) * config.batch]
+            told = rng.random(config.batch) >= config.untold
+            batch = turned(batch_of(lessons, rows, told), int(rng.integers(4)), bool(rng.integers(2)))
+            share = (epoch * batches + k) / (config.epochs * batches)
+            for group in optimiser.param_groups:
+                group["lr"] = config.rate * _rate_at(share)
+            cost, dark = _losses(network, batch)
+            optimiser.zero_grad()
+            (cost + config.free_weight * dark).backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+            optimiser.step()
+            sums += cost.item(), dark.item()
+        regret, error = regret_m(network, unseen)
+        point = {
+            "epoch": epoch + 1, "cost": sums[0] / batches, "free": sums[1] / batches,
+            "validation_regret_m": regret, "validation_regret_se_m": error, "wall_s": time.monotonic() - begun,
+        }  # fmt: skip
+        curve.append({key: round(value, 5) for key, value in point.items()})
+        _keep(out / _CHECKPOINT, network, optimiser, curve)
+        print(", ".join(f"{key} {value}" for key, value in curve[-1].items()), file=sys.stderr, flush=True)
+    return network, curve
+
+
+def _round(out: Path, number: int) -> Path:
+    return out / f"round-{number}"
+
+
+def _seeds(config: TrainingConfig, number: int) -> range:
+    return range(config.plans if number == 1 else config.later_plans)
+
+
+def _unseen(config: TrainingConfig) -> range:
+    return range(_VALIDATION, _VALIDATION + config.validation_plans)
+
+
+def _rate_at(share: float) -> float:
+    """Return the learning rate's share: up over the first seventh, then down along a cosine."""
+    warm = 1.0 / 7.0
+    return (
+        0.04 + 0.96 * share / warm
+        if share < warm
+        else 0.5 + 0.5 * math.cos(math.pi * (share - warm) / (1.0 - warm))
+    )
+
+
+def _keep(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, curve: list[dict[str, float]]) -> None:
+    tensors = {f"weight.{name}": value.contiguous() for name, value in network.state_dict().items()}
+    for name, parameter in network.named_parameters():
+        tensors |= {f"{key}.{name}": value.contiguous() for key, value in optimiser.state[parameter].items()}
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, {"curve": json.dumps(curve)})
+
+
+def _resume(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer) -> list[dict[str, float]]:
+    if not path.exists():
+        return []
+    tensors = load_file(path)
+    with safe_open(path, "pt") as file:
+        curve: list[dict[str, float]] = json.loads(file.metadata()["curve"])
+    network.load_state_dict(
+        {name.removeprefix("weight."): tensors[name] for name in tensors if name.startswith("weight.")}
+    )
+    for name, parameter in network.named_parameters():
+        optimiser.state[parameter] = {key: tensors[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
+    return curve
+
+
+# ---- the command -----------------------------------------------------------------------------------------------
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the module's command line; return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m training.dungeons.training", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run")
+    for name, value in asdict(TrainingConfig()).items():
+        parser.add_argument(_option(name), type=type(value), default=value)
+    parser.add_argument("--workers", type=int, default=1, help="processes that gather lessons")
+    options = vars(parser.parse_args(argv))
+    out, workers = options.pop("out"), options.pop("workers")
+    try:
+        for name in ("rounds", "plans", "later_plans", "validation_plans", "epochs", "batch"):
+            if options[name] < 1:
+                raise BadInput(f"{_option(name)} must be at least 1, got {options[name]}")
+        if not 0 <= options["untold"] <= 1:
+            raise BadInput(f"--untold must be between 0 and 1, got {options['untold']}")
+        for name in ("plans", "later_plans"):
+            if options[name] > _VALIDATION:
+                raise BadInput(
+                    f"{_option(name)} must be at most {_VALIDATION}: those from there on are validated on"
+                )
+        if workers < 1:
+            raise BadInput(f"--workers must be at least 1, got {workers}")
+        run(out, TrainingConfig(**options), workers=workers)
+    except (BadInput, Interrupted, KeyboardInterrupt) as error:
+        print(f"training.dungeons.training: {error or 'interrupted; the same command goes on'}", file=sys.stderr)
+        return 2 if isinstance(error, BadInput) else 130
+    print(out / _WEIGHTS)
+    return 0
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
+    """Gather lessons, train and write the policy."""
+    settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
+    check_settings(out, settings, [_WEIGHTS])
+    write_settings(out, settings)
+    policy: Path | None = None
+    curves = []
+    for number in range(1, config.rounds + 1):
+        folder = _round(out, number)
+        for seeds in (_seeds(config, number), _unseen(config)):
+            gather(folder / "lessons", seeds, policy=policy, workers=workers)
+        network, curve = train(out, config, number)
+        curves.append(curve)
+        weights = {
+            name: np.asarray(value.numpy(), PRECISION, order="C")  # as it lies in memory, channels may come last
+            for name, value in network.state_dict().items()
+            if not name.startswith("free.")
+        }
+        policy = folder / _WEIGHTS
+        atomic_write(policy, save(weights))
+    arguments = [f"{_option(name)}={value}" for name, value in asdict(config).items()]
+    last = _VALIDATION + config.validation_plans - 1
+    about: dict[str, Any] = {
+        "format": FORMAT,
+        "command": shlex.join(["python", "-m", "training.dungeons.training", "--out", "OUT", *arguments]),
+        "config": asdict(config),
+        "seeds": f"plans 0-{config.plans - 1}; validation {_VALIDATION}-{last}",
+        "curves": curves,
+    }
+    atomic_write(out / _WEIGHTS, save(weights))
+    atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")
+    # What counts is whole episodes: what a single choice gains, as lessons have it, says little of them.
+    plans = [dungeon_plan(_VALIDATION + k) for k in range(config.validation_plans)]
+    about["validation_path_m"] = {
+        name: round(statistics.fmean(float(explore(plan, agent)["path_m"]) for plan in plans), 2)
+        for name, agent in (("tour", "tour"), ("learned-tour", str(out / _WEIGHTS)))
+    }
+    atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,242 @@
+"""``mecanum explore``: one episode, from the options to its end; ``training.views`` writes its files."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+
+import agents
+from agents.base import ENDINGS as AGENT_ENDINGS
+from agents.base import Agent, Goal
+from mecanum_env import rooms as room_registry
+from mecanum_env.config import EnvConfig
+from mecanum_env.env import ExploreEnv, make_config
+from mecanum_env.rooms import FloorPlan
+from training.episodes.known_map import NAME as KNOWN_MAP
+from training.episodes.known_map import KnownMap
+from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.running import interrupt_flag, plain
+
+__all__ = ["ENDINGS", "EXTRAS", "FILES", "Episode", "ExploreOptions", "Progress", "Witness", "prepare", "run"]
+
+FILES = (
+    "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
+    "landmarks.db", "config.toml", "report.html", "metrics.json",
+)  # fmt: skip
+"""What an episode writes, ``metrics.json`` last: where it is, the others are."""
+
+EXTRAS = {"video": "episode.mp4", "mcap": "episode.mcap", "rerun": "episode.rrd"}
+"""What it writes besides when asked to, by the option."""
+
+LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
+"""The step limit where none is given: so many, or so many a square metre of free space."""
+
+ENDINGS = {
+    **AGENT_ENDINGS,
+    "time": "the step limit was reached first",
+    "collision": "it touched a wall, and the configuration ends an episode there",
+    "interrupted": "broken off by Ctrl-C",
+}
+"""Why an episode ended: the word in ``metrics.json``, and what it means."""
+
+_DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
+_DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExploreOptions:
+    """What was asked for; ``None`` where the config file or the default decides."""
+
+    out: Path
+    agent: str | None = None
+    rooms: str | None = None
+    slam: str | None = None
+    robot: str | None = None
+    noise: str | None = None
+    seed: int | None = None
+    floor_plan: Path | None = None
+    start: tuple[float, float, float] | None = None
+    config: Path | None = None
+    max_steps: int | None = None
+    coverage_target: float | None = None
+
+
+class Progress(Protocol):
+    """Told after every step how far the episode is."""
+
+    def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        """Show it, or do not."""
+
+
+class Witness(Protocol):
+    """Sees an episode's start and every step of it."""
+
+    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+        """Take down the environment as it is now, and where the agent means to go."""
+
+
+@dataclass(eq=False)
+class Episode:
+    """An episode: prepared, then run, then written."""
+
+    env: ExploreEnv
+    wrapped: Any  # the same environment, as gym.make wrapped it
+    agent: Agent
+    observation: Mapping[str, Any]
+    config: EnvConfig  # with the coverage that counts as success
+    run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
+    out: Path
+    end: str = "time"  # a word of ENDINGS
+    interrupted: bool = False
+    wall_time_s: float = 0.0
+    decisions_ms: list[float] = field(default_factory=list)
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the contents of ``metrics.json``."""
+        metrics: dict[str, Any] = dict(self.env.episode_metrics())
+        coverage = metrics["coverage"]
+        metrics["decision_ms_median"] = statistics.median(self.decisions_ms) if self.decisions_ms else None
+        metrics["return_error_m"] = float(np.hypot(*self.env.truth.pose[:2])) if self.end == "returned" else None
+        metrics |= {
+            "success": bool(coverage is not None and coverage >= self.config.coverage_target),
+            "agent": self.run["agent"],
+            "slam": self.config.slam,
+            "rooms": self.config.rooms if self.config.floor_plan is None else None,
+            "floor_plan": self.config.floor_plan,
+            "seed": self.run["seed"],
+            "end": self.end,
+            "interrupted": self.interrupted,
+            "wall_time_s": round(self.wall_time_s, 3),
+        }
+        return {key: plain(value) for key, value in metrics.items()}
+
+
+# ---- before --------------------------------------------------------------------------------------------------
+
+
+def prepare(options: ExploreOptions) -> Episode:
+    """Check everything that can be checked, and place the robot; nothing is written.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, and what to do.
+    """
+    with bad_input():
+        past = _read_run_table(options.config) if options.config is not None else {}
+        if any(v is not None for v in (options.rooms, options.floor_plan, options.seed)):
+            # Other rooms: neither the start nor the step limit is meant for them.
+            past = {name: value for name, value in past.items() if name in _DEFAULTS}
+        run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
+        agents.check(run["agent"], KNOWN_MAP)
+        if run["agent"].endswith(".safetensors"):
+            run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
+        config = make_config(
+            config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
+            noise=options.noise, floor_plan=options.floor_plan,
+        )  # fmt: skip
+        if options.rooms is not None and options.floor_plan is None:
+            config = replace(config, floor_plan=None)
+        elif config.floor_plan is not None:
+            config = replace(config, floor_plan=str(Path(config.floor_plan).absolute()))
+        if options.coverage_target is not None:
+            config = replace(config, coverage_target=options.coverage_target)
+        check_writable(options.out, [*FILES, *EXTRAS.values()])
+        plan = _make_plan(config, run["seed"])
+        # An agent maps all that it can reach; what counts as success is judged at the end.
+        limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
+        wrapped = gymnasium.make(
+            "mecanum_env:mecanum_env/Explore-v0", config=replace(config, coverage_target=1.0),
+            max_episode_steps=limit, disable_env_checker=True,
+        )  # fmt: skip
+        start = run.get("start")
+        reset_options = {"floor_plan": plan} | ({"start_pose": tuple(start)} if start is not None else {})
+        observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
+        env = wrapped.unwrapped
+        assert isinstance(env, ExploreEnv)
+        agent = _make_agent(run["agent"], env)
+        agent.reset(env.belief, run["seed"])
+    run |= {"max_steps": limit}
+    return Episode(env, wrapped, agent, observation, config, run, options.out)
+
+
+def _make_agent(name: str, env: ExploreEnv) -> Agent:
+    config = env.config
+    if name == KNOWN_MAP:
+        return KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    return agents.make(name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+
+
+def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+
+
+def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:
+    if config.floor_plan is not None:
+        return room_registry.load(config.floor_plan, seed=seed)
+    return room_registry.make(config.rooms, seed=seed, config=config.rooms_config)
+
+
+def _read_run_table(path: Path) -> dict[str, Any]:
+    """Return ``agent``, ``seed``, ``start`` and ``max_steps`` from a config's [run] table, where it has one."""
+    try:
+        values = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
+    run = values.get("run", {})
+    kinds = {"agent": str, "seed": int, "start": list, "max_steps": int}
+    wrong = [k for k, kind in kinds.items() if isinstance(run, dict) and k in run and type(run[k]) is not kind]
+    if not isinstance(run, dict) or wrong:
+        raise BadInput(f"config {path}: [run] {wrong[0] if wrong else ''} has the wrong type; see a config.toml")
+    start = run.get("start", [0.0, 0.0, 0.0])
+    good = len(start) == 3 and all(isinstance(v, int | float) and math.isfinite(v) for v in start)
+    if not good or run.get("seed", 0) < 0 or run.get("max_steps", 1) < 1:
+        raise BadInput(f"config {path}: [run] needs seed ≥ 0, max_steps ≥ 1 and start = [x, y, θ]")
+    return {name: run[name] for name in kinds if name in run}
+
+
+# ---- the episode -----------------------------------------------------------------------------------------------
+
+
+def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ()) -> None:
+    """Let the agent explore until it is done, the steps are used up, or Ctrl-C is pressed between two steps."""
+    env, agent, step = episode.env, episode.agent, episode.wrapped.step
+    patience = math.ceil(_DONE_AFTER_S / episode.config.step_s)
+    observation, goal, idle, max_steps = episode.observation, agent.goal, 0, episode.run["max_steps"]
+    for witness in witnesses:
+        witness.take(env, goal)
+    began = time.perf_counter()
+    with interrupt_flag() as interrupted:
+        for steps in range(1, max_steps + 1):
+            asked = time.perf_counter()
+            action = agent.act(observation, env.belief)
+            if agent.goal is not goal:
+                # The step in which it chose: driving on costs next to nothing.
+                episode.decisions_ms.append(1e3 * (time.perf_counter() - asked))
+                goal = agent.goal
+            observation, _, terminated, truncated, info = step(action)
+            for witness in witnesses:
+                witness.take(env, goal)
+            progress(coverage=info["coverage"], time_s=info["time_s"], steps=steps, max_steps=max_steps)
+            idle = idle + 1 if goal is None else 0
+            if interrupted.is_set():
+                episode.end, episode.interrupted = "interrupted", True
+            elif terminated and not (info["is_success"] and agent.outlives_coverage):
+                episode.end = "covered" if info["is_success"] else "collision"
+            elif idle >= patience:
+                episode.end = agent.status
+            elif not truncated:
+                continue
+            break
+    episode.wall_time_s = time.perf_counter() - began

@@ -1,0 +1,1 @@
+"""Figures: statistics with intervals, line charts, and the style of our pages."""

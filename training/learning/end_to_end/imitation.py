@@ -1,0 +1,151 @@
+"""What the end-to-end policy learns from lessons: of maps prices and goals, of situations twists."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from agents.learned.drive_network import sectors
+from mecanum_env.observation import MAP_SIZE
+from training.learning.end_to_end.lessons import LOG_PRICE, NO_WAY
+from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork, shortest, step_prices
+
+__all__ = ["Lessons", "control_batch", "learn_control", "learn_maps", "map_losses"]
+
+Lessons = Mapping[str, NDArray[Any]]
+
+_GOAL_WEIGHT = 5.0  # of a pixel that is a goal: few are
+_SMALL = 6  # pixels at the rim of a map that is called small
+_MARGIN = 6  # more than the convolutions look beyond a pixel
+_MIRRORED_NUMBERS = [*range(1, 20, 2), 33, 34]
+
+
+def learn_maps(
+    network: PlanNetwork, lessons: Lessons, *, steps: int, batch: int, rate: float, rng: np.random.Generator
+) -> Iterator[dict[str, float]]:
+    """Train the map network; what is said every hundred steps are the means of the losses since."""
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
+    n, seen = len(lessons["pose"]), []
+    # Batches of maps that fill less of the image cost less time: those are taken together.
+    small = _rims(lessons["map_global"]) >= _SMALL
+    groups = np.flatnonzero(~small), np.flatnonzero(small)
+    for step in range(steps):
+        _set_rate(optimizer, rate, step, steps)
+        group = groups[int(rng.random() < len(groups[1]) / n)]
+        rows = np.sort(rng.choice(group, size=batch))
+        losses = map_losses(network, lessons, rows, mirrored=step % 2 == 1, every=2)
+        total = losses["price"] + 10.0 * (losses["goal_local"] + losses["goal_global"]) + losses["travel"]
+        _descend(network, optimizer, total)
+        seen.append([float(value.detach()) for value in losses.values()])
+        if (step + 1) % 100 == 0 or step + 1 == steps:
+            yield {"step": step + 1} | dict(zip(losses, np.mean(seen, axis=0).tolist(), strict=True))
+            seen = []
+
+
+def map_losses(
+    network: PlanNetwork,
+    lessons: Lessons,
+    rows: NDArray[np.int64],
+    *,
+    mirrored: bool = False,
+    every: int = 1,
+) -> dict[str, Tensor]:
+    """Return the losses on some lessons, as they are or with left and right exchanged.
+
+    Of the local maps, which say more each, only ``every`` so many are looked at.
+    """
+    near, far, pose = lessons["map_local"][rows], lessons["map_global"][rows], lessons["pose"][rows].copy()
+    price, travel = lessons["price"][rows], lessons["travel"][rows]
+    goal_near, goal_far = (np.unpackbits(lessons[f"goal_{name}"][rows], axis=-1) for name in ("local", "global"))
+    if mirrored:
+        near, price, goal_near = near[..., ::-1], price[..., ::-1], goal_near[..., ::-1]
+        far, travel, goal_far = far[..., ::-1, :], travel[..., ::-1, :], goal_far[..., ::-1, :]
+        pose[:, 1] *= -1.0
+    near, price, goal_near = near[::every], price[::every], goal_near[::every]
+    rim = int(_rims(far).min())
+    middle = (..., slice(rim, MAP_SIZE - rim), slice(rim, MAP_SIZE - rim))
+    far, travel, goal_far = far[middle], travel[middle], goal_far[middle]
+    said, goal, steps, goal_overview = network(_tensor(near), _tensor(far))
+    prices = step_prices(steps, torch.from_numpy(lessons["pixel"][rows]))
+    start = torch.full(travel.shape, 1e6)
+    at = np.floor((pose[:, :2] + 1.0) * 0.5 * MAP_SIZE).astype(np.int64).clip(0, MAP_SIZE - 1)
+    start[np.arange(len(rows)), MAP_SIZE - 1 - rim - at[:, 1], at[:, 0] - rim] = 0.0
+    ways = _tensor(travel.astype(np.float32))
+    told = ways < 0.9 * NO_WAY
+    error = torch.log1p(shortest(prices, start)[told].clamp(max=1e5)) - torch.log1p(ways[told])
+    return {
+        "price": functional.smooth_l1_loss(said, _tensor(price.astype(np.float32)) / LOG_PRICE, beta=0.3),
+        "goal_local": _goal_loss(goal, goal_near),
+        "goal_global": _goal_loss(goal_overview, goal_far),
+        "travel": functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.2),
+    }
+
+
+def learn_control(
+    network: ControlNetwork, lessons: Lessons, *, steps: int, batch: int, rate: float, rng: np.random.Generator
+) -> Iterator[dict[str, float]]:
+    """Train the control network to send what the teacher would; every thousand steps the mean loss is said."""
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
+    n, seen = len(lessons["wanted"]), []
+    for step in range(steps):
+        _set_rate(optimizer, rate, step, steps)
+        scan, landmarks, numbers, wanted = control_batch(
+            lessons, np.sort(rng.integers(n, size=batch)), mirrored=step % 2 == 1
+        )
+        loss = functional.smooth_l1_loss(network(scan, landmarks, numbers), wanted, beta=0.1)
+        _descend(network, optimizer, loss)
+        seen.append(float(loss.detach()))
+        if (step + 1) % 1000 == 0 or step + 1 == steps:
+            yield {"step": step + 1, "control": float(np.mean(seen))}
+            seen = []
+
+
+def control_batch(lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool) -> tuple[Tensor, ...]:
+    """Return scans in sectors, landmarks, numbers and the wanted twists of some lessons, mirrored or not."""
+    scan, landmarks = lessons["scan"][rows], lessons["landmarks"][rows].astype(np.float32)
+    numbers, wanted = lessons["numbers"][rows].copy(), lessons["wanted"][rows].copy()
+    if mirrored:
+        # The first beam looks backwards, and so it does mirrored.
+        scan = np.roll(scan[:, ::-1], 1, axis=1)
+        landmarks[..., 1] *= -1.0
+        numbers[:, _MIRRORED_NUMBERS] *= -1.0
+        wanted[:, 1:] *= -1.0
+    return _tensor(sectors(scan.astype(np.float32))), _tensor(landmarks), _tensor(numbers), _tensor(wanted)
+
+
+def _rims(maps: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return for each map how many pixels at its rim, all around, are far from all that is known."""
+    known = maps[:, 1] > 0
+    used = np.asarray(known.any(axis=1) | known.any(axis=2))
+    first, last = used.argmax(axis=1), used[:, ::-1].argmax(axis=1)
+    return np.asarray(np.maximum(np.minimum(first, last) - _MARGIN, 0))
+
+
+def _goal_loss(logit: Tensor, goal: NDArray[np.uint8]) -> Tensor:
+    weight = torch.tensor(_GOAL_WEIGHT)
+    return functional.binary_cross_entropy_with_logits(logit, _tensor(goal.astype(np.float32)), pos_weight=weight)
+
+
+def _set_rate(optimizer: torch.optim.Optimizer, rate: float, step: int, steps: int) -> None:
+    """Warm up over 50 steps, then fall to a hundredth along a cosine."""
+    share = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+    for group in optimizer.param_groups:
+        group["lr"] = rate * min(1.0, (step + 1) / 50) * share
+
+
+def _descend(network: nn.Module, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
+    optimizer.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+    optimizer.step()
+
+
+def _tensor(values: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values))

@@ -1,0 +1,177 @@
+"""Episodes of the end-to-end policy: to learn from, driven by student and teacher in turn, or to judge it by."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import agents
+from agents.learned.drive_network import DriveNetwork, PlanSettings
+from mecanum_env.env import ExploreEnv
+from training.learning.end_to_end.lessons import FollowingTeacher, map_lesson
+
+__all__ = ["Episode", "Outcome", "give_lessons", "guided_lessons", "judge"]
+
+Weights = Mapping[str, NDArray[np.float32]]
+
+_SEGMENT_S = (1.0, 5.0)  # how long one of the two drives
+_SHAKE = (0.4, 0.4, 1.0)  # how far a disturbance goes, of the limits
+_PAUSE_S = 10.0  # before the first disturbance, on average
+_MAPS_S = 1.0  # between two lessons on the maps
+_KEPT = ("map_local", "map_global", "pose")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Episode:
+    """One episode: where, how long, and who drives."""
+
+    rooms: str
+    room_seed: int
+    seed: int
+    weights: Weights
+    settings: PlanSettings = field(default_factory=PlanSettings)
+    uncertainty: bool = True
+    slam: str = "invariant-ekf"
+    noise: str = "nominal"
+    time_limit_s: float = 300.0
+    teacher: str = "nearest-frontier"  # whose frontiers are goals
+    teacher_share: float = 1.0  # of the time, that the teacher drives
+    shaken: float = 0.1  # share of the time, about, that whoever drives is disturbed
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How an episode went."""
+
+    coverage: float
+    time_s: float
+    time_to_90_s: float | None
+    collisions: int
+
+
+Rows = dict[str, NDArray[Any]]
+
+
+def guided_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
+    """Have the teacher explore in its own way; return the lessons on maps, no others, and how it went."""
+    scene = _Scene(episode)
+    while not scene.over:
+        scene.note_maps()
+        scene.step(scene.guide.act(scene.observation, scene.env.belief))
+    return _stacked(scene.maps), {}, scene.outcome
+
+
+def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
+    """Have student and teacher drive in turn; return the lessons on maps and on control, and how it went."""
+    scene, network = _Scene(episode), _network(episode)
+    follow = FollowingTeacher(scene.env)
+    rows: list[dict[str, Any]] = []
+    switch_at, teacher_drives = 0.0, True
+    while not scene.over:
+        scene.guide.looked(scene.env.belief)
+        scene.note_maps()
+        observation = scene.observation
+        way = network.plan(observation)
+        inputs = network.inputs(observation, way)
+        wanted = follow(way.path, scene.action, observation, scene.env.belief)
+        rows.append(
+            {
+                "scan": observation["scan"].astype(np.float16),
+                "landmarks": inputs.landmarks.astype(np.float16),
+                "numbers": inputs.numbers,
+                "wanted": wanted,
+            }
+        )
+        if scene.time_s >= switch_at:
+            teacher_drives = bool(scene.rng.random() < episode.teacher_share)
+            switch_at = scene.time_s + float(scene.rng.uniform(*_SEGMENT_S))
+        scene.step(wanted if teacher_drives else network.twist(inputs))
+    return _stacked(scene.maps), _stacked(rows), scene.outcome
+
+
+class _Scene:
+    """An episode under way: what is seen, what was noted, and the disturbances."""
+
+    def __init__(self, episode: Episode) -> None:
+        self.env, self.rng, self._episode = _env(episode), np.random.default_rng(episode.seed), episode
+        observation, self._info = self.env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
+        self.observation: dict[str, Any] = dict(observation)
+        config = self.env.config
+        self.guide = agents.make(episode.teacher, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        self.guide.reset(self.env.belief, episode.seed)
+        self.action: NDArray[np.float32] = np.zeros(3, np.float32)
+        self.maps: list[dict[str, Any]] = []
+        self.time_s, self._maps_at = 0.0, 0.0
+        self._reached: float | None = None
+        self._shake, self._shake_end = np.zeros(3), 0.0
+        self._shake_at = float(self.rng.exponential(_PAUSE_S))
+        self._terminated = False
+
+    @property
+    def over(self) -> bool:
+        """Whether it has come to its end."""
+        return self._terminated or self.time_s >= self._episode.time_limit_s - 1e-9
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it went."""
+        info = self._info
+        return Outcome(
+            coverage=info["coverage"], time_s=self.time_s, time_to_90_s=self._reached,
+            collisions=info["collisions"],
+        )  # fmt: skip
+
+    def note_maps(self) -> None:
+        """Keep a lesson on the maps, if one is due."""
+        if self.time_s >= self._maps_at:
+            seen = {key: self.observation[key] for key in _KEPT}
+            self.maps.append(seen | map_lesson(self.guide, self.env))
+            self._maps_at = self.time_s + _MAPS_S
+
+    def step(self, action: NDArray[np.float32]) -> None:
+        """Act, disturbed now and then."""
+        if self.time_s >= self._shake_at:
+            length = float(self.rng.uniform(0.5, 2.0))
+            self._shake_end = self.time_s + length
+            pause = length * (1.0 / max(self._episode.shaken, 1e-3) - 1.0)
+            self._shake_at = self._shake_end + float(self.rng.exponential(pause))
+            self._shake = self.rng.uniform(-1.0, 1.0, 3) * _SHAKE
+        if self.time_s < self._shake_end:
+            action = np.clip(0.5 * action + self._shake, -1.0, 1.0).astype(np.float32)
+        observation, _, self._terminated, _, self._info = self.env.step(action)
+        self.action, self.observation, self.time_s = action, dict(observation), self._info["time_s"]
+        if self._reached is None and self._info["coverage"] >= 0.9:
+            self._reached = self.time_s
+
+
+def judge(episode: Episode) -> Outcome:
+    """Drive an episode by the network alone, and return how it went."""
+    env, network = _env(episode), _network(episode)
+    observation, info = env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
+    terminated, reached = False, None
+    while not terminated and info["time_s"] < episode.time_limit_s - 1e-9:
+        action = network.twist(network.inputs(observation, network.plan(observation)))
+        observation, _, terminated, _, info = env.step(action)
+        if reached is None and info["coverage"] >= 0.9:
+            reached = info["time_s"]
+    return Outcome(
+        coverage=info["coverage"], time_s=info["time_s"], time_to_90_s=reached, collisions=info["collisions"]
+    )
+
+
+def _env(episode: Episode) -> ExploreEnv:
+    return ExploreEnv(
+        rooms=episode.rooms, slam=episode.slam, noise=episode.noise, config={"time_limit_s": episode.time_limit_s}
+    )
+
+
+def _network(episode: Episode) -> DriveNetwork:
+    return DriveNetwork(episode.weights, episode.settings, uncertainty=episode.uncertainty)
+
+
+def _stacked(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:
+    return {key: np.stack([row[key] for row in rows]) for key in rows[0]}

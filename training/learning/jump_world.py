@@ -1,0 +1,287 @@
+"""Exploration without driving, for rehearsals: the robot is carried along the ways that it would drive.
+
+Nothing is noisy, no filter runs and no controller: the pose is the true one, the lidar looks every 0.2 m of the
+way, and time passes as it would at an even speed. Choices are found, described and planned by the agent's own
+parts, on the map that the scans make, so that what is learned here serves in ``ExploreFrontier-v0``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, SupportsInt, cast
+
+import cv2
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from agents.frontier_env import Observation, as_observation, choice_space
+from agents.learned.chooser import Chooser, ChooserConfig
+from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.ground_truth import Coverage, GroundTruth
+from mecanum_env.rooms.floor_plan import FloorPlan
+from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from slam.features.extraction import FeatureExtractor
+from slam.geometry import inverse, transform_points
+from slam.grids.occupancy import OccupancyGrid
+from slam.settings import from_mapping
+from slam.types import Belief, Scan
+
+__all__ = ["COVERED", "JumpWorld"]
+
+Array = NDArray[np.float64]
+
+COVERED = 0.95
+"""Coverage that an episode ends at."""
+
+_SPEED_M_S = 0.7  # along the way: what brisk driving comes to, beside walls and in the open
+_JUMP_M = 0.2  # between two looks
+_TURN_S = 0.25  # to start from rest, or to turn off at a right angle; twice that to turn round
+_AHEAD_M = 0.3  # of the way, where it sets off to
+_LOOK_S = 0.2  # at a way's end
+_LEAST_S = 0.3  # that a choice lasts
+_ROOM_M = 0.4  # around a place to begin at
+_POSE_COV = np.diag([2.5e-5, 2.5e-5, 1e-6])  # that the planner keeps off walls by; a filter's is about that
+
+
+class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
+    """The choices of ``ExploreFrontier-v0``, with jumps from look to look in between.
+
+    Parameters
+    ----------
+    driver : ChooserConfig or mapping, optional
+        As there. Covariance and landmarks there are none of: their columns are 0.
+    time_limit_s : float
+        Of an episode.
+    time_1_s, covered_1 : float
+        Reward of a second, and of all there is to map, as far as 95 % of it. An episode that ends with nothing
+        left to choose before that is charged with the time until the limit.
+
+    Notes
+    -----
+    ``reset`` needs ``options={"floor_plan": plan}``. The robot begins anywhere in it, its heading along one of the
+    plan's axes; with ``"anywhere": False`` at the plan's start. It keeps its heading, as a mecanum base can.
+    """
+
+    def __init__(
+        self,
+        *,
+        driver: ChooserConfig | Mapping[str, Any] | None = None,
+        time_limit_s: float = 300.0,
+        time_1_s: float = -1.0 / 30.0,
+        covered_1: float = 0.0,
+    ) -> None:
+        config = from_mapping(ChooserConfig, driver)
+        self.driver = replace(config, choice=replace(config.choice, uncertainty=False))
+        self.time_limit_s, self._time_1_s, self._covered_1 = time_limit_s, time_1_s, covered_1
+        self.action_space = spaces.Discrete(self.driver.choice.most)
+        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
+        self.robot, self.lidar = RobotConfig(), LidarConfig()
+        self.agent = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
+        self._eye = _Eye(self.lidar, self.robot)
+        self._place: _Place | None = None
+
+    @property
+    def belief(self) -> Belief:
+        """The true pose, and the map as the scans drew it."""
+        return Belief(
+            pose=self._pose, pose_cov=_POSE_COV, landmarks=np.zeros((0, 2)),
+            landmark_cov=np.zeros((0, 2, 2)), landmark_ids=np.zeros(0, np.int64), grid=self._grid,
+        )  # fmt: skip
+
+    @property
+    def ground(self) -> GroundTruth:
+        """The truth of the episode."""
+        assert self._place is not None
+        return self._place.truth
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
+        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
+        masks[0] = True
+        return masks
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin in a floor plan."""
+        super().reset(seed=seed)
+        if options is None or "floor_plan" not in options:
+            raise ValueError("JumpWorld.reset needs options={'floor_plan': plan}")
+        plan: FloorPlan = options["floor_plan"]
+        if self._place is None or self._place.truth.plan is not plan:
+            self._place = _Place(plan)
+        self._pose = self._place.draw(self.np_random) if options.get("anywhere", True) else np.zeros(3)
+        self._grid, self._coverage = OccupancyGrid(self._place.truth.resolution), Coverage(self._place.truth)
+        self._going = np.zeros(2)  # unit vector, or 0 at rest
+        self.time_s = self.covered = 0.0
+        self.agent.reset(self.belief, 0)
+        self._look()
+        self._look()
+        self._choice = self.agent.survey(self.belief)
+        return as_observation(self._choice, self.driver), self._info(0.0)
+
+    def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Go to a view point until the next choice of more than one is due."""
+        k, before, began = int(action), self.covered, self.time_s
+        while not self._over:
+            if self._choice is not None:
+                self.agent.take(self._choice, k if k < len(self._choice.index) else 0)
+            self._choice, k = None, 0
+            if not self._go() or self.covered >= COVERED:
+                break
+            self._choice = self.agent.survey(self.belief)
+            if self._choice is not None and len(self._choice.index) > 1:
+                break
+        reward = self._time_1_s * (self.time_s - began)
+        reward += self._covered_1 * (min(self.covered, COVERED) - min(before, COVERED))
+        truncated = self.time_s >= self.time_limit_s and self.covered < COVERED
+        terminated = not truncated and (self.covered >= COVERED or self._choice is None)
+        if terminated and self.covered < COVERED:
+            reward += self._time_1_s * (self.time_limit_s - self.time_s)
+        return (
+            as_observation(self._choice, self.driver), reward, terminated, truncated,
+            self._info(self.time_s - began),
+        )  # fmt: skip
+
+    @property
+    def _over(self) -> bool:
+        return self.covered >= COVERED or self.time_s >= self.time_limit_s
+
+    def _info(self, duration_s: float) -> dict[str, Any]:
+        return {
+            "time_s": self.time_s, "duration_s": duration_s, "coverage": self.covered,
+            "is_success": self.covered >= COVERED, "collisions": 0,
+        }  # fmt: skip
+
+    def _look(self) -> None:
+        assert self._place is not None
+        self._eye.look(self._place, self._pose, self._grid)
+        self.covered = self._coverage.update(self._grid)
+
+    def _go(self) -> bool:
+        """Go until a choice is due; return whether there was anywhere to go."""
+        began = self.time_s
+        path = self.agent.set_off(self.belief, self.time_s)
+        if path is None:
+            return False
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        self.time_s += _TURN_S * (1.0 - self._kept(path, along))
+        gone, length = 0.0, float(along[-1])
+        while gone < length - 1e-6:
+            jump = min(_JUMP_M, length - gone)
+            gone += jump
+            place = _at(path, along, gone)
+            step = place - self._pose[:2]
+            self._going = step / max(float(np.hypot(*step)), 1e-9)
+            self._pose = np.array([*place, self._pose[2]])
+            self.time_s += jump / _SPEED_M_S
+            self._look()
+            self.agent.pass_by(self.belief, self.time_s)
+            lasted = self.time_s - began
+            seen = lasted >= _LEAST_S and not self.agent.still_to_see(self.belief)
+            if self._over or seen or lasted >= self.driver.patience.replan_s:
+                return True
+        self.time_s += _LOOK_S
+        self._look()
+        self._going = np.zeros(2)
+        self.agent.arrive(self.time_s)
+        return True
+
+    def _kept(self, path: Array, along: Array) -> float:
+        """Return the share of its speed that the robot keeps when it sets off, −1 … 1."""
+        if along[-1] <= 0.05:
+            return 1.0
+        first = _at(path, along, _AHEAD_M) - self._pose[:2]
+        length = float(np.hypot(*first))
+        return float(self._going @ first) / length if length > 0.02 else 1.0
+
+
+def _at(path: Array, along: Array, s: float) -> Array:
+    """Return the point of a path ``(n, 2)`` at the arc length ``s``."""
+    return np.array([np.interp(s, along, path[:, 0]), np.interp(s, along, path[:, 1])])
+
+
+class _Passenger(Chooser):
+    """A chooser that is carried: it says where to, and is told when it is there."""
+
+    def set_off(self, belief: Belief, time_s: float) -> Array | None:
+        """Return the way ``(n, 2)`` to what was taken last; None where there is nothing to go to."""
+        self.pass_by(belief, time_s)
+        goal = self.choose(belief)
+        return None if goal is None else goal.path
+
+    def pass_by(self, belief: Belief, time_s: float) -> None:
+        """Take note of the time, and of where the sensor is."""
+        self.looked(belief)
+        self._time = time_s
+
+    def still_to_see(self, belief: Belief) -> bool:
+        """Whether there is anything left to see where it is going."""
+        assert self._target is not None
+        return self._is_frontier(belief, self._target)
+
+    def arrive(self, time_s: float) -> None:
+        """Take note that what is there was looked at."""
+        self._time = time_s
+        assert self._target is not None
+        self._troubles.note(self._target).looks += 1
+
+
+class _Place:
+    """A floor plan in the frame of its start, and where in it a robot may begin."""
+
+    def __init__(self, plan: FloorPlan) -> None:
+        start = np.array(plan.start, dtype=np.float64)
+        self.truth = GroundTruth(plan, start, robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+        to_start = inverse(start)
+        ends = transform_points(to_start, plan.segments.reshape(-1, 2))
+        self.segments = np.ascontiguousarray(ends.reshape(-1, 4))
+        self.circles = np.array(plan.circles, dtype=np.float64)
+        self.circles[:, :2] = transform_points(to_start, plan.circles[:, :2])
+        self._starts = self._clear()
+
+    def draw(self, rng: np.random.Generator) -> Array:
+        """Return a pose ``(3,)`` to begin at."""
+        x, y = self._starts[rng.integers(len(self._starts))]
+        return np.array([x, y, int(rng.integers(4)) * 0.5 * math.pi])
+
+    def _clear(self) -> Array:
+        """Return the places ``(n, 2)`` with room around them that hang together with the start."""
+        truth = self.truth
+        across = 2 * round(_ROOM_M / truth.resolution) + 1
+        near_wall = cv2.dilate(truth.walls.astype(np.uint8), np.ones((across, across), np.uint8)) > 0
+        _, labels = cv2.connectedComponents((truth.mappable & ~near_wall).astype(np.uint8), connectivity=4)
+        row, col = -truth.lattice_origin[0], -truth.lattice_origin[1]
+        inside = 0 <= row < labels.shape[0] and 0 <= col < labels.shape[1]
+        if not inside or labels[row, col] == 0:
+            return np.zeros((1, 2))
+        cells = np.argwhere(labels == labels[row, col])
+        return np.asarray((cells + np.array(truth.lattice_origin) + 0.5)[:, ::-1] * truth.resolution)
+
+
+class _Eye:
+    """The lidar without noise, and its scans drawn."""
+
+    def __init__(self, lidar: LidarConfig, robot: RobotConfig) -> None:
+        self._lidar, self._body_m = lidar, robot.inscribed_radius_m
+        self._directions = beam_directions(lidar.beams, lidar.angle_min, lidar.angle_increment)
+        self._extractor = FeatureExtractor()
+
+    def look(self, place: _Place, pose: Array, grid: OccupancyGrid) -> None:
+        """Draw into the grid what is seen from a pose ``(3,)`` of the robot."""
+        lidar, (x, y, heading) = self._lidar, pose.tolist()
+        eye = (x + lidar.offset_m * math.cos(heading), y + lidar.offset_m * math.sin(heading), heading)
+        ranges = np.empty(lidar.beams)
+        cast_rays(
+            place.segments, place.circles, *eye, self._directions, lidar.angle_min, lidar.angle_increment,
+            lidar.range_max_m, ranges,
+        )  # fmt: skip
+        scan = Scan(
+            ranges, angle_min=lidar.angle_min, angle_increment=lidar.angle_increment, range_max=lidar.range_max_m
+        )
+        self._extractor.extract(scan)
+        grid.integrate(eye, scan, self._extractor.surface, body=(x, y, self._body_m))

@@ -1,0 +1,130 @@
+"""Trained policies between stable-baselines3's zip and the files that the package ships: safetensors and JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors.numpy import load_file, save
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents.learned.choice_network import apart
+from agents.learned.chooser import ChooserConfig
+from agents.ppo import FORMAT, load_drive_policy
+from agents.ppo_frontier import load_choice_policy, policy_description
+from slam.formats import atomic_write, replacing
+from slam.settings import from_mapping, to_mapping
+from training.learning.choice_world import make_world
+from training.learning.config import TrainConfig
+from training.learning.ensemble import best_weights, curve_of
+from training.learning.networks import ChoicePolicy
+from training.learning.ppo import make_model
+
+__all__ = ["export_policy", "export_run", "write_zip"]
+
+
+def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:
+    """Write a policy of ``ppo-frontier`` as ``target`` (.safetensors, half precision) and the JSON file beside it.
+
+    Parameters
+    ----------
+    weights
+        Of the network, by name.
+    target
+        Where to.
+    training
+        What else the JSON file says; ``config``, the training's, among it: it says how the policy drives.
+    """
+    config = training["config"]
+    driver = to_mapping(from_mapping(ChooserConfig, config["world"]["driver"]))
+    described = policy_description(config["heads"], driver, **training)
+    atomic_write(target, save(_halved(weights)))
+    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    load_choice_policy(target)  # it is read back
+
+
+def export_run(run: Path, target: Path) -> None:
+    """Write the best policy of a run of ``ppo-frontier`` or ``ppo``; the JSON file says how it was trained.
+
+    Raises
+    ------
+    ValueError
+        Where the folder holds no run that got as far as an evaluation.
+    """
+    try:
+        progress = json.loads((run / "progress.json").read_text(encoding="utf-8"))
+        drives = progress["config"].get("policy") == "drive"
+        config = TrainConfig() if drives else from_mapping(TrainConfig, progress["config"])
+        curve = curve_of(config, run)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"{run} holds no finished part of a run; train it, or go on with mecanum train --resume ({error})"
+        ) from error
+    if drives:
+        _export_drive(run, target, progress, curve)
+    else:
+        export_policy(best_weights(config, run), target, _training(progress, curve))
+
+
+def write_zip(source: Path, target: Path, member: int | None = None) -> None:
+    """Write a policy of the package's format as a zip that ``MaskablePPO.load`` reads, to train on from.
+
+    Parameters
+    ----------
+    source, target
+        From and to.
+    member
+        Which of several networks that choose together, from 1: a zip holds one.
+
+    Raises
+    ------
+    ValueError
+        Where ``source`` is no such policy, is of several networks and ``member`` none of them, or its JSON file
+        does not say how it was trained.
+    """
+    count = len(load_choice_policy(source)[0].members)
+    if not 1 <= (member or (1 if count == 1 else 0)) <= count:
+        raise ValueError(f"{source} is of {count} network{'s' * (count > 1)}: choose one by --member 1 … {count}")
+    described = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
+    if "config" not in described:
+        raise ValueError(f"{source.with_suffix('.json')} does not say with which config it was trained")
+    config = from_mapping(TrainConfig, described["config"])
+    env = DummyVecEnv([lambda: make_world(config.world)])
+    model = make_model(config, env)
+    network = cast("ChoicePolicy", model.policy).network
+    weights = apart(load_file(source))[(member or 1) - 1]
+    network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
+    with replacing(target) as new:
+        model.save(new)
+    env.close()
+
+
+def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: Any) -> None:
+    """Write the best weights of a run of ``ppo`` in half precision, and the JSON file."""
+    config = progress["config"]
+    described = {
+        "format": FORMAT, "uncertainty": config["uncertainty"],
+        "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
+        **_training(progress, curve),
+    }  # fmt: skip
+    atomic_write(target, save(_halved(load_file(run / "best.safetensors"))))
+    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+    load_drive_policy(target)  # it is read back
+
+
+def _halved(weights: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
+    # Safetensors writes memory as it lies, whatever its order.
+    return {name: np.asarray(value, dtype=np.float16, order="C") for name, value in weights.items()}
+
+
+def _training(progress: Mapping[str, Any], curve: Any) -> dict[str, Any]:
+    config = progress["config"]
+    return {
+        "command": progress["command"], "config": config, "steps": progress["steps"],
+        "hours": round(progress["wall_s"] / 3600.0, 3), "training_seeds": config["world"]["seeds"], "curve": curve,
+    }  # fmt: skip

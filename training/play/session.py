@@ -1,0 +1,190 @@
+"""``mecanum play``: what is played. The rooms, the backend, and who drives; no window is needed for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+import agents
+import slam
+from agents.base import ENDINGS, Agent
+from mecanum_env import rooms as room_registry
+from mecanum_env.config import EnvConfig
+from mecanum_env.env import ExploreEnv, make_config
+from training.episodes.known_map import NAME as KNOWN_MAP
+from training.episodes.known_map import KnownMap
+from training.play.controls import Command
+from training.runs.errors import bad_input, one_line
+
+__all__ = ["PlayOptions", "Session"]
+
+T = TypeVar("T")
+
+_LAST_SEED = 2**31 - 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlayOptions:
+    """What was asked for; ``None`` where the default decides."""
+
+    agent: str = "nearest-frontier"
+    rooms: str | None = None
+    slam: str | None = None
+    robot: str | None = None
+    noise: str | None = None
+    seed: int = 0
+    floor_plan: Path | None = None
+
+
+class Session:
+    """Episodes one after the other, each with its rooms and its backend, and whoever drives.
+
+    An episode goes on for as long as somebody drives: all may be mapped, and no limit of time ends it.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, and what to do.
+    """
+
+    env: ExploreEnv
+    config: EnvConfig
+    seed: int
+    observation: Mapping[str, Any]
+    info: Mapping[str, Any]
+    agent: Agent | None = None
+    """Who drives instead of a person."""
+    trouble: str = ""
+    """Why the last command could not be followed, or nothing."""
+
+    def __init__(self, options: PlayOptions) -> None:
+        self.agent_name = options.agent
+        with bad_input():
+            agents.check(options.agent, KNOWN_MAP)
+            config = make_config(
+                rooms=options.rooms, slam=options.slam, robot=options.robot, noise=options.noise,
+                floor_plan=options.floor_plan,
+            )  # fmt: skip
+            # A plan from a file is a kind of rooms of its own.
+            self._kinds: list[tuple[str, str | None]] = [(name, None) for name in room_registry.names()]
+            if config.floor_plan is not None:
+                self._kinds.insert(0, (config.rooms, config.floor_plan))
+            self._start(config, options.seed)
+            self._make_agent(
+                self.env, options.seed
+            )  # its settings and its policy's file are looked at now, not at the wheel
+
+    # ---- what is there -------------------------------------------------------------------------------------
+
+    @property
+    def place(self) -> str:
+        """The rooms and their seed, in words."""
+        return _place(self.config, self.seed)
+
+    @property
+    def driver(self) -> str:
+        """Who drives, in words."""
+        return "You drive" if self.agent is None else f"Agent {self._short_name}"
+
+    @property
+    def driver_note(self) -> str:
+        """What the driver is about, or how to change the driver, in words."""
+        if self.trouble:
+            return self.trouble
+        if self.agent is None:
+            return f"Space: let {self._short_name} drive"
+        status = self.agent.status
+        return f"{status}: {ENDINGS[status]}" if self.agent.ended else f"{status} (Space: take the wheel)"
+
+    @property
+    def planned_path(self) -> NDArray[np.float64] | None:
+        """The way ``(n, 2)`` that the agent means to go [m], where one drives."""
+        return None if self.agent is None or self.agent.goal is None else self.agent.goal.path
+
+    def summary(self) -> str:
+        """Return how the episode stands, in one line."""
+        info = self.info
+        return (
+            f"{self.place}, {self.config.slam}: {info['time_s']:.1f} s, coverage {100 * info['coverage']:.1f} %, "
+            f"path {info['path_length_m']:.1f} m, collisions {info['collisions']}"
+        )
+
+    # ---- what happens --------------------------------------------------------------------------------------
+
+    def step(self, action: NDArray[np.float32]) -> None:
+        """Drive for one step: as the agent says where one drives, else by the action."""
+        if self.agent is not None:
+            action = self.agent.act(self.observation, self.env.belief)
+        self.observation, _, _, _, self.info = self.env.step(action)
+
+    def obey(self, command: Command) -> None:
+        """Do what a key asks for; the episode stays as it is where that cannot be done (``trouble`` says why)."""
+        self.trouble = ""
+        if command is Command.HAND_OVER:
+            self.agent = self._make_agent(self.env, self.seed) if self.agent is None else None
+        elif (wanted := self._wanted(command)) is not None:
+            try:
+                self._start(*wanted)
+            except ValueError as error:
+                self.trouble = one_line(error)
+
+    def preview(self, command: Command) -> str:
+        """Return what a command starts, in words, or nothing."""
+        wanted = self._wanted(command)
+        return "" if wanted is None else f"{_place(*wanted)}, {wanted[0].slam}"
+
+    def _wanted(self, command: Command) -> tuple[EnvConfig, int] | None:
+        """Return the configuration and seed of the episode that a command asks for."""
+        config, seed = self.config, self.seed
+        match command:
+            case Command.NEXT_BACKEND:
+                config = replace(config, slam=_after(config.slam, slam.names()), slam_config={})
+            case Command.NEXT_KIND:
+                rooms, floor_plan = _after((config.rooms, config.floor_plan), self._kinds)
+                config = replace(config, rooms=rooms, rooms_config={}, floor_plan=floor_plan)
+            case Command.NEXT_ROOM:
+                seed = min(seed + 1, _LAST_SEED)
+            case Command.PREVIOUS_ROOM:
+                seed = max(seed - 1, 0)
+            case Command.RESTART:
+                pass
+            case _:
+                return None
+        return config, seed
+
+    def _start(self, config: EnvConfig, seed: int) -> None:
+        env = ExploreEnv(config=config)
+        observation, info = env.reset(seed=seed)
+        agent = None if self.agent is None else self._make_agent(env, seed)
+        self.env, self.config, self.seed, self.agent = env, config, seed, agent
+        self.observation, self.info = observation, info
+
+    def _make_agent(self, env: ExploreEnv, seed: int) -> Agent:
+        """Return the agent, told of the belief as it is now: it may take over anywhere."""
+        config = env.config
+        agent: Agent
+        if self.agent_name == KNOWN_MAP:
+            agent = KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        else:
+            agent = agents.make(self.agent_name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent.reset(env.belief, seed)
+        return agent
+
+    @property
+    def _short_name(self) -> str:
+        return Path(self.agent_name).stem if self.agent_name.endswith(".safetensors") else self.agent_name
+
+
+def _place(config: EnvConfig, seed: int) -> str:
+    rooms = config.rooms if config.floor_plan is None else Path(config.floor_plan).name
+    return f"{rooms}, seed {seed}"
+
+
+def _after(item: T, items: Sequence[T]) -> T:
+    """Return what follows an item, the first after the last."""
+    return items[(items.index(item) + 1) % len(items)]

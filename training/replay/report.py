@@ -1,0 +1,191 @@
+"""What ``mecanum replay`` leaves behind: its metrics, files and the summary that is printed."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import cv2
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from slam.formats import atomic_write, write_map_server, write_tum
+from slam.landmarks.database import write_landmark_map
+from slam.logs import ScanLog
+from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
+from slam.settings import to_mapping
+from slam.types import Belief
+from training.replay.picture import draw_belief, draw_replay
+from training.replay.run import FILES, Replay
+from training.replay.scans import scan_metrics
+from training.runs.running import interrupt_flag, plain, versions
+
+__all__ = ["metrics", "summary", "surveyed_places", "write"]
+
+Array = NDArray[np.float64]
+
+
+def metrics(replay: Replay) -> dict[str, Any]:
+    """Return the contents of ``metrics.json``."""
+    times, true, est = replay.trajectories()
+    found: dict[str, Any] = {
+        "ate_rmse_m": None, "ate_aligned_m": None, "final_position_error_m": None,
+        "final_heading_error_rad": None, "anees": None, "dead_reckoning_ate_m": None,
+        "dead_reckoning_ate_aligned_m": None, "landmark_rmse_m": None, "landmark_rmse_aligned_m": None,
+    }  # fmt: skip
+    if len(true):
+        reckoned = _at(times, replay.log.odometry_times, replay.log.dead_reckoning())
+        found |= {
+            "ate_rmse_m": ate(true, est), "ate_aligned_m": ate_aligned(true, est),
+            "final_position_error_m": ate(true[-1:], est[-1:]),
+            "dead_reckoning_ate_m": ate(true, reckoned),
+            "dead_reckoning_ate_aligned_m": ate_aligned(true, reckoned),
+        }  # fmt: skip
+        if replay.log.has_heading:
+            found["final_heading_error_rad"] = float(heading_errors(true[-1:], est[-1:])[0])
+            found["anees"] = float(anees(replay.nees)) if np.isfinite(replay.nees).any() else None
+    belief = replay.backend.belief
+    surveyed = surveyed_places(replay, belief.landmark_ids)
+    mapped = np.isfinite(surveyed[:, 0])
+    if mapped.any():
+        found["landmark_rmse_m"] = ate(surveyed[mapped], belief.landmarks[mapped])
+        if np.count_nonzero(mapped) > 1:
+            found["landmark_rmse_aligned_m"] = ate_aligned(surveyed[mapped], belief.landmarks[mapped])
+    found |= {
+        "landmarks": len(belief.landmarks), "samples": len(true), "steps": replay.steps,
+        "observations": replay.observations, "duration_s": replay.time_s, "wall_s": round(replay.wall_time_s, 3),
+        "realtime_factor": round(replay.time_s / max(replay.wall_time_s, 1e-9), 1),
+        "slam": replay.config.slam, "association": replay.run["association"], "log": replay.log.name,
+        "seed": replay.run["seed"], "end": replay.end, "interrupted": replay.interrupted, "note": replay.log.note,
+    }  # fmt: skip
+    if isinstance(replay.log, ScanLog):
+        found |= scan_metrics(replay, replay.log)
+    return {key: plain(value) for key, value in found.items()}
+
+
+def surveyed_places(replay: Replay, ids: NDArray[np.int64]) -> Array:
+    """Return the surveyed positions ``(n, 2)`` [m] of landmarks; nan where there is none, or none is known."""
+    out = np.full((len(ids), 2), np.nan)
+    if replay.log.landmark_ids is None or replay.log.landmarks is None or replay.run["association"] != "known":
+        return out
+    row = {int(i): k for k, i in enumerate(replay.log.landmark_ids)}
+    for k, landmark_id in enumerate(ids.tolist()):
+        if landmark_id in row:
+            out[k] = replay.log.landmarks[row[landmark_id]]
+    return out
+
+
+def write(replay: Replay) -> dict[str, Any]:
+    """Write every file of a replay and return its metrics.
+
+    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
+    while writing leaves the results of an earlier one as they were.
+    """
+    out = replay.out
+    out.mkdir(parents=True, exist_ok=True)
+    folder = Path(mkdtemp(prefix=".writing-", dir=out))
+    try:
+        with interrupt_flag():  # one Ctrl-C does not leave half the files of this replay, half of another
+            found = _write_into(folder, replay)
+            for name in replay.files:
+                (folder / name).replace(out / name)
+        return found
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
+    log, belief, done = replay.log, replay.backend.belief, len(replay.estimates)
+    estimates = np.array(replay.estimates, np.float64).reshape(-1, 3)
+    times, true, _ = replay.trajectories()
+    write_tum(folder / "trajectory_estimate.tum", replay.sample_times[:done], estimates)
+    write_tum(folder / "trajectory_true.tum", times, np.nan_to_num(true, nan=0.0))  # a heading not known is 0
+    seen, angles = replay.backend.landmark_details()
+    write_landmark_map(
+        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
+        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+        backend=replay.config.slam, frame="reference",
+    )  # fmt: skip
+    surveyed = surveyed_places(replay, belief.landmark_ids)
+    atomic_write(folder / "landmarks.csv", _landmarks_csv(belief, seen, surveyed))
+    reckoned = log.dead_reckoning()[log.odometry_times <= replay.time_s]
+    picture = draw_replay(
+        reference=_broken_at_gaps(times, true, log.reference_gap_s), reckoned=reckoned, estimate=estimates,
+        landmarks=belief.landmarks,
+        surveyed=surveyed if log.landmarks is None else log.landmarks,
+        title=f"{log.name}   {replay.config.slam}, {replay.run['association']} association",
+    )  # fmt: skip
+    if isinstance(log, ScanLog):
+        write_map_server(folder / "map", belief.grid)
+        title = f"{log.name}   {replay.config.slam}"
+        atomic_write(folder / "map.png", cv2.imencode(".png", draw_belief(belief, estimates, title))[1].tobytes())
+    atomic_write(folder / "trajectory.png", cv2.imencode(".png", picture)[1].tobytes())
+    atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": _run_values(replay)}))
+    found = metrics(replay)
+    atomic_write(folder / "metrics.json", json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    return found
+
+
+def _run_values(replay: Replay) -> dict[str, Any]:
+    return {key: v for key, v in replay.run.items() if v is not None} | {"versions": versions()}
+
+
+def _landmarks_csv(belief: Belief, seen: NDArray[np.int64], surveyed: Array) -> str:
+    """Return a line a landmark: estimate, covariance, sightings and, where it was surveyed, its true place."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(("id", "x_m", "y_m", "var_x", "var_y", "cov_xy", "times_seen", "true_x_m", "true_y_m"))
+    for i in np.argsort(belief.landmark_ids, kind="stable"):
+        (x, y), cov = belief.landmarks[i], belief.landmark_cov[i]
+        numbers = [f"{v:.9g}" for v in (x, y, cov[0, 0], cov[1, 1], cov[0, 1])]
+        true = [f"{v:.9g}" if math.isfinite(v) else "" for v in surveyed[i]]
+        table.writerow((int(belief.landmark_ids[i]), *numbers, int(seen[i]), *true))
+    return text.getvalue()
+
+
+def _broken_at_gaps(times: Array, poses: Array, longest_s: float) -> Array:
+    """Return poses ``(n, 3)`` with a row of nan wherever the time leaps by more than ``longest_s``."""
+    return np.insert(poses, np.flatnonzero(np.diff(times) > longest_s) + 1, math.nan, axis=0)
+
+
+def _at(times: Array, stamps: Array, poses: Array) -> Array:
+    """Return poses ``(n, 3)`` between stamped ones ``(k, 3)``."""
+    columns = poses[:, 0], poses[:, 1], np.unwrap(poses[:, 2])
+    return np.column_stack([np.interp(times, stamps, column) for column in columns])
+
+
+def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -> str:
+    """Return what is printed at the end, where no JSON is wanted."""
+
+    def shown(key: str, unit: str, digits: int = 2) -> str:
+        return "-" if found[key] is None else f"{found[key]:.{digits}f} {unit}".rstrip()
+
+    speed = f"{found['wall_s']:.1f} s, {found['realtime_factor']:.0f} times real time"
+    scan_rows: list[tuple[str, str]] = []
+    sensed = f"{found['observations']} observations"
+    if "scans" in found:
+        error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
+        local = shown("relations_local_trans_m", "m", 3)
+        scan_rows.append(("relations", f"{error}, {local} along the way"))
+        sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
+    rows = (
+        ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
+        ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {sensed}"),
+        ("trajectory", f"{shown('ate_rmse_m', 'm')} off, {shown('ate_aligned_m', 'm')} aligned"),
+        ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
+        ("landmarks", f"{found['landmarks']}, {shown('landmark_rmse_m', 'm')} off"),
+        ("NEES / 3", shown("anees", "")),
+        *scan_rows,
+        ("took", speed),
+        ("files", f"{out}/: {', '.join(files)}"),
+    )
+    return "\n".join(f"{name:<12} {text}" for name, text in rows)

@@ -1,0 +1,307 @@
+"""``mecanum replay``: a backend on the recorded log of a real robot, from the options to the files."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+import slam
+from slam.backend import Backend
+from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_reference
+from slam.metrics.measures import nees_pose
+from slam.motion import move
+from slam.settings import from_mapping, require, to_mapping, unknown_name
+from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.running import interrupt_flag
+
+__all__ = [
+    "FILES",
+    "MAP_FILES",
+    "Progress",
+    "Replay",
+    "ReplayConfig",
+    "ReplayOptions",
+    "prepare",
+    "run",
+    "sample_times",
+]
+
+Array = NDArray[np.float64]
+
+FILES = (
+    "trajectory_estimate.tum", "trajectory_true.tum", "landmarks.db", "landmarks.csv", "trajectory.png",
+    "config.toml", "metrics.json",
+)  # fmt: skip
+"""What a replay writes, ``metrics.json`` last: where it is, the others are."""
+
+MAP_FILES = ("map.png", "map.pgm", "map.yaml")
+"""What a replay of a log with scans writes beside them."""
+
+ASSOCIATIONS = ("known", "unknown")
+SAMPLE_S = 0.1
+"""Poses are taken, and compared, at the reference's times no nearer to each other, and as often in its gaps."""
+
+_RUN_KINDS: dict[str, tuple[type, ...]] = {
+    "association": (str,), "seed": (int,), "limit_s": (int, float), "reference": (str,),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayOptions:
+    """What was asked for; ``None`` where the config file, the log or the default decides."""
+
+    log: Path
+    out: Path
+    robot: int | None = None
+    reference: Path | None = None  # of a log of scans
+    slam: str | None = None
+    association: str | None = None
+    seed: int | None = None
+    limit_s: float | None = None
+    config: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig:
+    """A replay's configuration file; the log's own values stand where it says nothing."""
+
+    observation: ObservationNoise | None = None  # of a log of scans there is none
+    slam: str = "ekf"
+    slam_config: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require(isinstance(self.slam_config, Mapping), "ReplayConfig.slam_config must be a table")
+
+
+@dataclass(eq=False)
+class Replay:
+    """A replay: prepared, then run, then written. One entry a sample in what it records."""
+
+    log: AnyLog
+    config: ReplayConfig
+    backend: Backend
+    run: dict[str, Any]  # association, seed, … as config.toml's [run] has them
+    out: Path
+    sample_times: Array  # (s,) [s]
+    sample_rows: NDArray[np.int64]  # (s,) row of the reference, -1 in its gaps
+    estimates: list[Array] = field(default_factory=list)  # (3,) each
+    nees: list[float] = field(default_factory=list)  # nan without a reference pose
+    time_s: float = 0.0  # how far it came
+    steps: int = 0
+    observations: int = 0
+    scan_times_s: list[float] = field(default_factory=list)  # wall clock of prediction and update, one a scan
+    end: str = "end of the log"
+    interrupted: bool = False
+    wall_time_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.headings = self.log.has_heading
+        self.files = (*MAP_FILES, *FILES) if isinstance(self.log, ScanLog) else FILES
+
+    def trajectories(self) -> tuple[Array, Array, Array]:
+        """Return times ``(n,)``, reference ``(n, 3)`` and estimate ``(n, 3)`` where there is a reference."""
+        done = len(self.estimates)
+        rows = self.sample_rows[:done]
+        compared = rows >= 0
+        estimates = np.array(self.estimates, np.float64).reshape(-1, 3)
+        return self.sample_times[:done][compared], self.log.reference_poses[rows[compared]], estimates[compared]
+
+
+# ---- before --------------------------------------------------------------------------------------------------
+
+
+def prepare(options: ReplayOptions) -> Replay:
+    """Read the log, check everything that can be checked, and set the backend at the start; nothing is written.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file, line or name is wrong, and what to do.
+    """
+    with bad_input():
+        if options.slam is not None:
+            slam.config_type(options.slam)  # before a log is read in vain
+        check_writable(options.out, (*MAP_FILES, *FILES))
+        values = _read_config(options.config) if options.config is not None else {}
+        run = {"seed": 0} | _run_table(values.pop("run", {}), options.config)
+        run |= {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
+        log = open_log(options.log, robot=options.robot)
+        if "reference" in run:
+            log = with_reference(log, run["reference"])
+            run["reference"] = str(Path(run["reference"]).absolute())
+        association = run.setdefault("association", "unknown" if log.ids is None else "known")
+        if association not in ASSOCIATIONS:
+            raise unknown_name("association", association, ASSOCIATIONS)
+        if association == "known" and log.ids is None:
+            raise ValueError(f"log {log.name} does not tell landmarks apart; give --association unknown")
+        limit = run.get("limit_s")
+        if limit is not None:
+            require(0 < limit < math.inf, f"--limit-s must be above 0 and finite, got {limit}")
+            log = log.until(float(limit))
+        config = _make_config(log, values, options.slam)
+        backend = slam.make(config.slam, config=config.slam_config)
+        if hasattr(backend, "give_pose") and not log.has_heading:
+            lacks = "none: give --reference" if isinstance(log, ScanLog) else "only positions"
+            raise ValueError(f"--slam {config.slam} needs true poses; log {log.name} has {lacks}")
+        if not (backend.observes_landmarks or isinstance(log, ScanLog)):
+            raise ValueError(f"--slam {config.slam} takes scans; log {log.name} holds landmark observations only")
+        backend.reset(log.start_pose, seed=run["seed"])
+    run |= {"log": str(options.log.absolute()), "clock_start_s": log.clock_start_s}
+    if options.robot is not None:
+        run["robot"] = options.robot
+    times, rows = sample_times(log)
+    return Replay(log, config, backend, run, options.out, times, rows)
+
+
+def sample_times(log: AnyLog) -> tuple[Array, NDArray[np.int64]]:
+    """Return when poses are taken ``(s,)`` [s], and the row of the reference there ``(s,)``, -1 in its gaps.
+
+    Of a log of scans they are taken after each scan, where alone its reference is.
+    """
+    if isinstance(log, ScanLog):
+        scan_rows = np.full(len(log.times), -1, np.int64)
+        scan_rows[np.searchsorted(log.times, log.reference_times)] = np.arange(len(log.reference_times))
+        return log.times, scan_rows
+    times: list[float] = []
+    rows: list[int] = []
+    reference = [*log.reference_times.tolist(), log.duration_s]
+    last = -math.inf
+    for row, at in enumerate(reference):
+        since = max(last, -SAMPLE_S)
+        for k in range(1, math.ceil((at - since) / SAMPLE_S - 0.5)):  # the gap, if there is one
+            times.append(since + k * SAMPLE_S)
+            rows.append(-1)
+        if at - last >= SAMPLE_S - 1e-9 and row < len(log.reference_times):
+            times.append(at)
+            rows.append(row)
+        last = times[-1] if times else last
+    return np.array(times), np.array(rows, np.int64)
+
+
+def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) -> ReplayConfig:
+    """Lay a config file over the log's own values; return the effective configuration, complete."""
+    if "observation" in values and log.observation_noise is None:
+        raise ValueError(f"log {log.name} holds scans, no observations; take [observation] out of the config")
+    config = from_mapping(ReplayConfig, values, base=ReplayConfig(observation=log.observation_noise))
+    name = backend or config.slam
+    kind = slam.config_type(name)
+    known = {key: value for key, value in log.settings.items() if key in kind.__dataclass_fields__}
+    settings = from_mapping(kind, config.slam_config, base=from_mapping(kind, known))
+    return ReplayConfig(observation=config.observation, slam=name, slam_config=to_mapping(settings))
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
+
+
+def _run_table(run: object, path: Path | None) -> dict[str, Any]:
+    """Return association, seed, limit and reference from a config's [run] table, where it has them."""
+    if not isinstance(run, dict):
+        raise BadInput(f"config {path}: [run] must be a table; see a config.toml")
+    for key, kinds in _RUN_KINDS.items():
+        if key in run and type(run[key]) not in kinds:
+            raise BadInput(f"config {path}: [run] {key} has the wrong type; see a config.toml")
+    if run.get("seed", 0) < 0:
+        raise BadInput(f"config {path}: [run] needs seed ≥ 0")
+    return {key: run[key] for key in _RUN_KINDS if key in run}
+
+
+# ---- the replay ------------------------------------------------------------------------------------------------
+
+
+def run(replay: Replay, progress: Callable[[float], None]) -> None:
+    """Feed the log to the backend until its end, or until Ctrl-C is pressed between two steps.
+
+    ``progress`` is told the log's time [s] after every step. Raises ``ArithmeticError`` where the backend's pose
+    ceases to be finite.
+    """
+    log, backend = replay.log, replay.backend
+    give_pose = getattr(backend, "give_pose", None)
+    known = replay.run["association"] == "known"
+    began = time.perf_counter()
+    with interrupt_flag() as interrupted:
+        for event in log.events(replay.config.observation, known=known):
+            _sample(replay, event.time_s, event.odometry.twist)
+            at = time.perf_counter()
+            if event.odometry.dt > 0:
+                backend.predict(event.odometry)
+                replay.steps += 1
+            if give_pose is not None and (true_pose := log.reference_at(event.time_s)) is not None:
+                give_pose(true_pose)
+            if event.observations is not None:
+                backend.observe(event.observations)
+                replay.observations += len(event.observations.range_bearing)
+            if event.scan is not None:
+                backend.update(event.scan)
+                replay.scan_times_s.append(time.perf_counter() - at)
+            replay.time_s = event.time_s
+            progress(event.time_s)
+            if interrupted.is_set():
+                replay.end, replay.interrupted = "interrupted", True
+                break
+            if not math.isfinite(math.fsum(backend.pose)):
+                name, when = replay.config.slam, event.time_s
+                raise ArithmeticError(
+                    f"{name} diverged {when:.1f} s into the log: its pose is not finite any more"
+                )
+        else:
+            _sample(replay, math.inf, (0.0, 0.0, 0.0))
+    replay.wall_time_s = time.perf_counter() - began
+
+
+def _sample(replay: Replay, before: float, twist: Any) -> None:
+    """Record the samples that are due before a time, while ``twist`` is held."""
+    log, backend, now = replay.log, replay.backend, replay.time_s
+    while (k := len(replay.estimates)) < len(replay.sample_times) and replay.sample_times[k] < before:
+        # Moved on to the very time, beside the filter: a step of its own would change V's share.
+        replay.estimates.append(move(backend.pose, twist, float(replay.sample_times[k]) - now))
+        true_pose = log.reference_at(now) if replay.headings and replay.sample_rows[k] >= 0 else None
+        replay.nees.append(math.nan if true_pose is None else _pose_nees(backend, true_pose))
+
+
+def _pose_nees(backend: Backend, true_pose: Array) -> float:
+    own: Callable[[Array], float] | None = getattr(backend, "pose_nees", None)
+    if own is not None:  # a filter whose error is not the plain difference
+        return float(own(true_pose))
+    return float(nees_pose(backend.pose, backend.pose_cov, true_pose))
+
+
+class Progress:
+    """How far a replay is, and how long it will take: one line that changes, or now and then a line."""
+
+    def __init__(self, duration_s: float, stream: TextIO | None = None) -> None:
+        self._stream = stream or sys.stderr
+        self._duration = duration_s
+        self._terminal = self._stream.isatty()
+        self._began = time.monotonic()
+        self._next = self._began + (0.2 if self._terminal else 5.0)
+
+    def __call__(self, time_s: float) -> None:
+        """Show it, where it is time to."""
+        now = time.monotonic()
+        if now < self._next or time_s <= 0.0:
+            return
+        self._next = now + (0.2 if self._terminal else 30.0)
+        left = (now - self._began) * (self._duration - time_s) / max(time_s, 1e-9)
+        text = f"replaying: {time_s:.0f} of {self._duration:.0f} s, {left:.0f} s to go"
+        print(f"\r{text:<60}" if self._terminal else text, end="" if self._terminal else "\n",
+              file=self._stream, flush=True)  # fmt: skip
+
+    def close(self) -> None:
+        """Take the line away."""
+        if self._terminal:
+            print(f"\r{'':<60}\r", end="", file=self._stream, flush=True)

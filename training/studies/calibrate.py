@@ -1,0 +1,108 @@
+"""Odometry calibration: V as the simulated robot has it, beside V as its estimators are told.
+
+``python -m training.studies.calibrate`` drives each preset's robot over an open floor and prints both
+(:mod:`mecanum_env.sensing.odometry_calibration`, theory.md A).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
+from mecanum_env.sensing.calibration import odometry_noise
+from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit
+from slam.motion import OdometryNoise
+from slam.settings import unknown_name
+
+__all__ = ["compare", "main", "table"]
+
+_TERMS = ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m")
+
+
+def compare(preset: str, *, episodes: int, steps: int, seed: int) -> dict[str, Any]:
+    """Drive a noise preset's robot; return V measured and declared, and by how much the declared one is off.
+
+    ``drift_ratio_*`` is the squared drift over a second, over what V allows for it: ideal 1, below it V is too
+    large. ``lasting_without_gain`` is what V would be if the wheels' mean overstatement, ``gain``, were taken out.
+    """
+    robot, noise = ROBOT_PRESETS.get(preset, ROBOT_PRESETS["youbot"]), NOISE_PRESETS[preset]
+    drives = drive(robot, noise, episodes=episodes, steps=steps, seed=seed)
+    found = fit(drives, robot.lever_m)
+    # One gain for all three: that of the wheels.
+    gain = float(np.mean(found.gain))
+    corrected = Drives(drives.measured * (1.0 - gain), drives.true, drives.dt)
+    declared = odometry_noise(robot, noise)
+    return {
+        "white": _terms(found.white),
+        "lasting": _terms(found.lasting),
+        "lasting_without_gain": _terms(fit(corrected, robot.lever_m).lasting),
+        "declared": _terms(declared),
+        "declared_white": _terms(declared.white()),
+        "drift_ratio_declared": drift_ratios(drives, declared),
+        "drift_ratio_lasting": drift_ratios(drives, found.lasting),
+        "gain": found.gain.tolist(),
+        "bins": found.bins.tolist(),
+        "steps": found.steps,
+    }
+
+
+def _terms(noise: OdometryNoise) -> dict[str, float]:
+    return {name: getattr(noise, name) for name in _TERMS}
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Return the comparison as a table; speeds in m/s, turn rates in rad/s."""
+    head = f"{'':<30}{'v floor':>9}{'v share':>9}{'ω floor':>9}{'ω share':>9}{'drift² v':>10}{'drift² ω':>10}"
+    lines = [head]
+    for preset, result in results.items():
+        for kind in ("white", "declared_white", "lasting", "lasting_without_gain", "declared"):
+            row = "".join(f"{result[kind][name]:>9.4f}" for name in _TERMS)
+            ratios = result.get(f"drift_ratio_{kind}")
+            row += "" if ratios is None else "".join(f"{ratio:>10.2f}" for ratio in ratios)
+            lines.append(f"{preset:<9} {kind.replace('_', ' '):<20}{row}")
+        gains = ", ".join(f"{100 * share:+.1f} %" for share in result["gain"])
+        lines.append(f"{preset:<9} the wheels claim more than was driven: vx, vy, ω {gains}")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the module's command line; return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.studies.calibrate", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--noise", default="nominal,slippery,cavity", help="presets, separated by commas")
+    parser.add_argument("--episodes", type=int, default=60)
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(argv)
+    results = {}
+    try:
+        if options.episodes < 1 or options.steps < 10 or options.seed < 0:
+            raise ValueError("needs --episodes ≥ 1, --steps ≥ 10 and --seed ≥ 0")
+        presets = list(dict.fromkeys(options.noise.split(",")))
+        for preset in presets:
+            if preset not in NOISE_PRESETS:
+                raise unknown_name("noise preset", preset, NOISE_PRESETS)
+    except ValueError as error:
+        print(f"training.studies.calibrate: {error}", file=sys.stderr)
+        return 2
+    try:
+        for preset in presets:
+            print(f"driving {preset} …", file=sys.stderr)
+            results[preset] = compare(preset, episodes=options.episodes, steps=options.steps, seed=options.seed)
+    except KeyboardInterrupt:
+        print("training.studies.calibrate: interrupted", file=sys.stderr)
+        return 130
+    print(json.dumps(results) if options.json else table(results))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,298 @@
+"""``mecanum complexity``: how long one step of an estimator takes, against the number of landmarks in its map.
+
+The landmarks stand one a square metre however many there are, so that the robot, which drives in their midst,
+always sees as many: what grows is the map that it does not see. ``docs/consistency.md`` has what was measured.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.blas import dsyrk
+
+import slam
+from slam.backend import Backend
+from slam.formats import atomic_write
+from slam.geometry import wrap
+from slam.motion import move
+from slam.types import Observations, Odometry
+from training.figures.charts import Axis, Line, draw_chart, png
+from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
+from training.runs.errors import BadInput, bad_input
+
+__all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
+
+Array = NDArray[np.float64]
+Job = tuple[str, int, int]  # backend or REFERENCE, landmarks, steps
+Point = dict[str, float | None]
+
+FILES = ("complexity.json", "complexity.png")
+SEEN = 10
+"""Landmarks observed in one step."""
+REFERENCE = "blas"
+"""For comparison: P − WᵀW of a W of 2 · SEEN rows by BLAS, P of the size of the joint covariance, float64."""
+REPEATS = 10
+_POINTS = "points"
+_MOST_LANDMARKS = 2000  # the joint covariance of so many takes 130 MB
+_DT, _SPEED, _TURN = 0.1, 0.3, 0.2
+_SIGMAS = np.array([0.02, math.radians(1.0)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What was asked for, checked."""
+
+    backends: tuple[str, ...]
+    landmarks: tuple[int, ...]
+    steps: int
+
+    @classmethod
+    def parse(cls, *, slam: str, landmarks: str, steps: int) -> Plan:
+        """Check options as typed; :class:`BadInput` says what is allowed."""
+        with bad_input():
+            backends = tuple(backend_names(slam))
+            words = [word.strip() for word in landmarks.split(",")]
+            sizes = sorted({int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 9})
+            if not all(w.isascii() and w.isdigit() for w in words):
+                raise ValueError(f"--landmarks {landmarks!r} are no numbers; give for instance 25,50,100")
+            if not sizes or sizes[0] < SEEN or sizes[-1] > _MOST_LANDMARKS or any(len(w) > 8 for w in words):
+                raise ValueError(f"--landmarks must each be in {SEEN} … {_MOST_LANDMARKS}, got {landmarks!r}")
+        return cls(backends=backends, landmarks=tuple(sizes), steps=steps)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what every point depends on."""
+        return {
+            "version": installed_version(), "steps": self.steps, "repeats": REPEATS, "seen": SEEN,
+            "reference": "dsyrk",
+        }  # fmt: skip
+
+    def jobs(self) -> list[Job]:
+        """Return every point to measure, the reference among them."""
+        return [(name, n, self.steps) for n in self.landmarks for name in (*self.backends, REFERENCE)]
+
+
+# ---- one point -------------------------------------------------------------------------------------------------
+
+
+def run_job(job: Job) -> Point:
+    """Measure one point: the median over the steps, the least of :data:`REPEATS` such [µs].
+
+    ``us_per_step`` of predict and observe together, ``us_predict``, and ``us_correction`` of the stacked update
+    alone, which the EKFs have (null elsewhere). The reference has the first only.
+    """
+    name, landmarks, steps = job
+    if name == REFERENCE:
+        return {"us_per_step": _time_reference(landmarks), "us_predict": None, "us_correction": None}
+    backend = slam.make(name, config={"lidar_offset_m": 0.0})
+    world = _landmarks(landmarks)
+    drive = _record(world, steps * REPEATS)
+    _map_everything(backend, world, drive[0][2])
+    backend.predict(drive[0][0])  # compiles what is still to be compiled
+    backend.observe(drive[0][1])
+    _map_everything(backend, world, drive[0][2])
+    rows = _time_steps(backend, drive, _watch_correction(backend))
+    medians = np.median(rows.reshape(REPEATS, steps, 3), axis=1)
+    whole, predict, correction = (1e6 * float(v) for v in medians.min(axis=0))
+    return {"us_per_step": whole, "us_predict": predict, "us_correction": correction or None}
+
+
+def _landmarks(count: int) -> Array:
+    """Return points ``(count, 2)`` [m] about the origin, one a square metre."""
+    rng = np.random.default_rng(count)
+    side = math.ceil(math.sqrt(count))
+    cells = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) - 0.5 * (side - 1)
+    nearest = np.argsort(np.hypot(cells[:, 0], cells[:, 1]), kind="stable")[:count]
+    return np.asarray(cells[nearest] + rng.uniform(-0.3, 0.3, (count, 2)))
+
+
+def _record(world: Array, steps: int) -> list[tuple[Odometry, Observations, Array]]:
+    """Drive a circle of 1.5 m; return each step's odometry, :data:`SEEN` nearest landmarks, and pose before it."""
+    rng = np.random.default_rng(0)
+    pose, twist = np.array([0.0, -_SPEED / _TURN, 0.0]), np.array([_SPEED, 0.0, _TURN])
+    out = []
+    for _ in range(steps):
+        before, pose = pose, move(pose, twist, _DT)
+        odometry = Odometry(twist * (1.0 + 0.01 * rng.standard_normal(3)), _DT)
+        distance = np.hypot(*(world - pose[:2]).T)
+        out.append((odometry, _observe(world, np.argsort(distance, kind="stable")[:SEEN], pose, rng), before))
+    return out
+
+
+def _observe(world: Array, ids: NDArray[np.int64], pose: Array, rng: np.random.Generator) -> Observations:
+    dx, dy = (world[ids] - pose[:2]).T
+    seen = np.column_stack([np.hypot(dx, dy), np.arctan2(dy, dx) - pose[2]])
+    seen += _SIGMAS * rng.standard_normal(seen.shape)
+    seen[:, 1] = wrap(seen[:, 1])
+    return Observations(seen, np.repeat(np.diag(_SIGMAS**2)[None], len(ids), axis=0), ids)
+
+
+def _map_everything(backend: Backend, world: Array, pose: Array) -> None:
+    """Have every landmark in the map, each by one observation from the start."""
+    backend.reset(pose)
+    rng = np.random.default_rng(1)
+    for begin in range(0, len(world), SEEN):
+        backend.observe(_observe(world, np.arange(begin, min(begin + SEEN, len(world))), pose, rng))
+
+
+def _watch_correction(backend: Backend) -> Callable[[], float]:
+    """Time an EKF's stacked update by standing in for its method; return what gives the last one's time [s]."""
+    took = [0.0]
+    inner = getattr(backend, "_correct", None)
+    if inner is not None and backend.belief.joint_cov is not None:
+
+        def timed(*args: Any) -> Any:
+            begin = time.perf_counter()
+            out = inner(*args)
+            took[0] = time.perf_counter() - begin
+            return out
+
+        backend._correct = timed  # type: ignore[attr-defined]
+    return lambda: took[0]
+
+
+def _time_steps(
+    backend: Backend, drive: Sequence[tuple[Odometry, Observations, Array]], correction: Callable[[], float]
+) -> Array:
+    """Return per step the time of all of it, of ``predict``, and of the correction ``(steps, 3)`` [s]."""
+    clock = time.perf_counter
+    rows = np.empty((len(drive), 3))
+    for row, (odometry, observations, _) in zip(rows, drive, strict=True):
+        begin = clock()
+        backend.predict(odometry)
+        middle = clock()
+        backend.observe(observations)
+        row[:] = clock() - begin, middle - begin, correction()
+    return rows
+
+
+def _time_reference(landmarks: int) -> float:
+    """Return how long BLAS takes for P ← P − WᵀW by `dsyrk` [µs]."""
+    n = 3 + 2 * landmarks
+    w = np.asfortranarray(1e-3 * np.random.default_rng(0).standard_normal((2 * SEEN, n)))
+    p = np.asfortranarray(np.eye(n))
+    medians = []
+    for _ in range(REPEATS):
+        times = []
+        for _ in range(100):
+            begin = time.perf_counter()
+            dsyrk(-1.0, w, beta=1.0, c=p, trans=1, overwrite_c=1)  # one triangle, in place
+            times.append(time.perf_counter() - begin)
+        medians.append(float(np.median(times)))
+    return 1e6 * min(medians)
+
+
+# ---- all of them -----------------------------------------------------------------------------------------------
+
+
+def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
+    """Measure the points that ``out`` does not hold yet, one at a time; write and return ``complexity.json``.
+
+    Raises
+    ------
+    BadInput
+        For a folder that cannot be used, or a backend that takes no observations.
+    Interrupted
+        On Ctrl-C; running it again goes on.
+    """
+    settings = plan.settings()
+    check_settings(out, settings, FILES)
+    for name in plan.backends:
+        _check_observes(name)
+    write_settings(out, settings)
+    folder = out / _POINTS
+    folder.mkdir(exist_ok=True)
+    points: dict[Job, Point] = {}
+    for job in plan.jobs():
+        kept = _load(_file(folder, job))
+        if kept is not None:
+            points[job] = kept
+
+    def keep(job: Job, point: Point) -> None:
+        atomic_write(_file(folder, job), json.dumps(point) + "\n")
+        points[job] = point
+
+    missing = [job for job in plan.jobs() if job not in points]
+    run_all(missing, run_job, workers=1, keep=keep, what="points", apart=True)
+    result: dict[str, Any] = {}
+    for name in (*plan.backends, REFERENCE):
+        rows = [{"landmarks": n, **points[name, n, plan.steps]} for n in plan.landmarks]
+        times = [float(row["us_per_step"] or 0.0) for row in rows]
+        result[name] = {"times": rows, "exponent": exponent(plan.landmarks, times)}
+    result["config"] = settings
+    atomic_write(out / "complexity.json", json.dumps(result, indent=1) + "\n")
+    atomic_write(out / "complexity.png", png(_chart(plan, result)))
+    return result
+
+
+def exponent(landmarks: Sequence[int], times: Sequence[float]) -> float | None:
+    """Return b of the power law a · nᵇ that fits the logarithms best; None of fewer than two points."""
+    if len(landmarks) < 2:
+        return None
+    return float(np.polyfit(np.log(landmarks), np.log(times), 1)[0])
+
+
+def _file(folder: Path, job: Job) -> Path:
+    return folder / f"{job[0]}-{job[1]}.json"
+
+
+def _load(path: Path) -> Point | None:
+    """Return a point as it was kept; None where it is not there or damaged, and so to be measured again."""
+    try:
+        point = json.loads(path.read_text("utf-8"))
+        return {name: None if point[name] is None else float(point[name]) for name in _KEYS}
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
+_KEYS = ("us_per_step", "us_predict", "us_correction")
+
+
+def _check_observes(name: str) -> None:
+    """Refuse a backend that takes scans only."""
+    backend = slam.make(name, config={"lidar_offset_m": 0.0})
+    world = _landmarks(SEEN)
+    try:
+        _map_everything(backend, world, np.zeros(3))
+    except (NotImplementedError, TypeError, ValueError) as error:
+        raise BadInput(f"--slam {name} takes no landmark observations ({error}); leave it out") from error
+
+
+# ---- what the user sees ----------------------------------------------------------------------------------------
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return the times per step [µs] as a table, and the EKFs' corrections against the reference."""
+    rows = {name: row for name, row in result.items() if name != "config"}
+    sizes = [point["landmarks"] for point in rows[REFERENCE]["times"]]
+    lines = [f"{'µs per step, landmarks':<26}" + "".join(f"{n:>9}" for n in sizes) + f"{'exponent':>10}"]
+    for name, row in rows.items():
+        fit = row["exponent"]
+        ends = f"{'-' if fit is None else f'{fit:.2f}':>10}"
+        lines.append(f"{name:<26}" + _cells([p["us_per_step"] for p in row["times"]]) + ends)
+        corrections = [p["us_correction"] for p in row["times"]]
+        if all(corrections):
+            ratios = [c / p["us_per_step"] for c, p in zip(corrections, rows[REFERENCE]["times"], strict=True)]
+            lines.append(f"{'  its stacked update':<26}" + _cells(corrections))
+            lines.append(f"{'  that over ' + REFERENCE:<26}" + _cells(ratios))
+    return "\n".join(lines)
+
+
+def _cells(values: Sequence[float]) -> str:
+    return "".join(f"{v:>9.1f}" for v in values)
+
+
+def _chart(plan: Plan, result: dict[str, Any]) -> NDArray[np.uint8]:
+    lines = [
+        Line(name, plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], dots=True)
+        for name in (*plan.backends, REFERENCE)
+    ]
+    title = f"Time per step: predict, and observe {SEEN} of n landmarks"
+    return draw_chart(lines, title=title, x=Axis("landmarks n", log=True), y=Axis("µs", log=True))

@@ -1,0 +1,286 @@
+"""``mecanum consistency``: is the error as large as the covariance says? NEES and NIS over Monte-Carlo runs.
+
+In a :mod:`training.studies.circle_world`, where nothing but the filter can be wrong, or in generated rooms,
+explored by the nearest-frontier agent. ``docs/consistency.md`` has the equations and what was measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import slam
+from mecanum_env import MAX_EPISODE_STEPS
+from mecanum_env import rooms as room_registry
+from mecanum_env.config import NOISE_PRESETS, NoiseConfig
+from slam.backend import Backend
+from slam.formats import atomic_write, replacing
+from slam.metrics.measures import anees, nees_band
+from slam.settings import unknown_name
+from training.figures.charts import Axis, Line, draw_chart, png
+from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
+from training.runs.errors import BadInput, bad_input
+from training.studies.circle_world import WORLDS, drive
+
+__all__ = ["Plan", "Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
+
+Array = NDArray[np.float64]
+Job = tuple[str, str, int, int, float]  # backend, rooms, seed, steps, noise
+Record = dict[str, Array]  # of each step (steps,): "nees", "nis", "dof"
+
+FILES = ("consistency.json", "consistency.png")
+AGENT = "nearest-frontier"
+_RUNS = "runs"  # the folder of what each run left
+_IDLE_STEPS = 20  # an agent without a goal for so long has nothing left to do
+_SCALED = ("range_sigma_m", "dropout", "encoder", "radius_error", "base_error", "slip")
+_NOT_HERE = {"truth": "is given the pose, so there is nothing to be consistent about"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What was asked for, checked."""
+
+    backends: tuple[str, ...]
+    rooms: str
+    runs: int
+    steps: int  # of each run, at most
+    noise: float  # times the noise of the world, or of the nominal robot
+    seed0: int
+
+    @classmethod
+    def parse(cls, *, slam: str, rooms: str, runs: int, steps: int | None, noise: float, seed0: int) -> Plan:
+        """Check options as typed; :class:`BadInput` says what is allowed."""
+        with bad_input():
+            backends = tuple(backend_names(slam, without=_NOT_HERE))
+            if rooms not in WORLDS and rooms not in room_registry.names():
+                raise unknown_name("rooms", rooms, (*WORLDS, *room_registry.names()))
+            if not (math.isfinite(noise) and noise > 0):
+                raise ValueError(f"--noise must be a finite number above 0, got {noise}")
+            if rooms not in WORLDS:
+                scaled_noise(noise)
+        if steps is None:
+            steps = WORLDS[rooms].steps if rooms in WORLDS else MAX_EPISODE_STEPS
+        return cls(backends=backends, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0)
+
+    def settings(self) -> dict[str, Any]:
+        """Return what every run depends on, whatever its backend and seed."""
+        out: dict[str, Any] = {
+            "version": installed_version(), "rooms": self.rooms, "steps": self.steps, "noise": self.noise,
+        }  # fmt: skip
+        if self.rooms in WORLDS:
+            return out | {"world": WORLDS[self.rooms].scaled(self.noise).settings()}
+        return out | {"agent": AGENT, "noise_config": dataclasses.asdict(scaled_noise(self.noise))}
+
+    def jobs(self) -> list[Job]:
+        """Return every run, all backends on one seed before the next seed."""
+        seeds = range(self.seed0, self.seed0 + self.runs)
+        return [(name, self.rooms, seed, self.steps, self.noise) for seed in seeds for name in self.backends]
+
+
+def scaled_noise(scale: float) -> NoiseConfig:
+    """Return the nominal noise, all of it times ``scale``; the floor's friction is left as it is."""
+    nominal = NOISE_PRESETS["nominal"]
+    return dataclasses.replace(nominal, **{name: scale * getattr(nominal, name) for name in _SCALED})
+
+
+# ---- one run ---------------------------------------------------------------------------------------------------
+
+
+def run_job(job: Job) -> Record:
+    """Do one run; return its NEES, its NIS and the NIS's degrees of freedom at each step ``(steps,)``.
+
+    NIS is nan for a backend that has none.
+    """
+    name, rooms, seed, steps, noise = job
+    rows = _in_world(name, rooms, seed, steps, noise) if rooms in WORLDS else _in_rooms(*job)
+    values = np.array(rows, np.float64).reshape(-1, 3)
+    return {"nees": values[:, 0], "nis": values[:, 1], "dof": values[:, 2]}
+
+
+def _row(backend: Backend, true_pose: Array) -> tuple[float, float, float]:
+    dof = float(getattr(backend, "nis_dof", 0))
+    return backend.pose_nees(true_pose), float(getattr(backend, "nis", math.nan)) if dof else math.nan, dof
+
+
+def _in_world(name: str, rooms: str, seed: int, steps: int, noise: float) -> list[tuple[float, float, float]]:
+    world = WORLDS[rooms].scaled(noise)
+    backend = slam.make(name, config=world.backend_settings())
+    rows = []
+    for step in drive(world, backend, seed, steps):
+        nees, nis, dof = _row(backend, step.true_pose)
+        # The backend still tells of its last observation where there was none in this step.
+        rows.append((nees, nis, dof) if len(step.observations.range_bearing) else (nees, math.nan, 0.0))
+    return rows
+
+
+def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> list[tuple[float, float, float]]:
+    """Explore until the agent has nothing left to do, or the steps are used up."""
+    import gymnasium
+
+    import agents
+    from mecanum_env.env import ExploreEnv
+
+    wrapped = gymnasium.make(
+        "mecanum_env:mecanum_env/Explore-v0", rooms=rooms, slam=name,
+        noise=dataclasses.asdict(scaled_noise(noise)), config={"coverage_target": 1.0}, max_episode_steps=steps,
+        disable_env_checker=True,
+    )  # fmt: skip
+    observation, _ = wrapped.reset(seed=seed)
+    env = wrapped.unwrapped
+    assert isinstance(env, ExploreEnv)
+    config = env.config
+    agent = agents.make(AGENT, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    agent.reset(env.belief, seed)
+    rows, idle, done = [], 0, False
+    while not done and idle < _IDLE_STEPS:
+        action = agent.act(observation, env.belief)
+        idle = idle + 1 if agent.goal is None else 0
+        observation, _, terminated, truncated, info = wrapped.step(action)
+        done = terminated or truncated
+        rows.append(_row(env.backend, info["true_pose"]))
+    wrapped.close()
+    return rows
+
+
+# ---- all of them -----------------------------------------------------------------------------------------------
+
+
+def consistency(plan: Plan, *, out: Path, workers: int) -> dict[str, Any]:
+    """Do the runs that ``out`` does not hold yet, write ``consistency.json`` and ``.png``, return the former.
+
+    Raises
+    ------
+    BadInput
+        For a folder that cannot be used, or a backend that takes no observations.
+    Interrupted
+        On Ctrl-C; running it again goes on.
+    """
+    settings = plan.settings()
+    check_settings(out, settings, FILES)
+    if plan.rooms in WORLDS:
+        for name in plan.backends:
+            _check_observes(name, plan.rooms)
+    write_settings(out, settings)
+    folder = out / _RUNS
+    folder.mkdir(exist_ok=True)
+    records: dict[Job, Record] = {}
+    for job in plan.jobs():
+        kept = _load(_file(folder, job))
+        if kept is not None:
+            records[job] = kept
+
+    def keep(job: Job, record: Record) -> None:
+        with replacing(_file(folder, job)) as path, path.open("wb") as file:
+            np.savez_compressed(file, **record)  # type: ignore[arg-type]
+        records[job] = record
+
+    run_all([job for job in plan.jobs() if job not in records], run_job, workers=workers, keep=keep)
+    groups = {name: [records[job] for job in plan.jobs() if job[0] == name] for name in plan.backends}
+    result: dict[str, Any] = {name: summarise(group) for name, group in groups.items()}
+    result["config"] = settings | {"seeds": [plan.seed0, plan.seed0 + plan.runs - 1]}
+    atomic_write(out / "consistency.json", json.dumps(result, indent=1) + "\n")
+    atomic_write(out / "consistency.png", png(_chart(plan, groups)))
+    return result
+
+
+def summarise(records: Sequence[Record]) -> dict[str, Any]:
+    """Return a backend's figures from its runs.
+
+    ``anees_pose`` is the mean over the steps of the Monte-Carlo average of NEES / 3 (null where that is not
+    finite), ``fraction_in_band`` the share of the steps whose average lies in ``band``, the 95 % band of so many
+    runs (at each step: of those that go on), ``nis_mean`` all NIS over all degrees of freedom (null: no NIS).
+    """
+    averages, lows, highs = _averages(records)
+    defined = [(float(np.nansum(r["nis"])), float(r["dof"][~np.isnan(r["nis"])].sum())) for r in records]
+    nis, dof = (sum(column) for column in zip(*defined, strict=True))
+    low, high = nees_band(3, len(records))
+    mean = float(averages.mean())
+    return {
+        "anees_pose": mean if math.isfinite(mean) else None,
+        "fraction_in_band": float(np.mean((averages >= lows) & (averages <= highs))),
+        "nis_mean": nis / dof if dof else None,
+        "runs": len(records),
+        "steps": len(averages),
+        "band": [low, high],
+    }
+
+
+def _averages(records: Sequence[Record]) -> tuple[Array, Array, Array]:
+    """Return per step the average NEES / 3 over the runs, and its band.
+
+    Counted as long as at least half the runs go on; the others' ends would leave the average to a few.
+    """
+    lengths = [len(r["nees"]) for r in records]
+    steps = int(np.median(lengths))
+    values = np.full((len(records), steps), np.nan)
+    for row, record in zip(values, records, strict=True):
+        row[: len(record["nees"])] = record["nees"][:steps]
+    going_on = [sum(length > k for length in lengths) for k in range(steps)]
+    bands = {runs: nees_band(3, runs) for runs in set(going_on)}
+    low, high = np.array([bands[runs] for runs in going_on]).T
+    return anees(values, axis=0), low, high
+
+
+def _file(folder: Path, job: Job) -> Path:
+    return folder / f"{job[0]}-{job[2]}.npz"
+
+
+def _load(path: Path) -> Record | None:
+    """Return a run as it was kept; None where it is not there or damaged, and so to be done again."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            record = {name: np.asarray(file[name], np.float64) for name in ("nees", "nis", "dof")}
+    except Exception:  # a damaged archive can raise almost anything
+        return None
+    return record if len({r.shape for r in record.values()}) == 1 and record["nees"].ndim == 1 else None
+
+
+def _check_observes(name: str, rooms: str) -> None:
+    """Refuse a backend that takes scans only where there are none."""
+    world = WORLDS[rooms]
+    try:
+        for _ in drive(world, slam.make(name, config=world.backend_settings()), 0, 2):
+            pass
+    except (NotImplementedError, TypeError, ValueError) as error:
+        raise BadInput(
+            f"--slam {name} takes no landmark observations ({error}); give --rooms {room_registry.names()[0]}"
+        ) from error
+
+
+# ---- what the user sees ----------------------------------------------------------------------------------------
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return the figures as a table."""
+    lines = [f"{'backend':<16}{'NEES / 3':>10}{'in 95 % band':>14}{'NIS / dof':>11}{'runs':>6}{'steps':>7}"]
+    for name, row in result.items():
+        if name == "config":
+            continue
+        mean, nis = row["anees_pose"], row["nis_mean"]
+        lines.append(
+            f"{name:<16}{'inf' if mean is None else f'{mean:.3f}':>10}{100 * row['fraction_in_band']:>12.0f} %"
+            f"{'-' if nis is None else f'{nis:.3f}':>11}{row['runs']:>6}{row['steps']:>7}"
+        )
+    low, high = next(iter(result.values()))["band"]
+    lines.append(f"ideal 1; the average of a step lies in [{low:.2f}, {high:.2f}] with 95 % if consistent")
+    return "\n".join(lines)
+
+
+def _chart(plan: Plan, groups: dict[str, list[Record]]) -> NDArray[np.uint8]:
+    averages = {name: _averages(group)[0] for name, group in groups.items()}
+    highest = max(float(np.max(v[np.isfinite(v)], initial=0.0)) for v in averages.values())
+    title = f"Pose NEES / 3, average of {plan.runs} runs: {plan.rooms}, noise × {plan.noise:g}"
+    axis = Axis("1 is consistent, above it too sure; green: 95 % band", log=True) if highest > 10 else Axis(
+        "1 is consistent, above it too sure; green: 95 % band", low=0.0
+    )  # fmt: skip
+    lines = [Line(name, np.arange(1, len(v) + 1), v, px=1) for name, v in averages.items()]
+    last = max(len(v) for v in averages.values())
+    return draw_chart(lines, title=title, x=Axis("step", low=0.0, high=last), y=axis, band=nees_band(3, plan.runs))

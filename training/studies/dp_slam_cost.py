@@ -1,0 +1,180 @@
+"""What the maps of DP-SLAM's particles cost: the shared grid beside a grid copied for every particle.
+
+``python -m training.studies.dp_slam_cost --out DIR`` records one drive in a generated room, replays it to
+``dp-slam`` with more and more particles, with either kind of map, and writes ``dp_slam_cost.json``, ``memory.png``
+and ``time.png``. Both kinds are the same filter, bit for bit; the last poses are compared to show it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+import agents
+import mecanum_env
+from mecanum_env.env import ExploreEnv
+from mecanum_env.rooms import registry as room_registry
+from mecanum_env.sensing.calibration import backend_settings
+from slam.dp_slam import DpSlam, DpSlamConfig
+from slam.formats import atomic_write
+from slam.particles.shared_grid import SharedGrid
+from slam.settings import from_mapping, unknown_name
+from slam.types import Odometry, Scan
+from training.figures.charts import Axis, Line, draw_chart, png
+from training.runs.errors import BadInput, check_writable
+
+__all__ = ["cost", "main", "record"]
+
+Drive = list[tuple[Odometry, Scan]]
+
+_FILES = ("dp_slam_cost.json", "memory.png", "time.png")
+_KINDS = ("shared", "copies")
+
+
+def record(rooms: str, *, seed: int, steps: int) -> tuple[Drive, dict[str, Any]]:
+    """Drive with the true pose given; return what the sensors said, and the settings of a backend for it."""
+    mecanum_env.register_envs()
+    env = cast("ExploreEnv", gym.make("mecanum_env/Explore-v0", rooms=rooms, slam="truth").unwrapped)
+    observation, _ = env.reset(seed=seed)
+    agent = agents.make("nearest-frontier")
+    agent.reset(env.belief)
+    drive: Drive = [(env.odometry, env.scan)]
+    for _ in range(steps):
+        observation, _, terminated, _, _ = env.step(agent.act(observation, env.belief))
+        drive.append((env.odometry, env.scan))
+        if terminated:
+            break
+    return drive, backend_settings(env.config)
+
+
+def cost(
+    drive: Drive, settings: dict[str, Any], particles: list[int], *, limit_mb: float, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Replay a drive with every number of particles and both kinds of maps.
+
+    Returns
+    -------
+    list
+        Per number: ``particles``, ``updates`` and per kind ``mb`` (most that the maps took), ``ms_per_update`` and
+        ``last_pose``; ``copies`` is ``None`` where it would take more than ``limit_mb``. ``shared`` also has
+        ``nodes`` (most at once), and ``entries``.
+    """
+    # Compiled before anything is timed.
+    for copies in (False, True):
+        _replay(drive[: len(drive) // 4], settings, 2, copies=copies, seed=seed)
+    out: list[dict[str, Any]] = []
+    for n in particles:
+        print(f"{n} particles", file=sys.stderr)
+        shared = _replay(drive, settings, n, copies=False, seed=seed)
+        needs = n * shared.pop("cells") * 16 / 2**20
+        row: dict[str, Any] = {"particles": n, "updates": shared.pop("updates"), "shared": shared, "copies": None}
+        if needs <= limit_mb:
+            copied = _replay(drive, settings, n, copies=True, seed=seed)
+            row["copies"] = {key: copied[key] for key in ("mb", "ms_per_update", "last_pose")}
+        row["copies_mb"] = needs
+        out.append(row)
+    return out
+
+
+def _replay(drive: Drive, settings: dict[str, Any], particles: int, *, copies: bool, seed: int) -> dict[str, Any]:
+    config = from_mapping(DpSlamConfig, {**settings, "particles": particles, "copies": copies})
+    backend = DpSlam(config)
+    backend.reset(seed=seed)
+    spent, updates, most, nodes = 0.0, 0, 0, 0
+    for odometry, scan in drive:
+        backend.predict(odometry)
+        before = len(backend.path)
+        began = time.perf_counter()
+        backend.update(scan)
+        took = time.perf_counter() - began
+        if len(backend.path) > before:
+            spent, updates = spent + took, updates + 1
+        most = max(most, backend.grids.nbytes)
+        if isinstance(backend.grids, SharedGrid):
+            nodes = max(nodes, len(backend.grids.ancestry.nodes))
+    rows, cols = backend.grids.lattice.shape
+    found: dict[str, Any] = {
+        "mb": most / 2**20, "ms_per_update": 1e3 * spent / max(updates, 1), "last_pose": backend.pose.tolist(),
+        "updates": updates, "cells": rows * cols,
+    }  # fmt: skip
+    if isinstance(backend.grids, SharedGrid):
+        found |= {"nodes": nodes, "entries": backend.grids.live}
+    return found
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    parser = argparse.ArgumentParser(prog="python -m training.studies.dp_slam_cost", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--particles", default="50,100,200,500,1000")
+    parser.add_argument("--rooms", default="apartment")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--limit-mb", type=float, default=1000.0, help="copies that need more are left out")
+    options = parser.parse_args(argv)
+    try:
+        particles = _numbers(options.particles)
+        if options.rooms not in room_registry.names():
+            raise BadInput(str(unknown_name("rooms", options.rooms, room_registry.names())))
+        check_writable(options.out, _FILES)
+    except BadInput as error:
+        print(error, file=sys.stderr)
+        return 2
+    drive, settings = record(options.rooms, seed=options.seed, steps=options.steps)
+    rows = cost(drive, settings, particles, limit_mb=options.limit_mb, seed=options.seed)
+    _write(options.out, rows, {"rooms": options.rooms, "seed": options.seed, "steps": len(drive) - 1})
+    print(table(rows))
+    return 0
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        found = sorted({int(part) for part in text.split(",")})
+    except ValueError:
+        found = []
+    if not found or found[0] < 1:
+        raise BadInput(f"--particles takes whole numbers from 1 on, separated by commas; got {text!r}")
+    return found
+
+
+def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:
+    x = [row["particles"] for row in rows]
+    out.mkdir(parents=True, exist_ok=True)
+    for name, key, label in (("memory", "mb", "MB"), ("time", "ms_per_update", "ms")):
+        lines = [
+            Line(kind, x, [np.nan if row[kind] is None else row[kind][key] for row in rows], dots=True)
+            for kind in _KINDS
+        ]
+        if key == "mb":
+            lines.append(Line("copies, computed", x, [row["copies_mb"] for row in rows], px=1))
+        chart = draw_chart(
+            lines, title=f"Maps of the particles: {'memory' if key == 'mb' else 'time per update'}",
+            x=Axis("particles", log=True), y=Axis(label, log=True),
+        )  # fmt: skip
+        atomic_write(out / f"{name}.png", png(chart))
+    atomic_write(out / "dp_slam_cost.json", json.dumps({"run": run, "rows": rows}, indent=1) + "\n")
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Return the figures as a table."""
+    lines = [f"{'particles':>9}{'nodes':>8}{'shared MB':>12}{'copies MB':>12}{'shared ms':>12}{'copies ms':>12}"]
+    for row in rows:
+        shared, copied = row["shared"], row["copies"]
+        copies_mb = f"{copied['mb']:.0f}" if copied else f"({row['copies_mb']:.0f})"
+        copies_ms = f"{copied['ms_per_update']:.1f}" if copied else "-"
+        lines.append(
+            f"{row['particles']:>9}{shared['nodes']:>8}{shared['mb']:>12.1f}{copies_mb:>12}"
+            f"{shared['ms_per_update']:>12.1f}{copies_ms:>12}"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

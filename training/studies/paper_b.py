@@ -1,0 +1,256 @@
+"""Paper B's claims as plots (theory.md B, points 1, 2 and 6), in the circle world.
+
+``python -m training.studies.paper_b --out DIR`` follows one run of the EKFs, with the start uncertain by 10 cm,
+and one of each FastSLAM, and writes ``determinants.png``, ``variances.png``, ``correlations.png``,
+``particles.png`` and ``paper_b.json``. What the figures mean: ``docs/consistency.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import slam
+from slam.backend import Backend
+from slam.formats import atomic_write
+from training.figures.charts import Axis, Line, draw_chart, png
+from training.runs.errors import BadInput, check_writable
+from training.studies.circle_world import WORLDS, LandmarkWorld, drive
+
+__all__ = ["floor_of", "follow_filter", "follow_particles", "main", "paper_b"]
+
+Array = NDArray[np.float64]
+
+_START_SIGMA_M = 0.1  # a start known exactly would leave landmarks no floor but zero
+_UNCERTAIN_HEADING = math.radians(2.0)
+_PARTICLE_BACKENDS = ("fastslam1", "fastslam2")
+_SMOOTHED = 25  # steps that N_eff is averaged over in the chart
+_FILES = ("determinants.png", "variances.png", "correlations.png", "particles.png", "paper_b.json")
+
+
+# ---- claims 1 and 2: the joint Gaussian ------------------------------------------------------------------------
+
+
+def follow_filter(backend: Backend, world: LandmarkWorld, *, seed: int, steps: int) -> dict[str, Array]:
+    """Drive once; return how the map's covariance goes, from the step in which every landmark is in it.
+
+    Returns
+    -------
+    dict
+        ``step`` ``(k,)``; ``log_det`` of the map ``(k,)``; ``pair_log_det`` of every pair of landmarks
+        ``(k, pairs)``; ``sigma`` of each landmark ``(k, n)`` [m], root of half the trace, by the landmarks' order
+        in the world; ``correlation`` of the pairs, the mean over x and y ``(k, pairs)``; ``distance_sigma`` of
+        the pairs' distances ``(k, pairs)`` [m].
+    """
+    n = len(world.landmarks)
+    first, second = np.triu_indices(n, 1)
+    rows: dict[str, list[Any]] = {name: [] for name in _ROWS}
+    for k, _ in enumerate(drive(world, backend, seed, steps), start=1):
+        if backend.landmark_count < n:
+            continue
+        belief = backend.belief
+        order = np.argsort(belief.landmark_ids)
+        index = (3 + 2 * order[:, None] + np.arange(2)).ravel()
+        assert belief.joint_cov is not None
+        cov = belief.joint_cov[np.ix_(index, index)]  # (2n, 2n)
+        blocks = cov.reshape(n, 2, n, 2).transpose(0, 2, 1, 3)  # (n, n, 2, 2)
+        cross = blocks[first, second]
+        top = np.concatenate([blocks[first, first], cross], axis=2)
+        bottom = np.concatenate([cross.transpose(0, 2, 1), blocks[second, second]], axis=2)
+        variances = np.diagonal(blocks[np.arange(n), np.arange(n)], axis1=1, axis2=2)  # (n, 2)
+        scale = np.sqrt(variances[first] * variances[second])
+        points = belief.landmarks[order]
+        along = points[first] - points[second]
+        along /= np.hypot(along[:, 0], along[:, 1])[:, None]
+        between = blocks[first, first] + blocks[second, second] - cross - cross.transpose(0, 2, 1)
+        rows["step"].append(k)
+        rows["log_det"].append(np.linalg.slogdet(cov)[1])
+        rows["pair_log_det"].append(np.linalg.slogdet(np.concatenate([top, bottom], axis=1))[1])
+        rows["sigma"].append(np.sqrt(0.5 * variances.sum(axis=1)))
+        rows["correlation"].append((np.diagonal(cross, axis1=1, axis2=2) / scale).mean(axis=1))
+        rows["distance_sigma"].append(np.sqrt(np.einsum("ni,nij,nj->n", along, between, along)))
+    if not rows["step"]:
+        raise BadInput(f"--steps {steps} are too few for the robot to see every landmark; give 200 or more")
+    return {name: np.array(values, np.float64) for name, values in rows.items()}
+
+
+_ROWS = ("step", "log_det", "pair_log_det", "sigma", "correlation", "distance_sigma")
+
+
+def floor_of(world: LandmarkWorld) -> Array:
+    """Return the σ ``(n,)`` [m] that no landmark can fall below: that of the frame in which it is mapped.
+
+    A landmark seen without noise at the start would have the covariance G P₀ Gᵀ, G = [I, J (m − p₀)].
+    """
+    away = world.landmarks - world.path(0)[0][:2]
+    heading = world.start_sigma_rad**2 * np.sum(away**2, axis=1)
+    return np.asarray(np.sqrt(world.start_sigma_m**2 + 0.5 * heading))
+
+
+def _figures(rows: dict[str, Array], world: LandmarkWorld) -> dict[str, float]:
+    """Return what the claims come down to in numbers."""
+    floor = floor_of(world)
+    return {
+        "steps_with_all_landmarks": len(rows["step"]),
+        "log_det_first": float(rows["log_det"][0]),
+        "log_det_last": float(rows["log_det"][-1]),
+        "log_det_largest_increase": _largest_increase(rows["log_det"]),
+        "pair_log_det_largest_increase": _largest_increase(rows["pair_log_det"]),
+        "landmark_sigma_over_floor_first_max": float((rows["sigma"][0] / floor).max()),
+        "landmark_sigma_over_floor_last_max": float((rows["sigma"][-1] / floor).max()),
+        "landmark_sigma_over_floor_last_min": float((rows["sigma"][-1] / floor).min()),
+        "correlation_first_min": float(rows["correlation"][0].min()),
+        "correlation_last_min": float(rows["correlation"][-1].min()),
+        "distance_sigma_last_median_m": float(np.median(rows["distance_sigma"][-1])),
+        "landmark_sigma_last_median_m": float(np.median(rows["sigma"][-1])),
+    }
+
+
+def _largest_increase(values: Array) -> float:
+    """Return the largest rise from one step to the next ``(k, …)``; negative: everything fell at every step."""
+    return float(np.diff(values, axis=0).max()) if len(values) > 1 else 0.0
+
+
+# ---- claim 6: particles ----------------------------------------------------------------------------------------
+
+
+def follow_particles(backend: Backend, world: LandmarkWorld, *, seed: int, steps: int) -> dict[str, Array]:
+    """Drive once; return N_eff and the number of surviving ancestors at each step ``(steps,)``."""
+    rows = [
+        (float(getattr(backend, "n_eff", math.nan)), float(getattr(backend, "ancestors", math.nan)))
+        for _ in drive(world, backend, seed, steps)
+    ]
+    n_eff, ancestors = np.array(rows).T
+    return {"n_eff": n_eff, "ancestors": ancestors}
+
+
+def _particle_figures(rows: dict[str, Array]) -> dict[str, float | int | None]:
+    one = np.flatnonzero(rows["ancestors"] <= 1)
+    return {
+        "n_eff_mean": float(rows["n_eff"].mean()),
+        "n_eff_min": float(rows["n_eff"].min()),
+        "ancestors_last": float(rows["ancestors"][-1]),
+        "steps_until_one_ancestor": int(one[0]) + 1 if len(one) else None,
+    }
+
+
+# ---- all of it -------------------------------------------------------------------------------------------------
+
+
+def paper_b(out: Path, *, seed: int = 0, steps: int | None = None) -> dict[str, Any]:
+    """Follow every filter, write the charts and ``paper_b.json``, and return the latter's contents."""
+    check_writable(out, _FILES)
+    circle = WORLDS["circle"]
+    steps = circle.steps if steps is None else steps
+    world = dataclasses.replace(circle, start_sigma_m=_START_SIGMA_M)
+    turned = dataclasses.replace(world, start_sigma_rad=_UNCERTAIN_HEADING)
+    result: dict[str, Any] = {"steps": steps, "seed": seed, "start_sigma_m": _START_SIGMA_M}
+    rows = follow_filter(_make("ekf", world), world, seed=seed, steps=steps)
+    result["ekf"] = _figures(rows, world)
+    charts = _filter_charts(rows, world)
+    for name in ("ekf", "invariant-ekf"):
+        if _registered(name):
+            followed = follow_filter(_make(name, turned), turned, seed=seed, steps=steps)
+            result[f"{name}, heading uncertain by 2°"] = _figures(followed, turned)
+    particles = {}
+    for name in _PARTICLE_BACKENDS:
+        if _registered(name):
+            particles[name] = follow_particles(_make(name, circle), circle, seed=seed, steps=steps)
+            result[name] = _particle_figures(particles[name])
+    if particles:
+        charts["particles.png"] = _particle_chart(particles)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, image in charts.items():
+        atomic_write(out / name, png(image))
+    atomic_write(out / "paper_b.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    return result
+
+
+def _make(name: str, world: LandmarkWorld) -> Backend:
+    return slam.make(name, config=world.backend_settings())
+
+
+def _registered(name: str) -> bool:
+    if name in slam.names():
+        return True
+    print(f"{name} is not registered: left out", file=sys.stderr)
+    return False
+
+
+def _filter_charts(rows: dict[str, Array], world: LandmarkWorld) -> dict[str, NDArray[np.uint8]]:
+    step, n = rows["step"], len(world.landmarks)
+    x = Axis("step", low=0.0, high=float(step[-1]))
+    # Pairs from the nearest neighbours on the ring to those across it.
+    first, second = np.triu_indices(n, 1)
+    chosen = [int(np.flatnonzero((first == 0) & (second == k))[0]) for k in (1, 2, 5, 10) if k < n]
+    names = [f"pair 0, {second[k]}" for k in chosen]
+    size = 2 * n
+    determinants = [Line(f"map (per dimension, {size})", step, rows["log_det"] / size)] + [
+        Line(name, step, rows["pair_log_det"][:, k] / 4) for name, k in zip(names, chosen, strict=True)
+    ]
+    sigmas = [Line("", step, rows["sigma"][:, k], colour=0, px=1) for k in range(n)]
+    sigmas.append(Line("floor: the start's 0.1 m", step, np.full(len(step), floor_of(world).max()), colour=1))
+    correlations = [
+        Line(name, step, 1.0 - rows["correlation"][:, k]) for name, k in zip(names, chosen, strict=True)
+    ]
+    log = "log det / dimension"
+    return {
+        "determinants.png": draw_chart(
+            determinants, title="Determinants of the map and of pairs of landmarks fall", x=x, y=Axis(log)
+        ),
+        "variances.png": draw_chart(
+            sigmas, title="Landmarks' σ falls to a floor", x=x, y=Axis("σ [m]", low=0.0)
+        ),
+        "correlations.png": draw_chart(
+            correlations, title="Landmarks' correlation grows to 1", x=x, y=Axis("1 - correlation", log=True)
+        ),
+    }  # fmt: skip
+
+
+def _particle_chart(particles: dict[str, dict[str, Array]]) -> NDArray[np.uint8]:
+    lines = []
+    for k, (name, rows) in enumerate(particles.items()):
+        step = np.arange(1, len(rows["n_eff"]) + 1)
+        few = min(_SMOOTHED, len(step))
+        smooth = np.convolve(rows["n_eff"], np.full(few, 1.0 / few), mode="valid")
+        lines.append(Line(f"{name}: N_eff", step[few - 1 :], smooth, colour=2 * k))
+        lines.append(Line(f"{name}: ancestors", step, rows["ancestors"], colour=2 * k + 1))
+    last = float(max(len(rows["n_eff"]) for rows in particles.values()))
+    x, y = Axis("step", low=0.0, high=last), Axis(f"N_eff: mean of {_SMOOTHED} steps", log=True)
+    title = "Particles that count, and ancestors"
+    return draw_chart(lines, title=title, x=x, y=y)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the module's command line; return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m training.studies.paper_b", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/paper_b"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=None)
+    options = parser.parse_args(argv)
+    try:
+        if options.seed < 0 or (options.steps is not None and options.steps < 1):
+            raise BadInput("--seed must be at least 0 and --steps at least 1")
+        result = paper_b(options.out, seed=options.seed, steps=options.steps)
+    except BadInput as error:
+        print(f"training.studies.paper_b: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("training.studies.paper_b: interrupted before the results were written", file=sys.stderr)
+        return 130
+    print(json.dumps(result, indent=1, ensure_ascii=False))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,349 @@
+"""Other simulators under the same load, for ``mecanum speed --peer``: the same walls, beams and step, in turn.
+
+The peer runs in a process of its own (this module, started with ``-m``), which waits while our environment is
+timed and is timed while ours waits: whatever else the machine does slows both alike. It talks in lines of JSON.
+
+navground (https://idsia-robotics.github.io/navground) has mecanum kinematics, walls, noisy lidar and odometry,
+and a local grid map; it has neither the dynamics of wheels and motors nor SLAM, and its robot is a disc.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from slam.settings import unknown_name
+
+if TYPE_CHECKING:
+    from mecanum_env.config import EnvConfig
+    from mecanum_env.rooms import FloorPlan
+
+__all__ = ["PEERS", "ROUNDS", "Drive", "PeerProcess", "compare", "peer_setup", "require"]
+
+PEERS: dict[str, tuple[str, ...]] = {"navground": ("navground", "navground-learning")}
+"""Peers by name: the distributions that must be installed."""
+
+ROUNDS = 5
+"""How often each side is measured; odd, so that the median is a round that took place."""
+
+_MAP_CELLS = 200  # the peer's map is a square around the robot, of this many cells a side
+_WARM_UP_STEPS = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """One episode to measure: a room, and how many steps in it."""
+
+    seed: int
+    steps: int
+    plan: FloorPlan
+
+
+def require(peer: str) -> dict[str, str]:
+    """Return the versions of a peer's distributions; ``ValueError`` tells how to install what is missing."""
+    if peer not in PEERS:
+        raise unknown_name("peer", peer, PEERS)
+    try:
+        return {name: version(name) for name in PEERS[peer]}
+    except PackageNotFoundError as error:
+        raise ValueError(
+            f'{peer} is not installed ({error.name} is missing); run `pip install "mecanum-slam[peers]"`'
+        ) from error
+
+
+def peer_setup(config: EnvConfig) -> dict[str, Any]:
+    """Return, ready for JSON, what the peer is told of our environment; SI units.
+
+    Left to our side alone, for want of a counterpart: lost beams, the least range, errors of the wheels' radii
+    and lever, slip, and friction. The disc is the one around our footprint.
+    """
+    robot, lidar, noise = config.robot, config.lidar, config.noise
+    return {
+        "step_s": config.step_s,
+        "radius_m": robot.circumscribed_radius_m,
+        "lever_m": robot.lever_m,
+        "max_speed_m_s": robot.max_speed_m_s,
+        "max_turn_rate_rad_s": robot.max_turn_rate_rad_s,
+        "beams": lidar.beams,
+        "angle_min_rad": lidar.angle_min,
+        # navground's first and last beam lie at the ends of the field of view, on a full circle too.
+        "field_of_view_rad": lidar.angle_increment * (lidar.beams - 1),
+        "range_max_m": lidar.range_max_m,
+        "lidar_offset_m": lidar.offset_m,
+        "range_sigma_m": noise.range_sigma_m,
+        # Our encoders err by a share of the motion; theirs by a constant: the same at full speed.
+        "speed_sigma_m_s": noise.encoder * robot.max_speed_m_s,
+        "turn_rate_sigma_rad_s": noise.encoder * robot.max_turn_rate_rad_s,
+        "map_cells": _MAP_CELLS,
+        "map_resolution_m": config.grid_resolution_m,
+    }
+
+
+def compare(
+    peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float], rounds: int = ROUNDS
+) -> dict[str, Any]:
+    """Measure ours and the peer in turn; every round drives all of ``drives``, ours first.
+
+    Parameters
+    ----------
+    peer : str
+        A name in :data:`PEERS`.
+    config : EnvConfig
+        Our environment's; see :func:`peer_setup`.
+    drives : sequence of Drive
+        The rooms, and the steps in each.
+    ours : callable
+        Drives them once in our environment and returns its complete steps per second.
+    rounds : int
+        How often.
+
+    Returns
+    -------
+    dict
+        ``name``, ``versions``, the medians ``ours_steps_per_second`` and ``steps_per_second`` (the peer's),
+        ``ratio`` (ours over theirs), ``rounds`` (the same by round), ``steps`` a round and side, ``setup``.
+
+    Raises
+    ------
+    ValueError
+        If the peer is unknown or not installed.
+    RuntimeError
+        If the peer's process breaks down.
+    """
+    versions = require(peer)
+    setup = peer_setup(config)
+    measured: list[dict[str, float]] = []
+    with PeerProcess(setup, drives) as process:
+        for _ in range(rounds):
+            our_rate = ours()
+            measured.append({"ours": our_rate, "theirs": process.steps_per_second()})
+        ready = process.ready
+    our_median, their_median = (statistics.median(r[side] for r in measured) for side in ("ours", "theirs"))
+    return {
+        "name": peer,
+        "versions": versions,
+        "ours_steps_per_second": our_median,
+        "steps_per_second": their_median,
+        "ratio": our_median / their_median,
+        "rounds": measured,
+        "steps": sum(drive.steps for drive in drives),
+        "setup": setup | {"walls": ready["walls"], "discs": ready["discs"], "actions": "random"},
+    }
+
+
+class PeerProcess:
+    """The peer in its own process: a context manager that ends it.
+
+    Parameters
+    ----------
+    setup : dict
+        See :func:`peer_setup`.
+    drives : sequence of Drive
+        What every round drives.
+
+    Notes
+    -----
+    ``ready`` holds what the peer made of it: ``walls`` and ``discs`` (in the first room), and ``scan``, the
+    ranges [m] that its lidar measures at the first start.
+    """
+
+    def __init__(self, setup: dict[str, Any], drives: Sequence[Drive]) -> None:
+        episodes = [
+            {
+                "seed": drive.seed,
+                "steps": drive.steps,
+                "segments": drive.plan.segments.tolist(),
+                "circles": drive.plan.circles.tolist(),
+                "start": list(drive.plan.start),
+            }
+            for drive in drives
+        ]
+        self._load = {"setup": setup, "episodes": episodes}
+
+    def __enter__(self) -> PeerProcess:
+        # The child must find this very package, wherever it was started from.
+        root = str(Path(__file__).resolve().parents[2])
+        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "training.studies.peers"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            text=True,
+            encoding="utf-8",
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+        )
+        try:
+            self.ready = self._ask(self._load)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # It waits for a line and holds nothing worth keeping.
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with suppress(BrokenPipeError):
+                    stream.close()
+        self._errors.close()
+
+    def steps_per_second(self) -> float:
+        """Let the peer drive one round; return its complete steps per second."""
+        answer = self._ask("drive")
+        return float(answer["steps"] / answer["seconds"])
+
+    def _ask(self, message: object) -> dict[str, Any]:
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None and stdout is not None
+        with suppress(BrokenPipeError):  # it has ended: the empty answer below tells
+            stdin.write(json.dumps(message) + "\n")
+            stdin.flush()
+        line = stdout.readline()
+        if not line:
+            self._process.wait()
+            self._errors.seek(0)
+            said = [text.strip() for text in self._errors if text.strip()] or ["no message"]
+            raise RuntimeError(f"the peer's process ended with code {self._process.returncode}: {said[-1]}")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+# ---- in the peer's process ---------------------------------------------------------------------------------
+
+
+def _navground_env(setup: dict[str, Any], episodes: list[dict[str, Any]]) -> Any:
+    """Return navground_learning's Gymnasium environment: the rooms by seed, one mecanum robot, its sensors."""
+    import gymnasium
+
+    core, sim = (importlib.import_module(f"navground.{name}") for name in ("core", "sim"))
+    importlib.import_module("navground.learning.env")
+    learning = importlib.import_module("navground.learning.config")
+    rooms = {episode["seed"]: episode for episode in episodes}
+
+    def build(world: Any, seed: int | None) -> None:
+        room = rooms.get(seed, episodes[0])
+        for x1, y1, x2, y2 in room["segments"]:
+            world.add_wall(sim.Wall((x1, y1), (x2, y2)))
+        for x, y, radius in room["circles"]:
+            world.add_obstacle(sim.Obstacle((x, y), radius))
+        kinematics = core.kinematics.FourWheelsOmniDriveKinematics(setup["max_speed_m_s"], setup["lever_m"])
+        behavior = core.behaviors.DummyBehavior(kinematics, setup["radius_m"])
+        agent = sim.Agent(setup["radius_m"], behavior, kinematics, control_period=setup["step_s"])
+        agent.position, agent.orientation = room["start"][:2], room["start"][2]
+        world.add_agent(agent)
+
+    scenario = sim.Scenario()
+    scenario.add_init(build)
+    return gymnasium.make(
+        "navground",
+        scenario=scenario,
+        sensors=_navground_sensors(setup),
+        # As ours: a body twist, as fractions of the robot's limits.
+        action=learning.ControlActionConfig(
+            max_speed=setup["max_speed_m_s"], max_angular_speed=setup["max_turn_rate_rad_s"]
+        ),
+        observation=learning.DefaultObservationConfig(include_target_direction=False),
+        time_step=setup["step_s"],
+        terminate_if_idle=False,  # with no target to go to, the robot always counts as idle
+        include_action=False,  # the action of navground's own controller, which ours has no like of
+        max_episode_steps=max(episode["steps"] for episode in episodes) + 1,
+    )
+
+
+def _navground_sensors(setup: dict[str, Any]) -> list[dict[str, Any]]:
+    lidar = {
+        "type": "Lidar",
+        "name": "lidar",
+        "range": setup["range_max_m"],
+        "start_angle": setup["angle_min_rad"],
+        "field_of_view": setup["field_of_view_rad"],
+        "resolution": setup["beams"],
+        "error_std_dev": setup["range_sigma_m"],
+        "position": [setup["lidar_offset_m"], 0.0],
+    }
+    odometry = {
+        "type": "Odometry",
+        "name": "odometry",
+        "longitudinal_speed_std_dev": setup["speed_sigma_m_s"],
+        "transversal_speed_std_dev": setup["speed_sigma_m_s"],
+        "angular_speed_std_dev": setup["turn_rate_sigma_rad_s"],
+    }
+    grid_map = {
+        "type": "LocalGridMap",
+        "name": "map",
+        "external_lidars": ["lidar"],
+        "external_odometry": "odometry",
+        "width": setup["map_cells"],
+        "height": setup["map_cells"],
+        "resolution": setup["map_resolution_m"],
+        "footprint": "none",
+    }
+    return [lidar, odometry, grid_map]  # in the order in which each feeds on those before
+
+
+def _drive(env: Any, episodes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Drive every episode with random actions; return the steps and the seconds spent within them."""
+    clock = time.perf_counter
+    steps, seconds = 0, 0.0
+    for episode in episodes:
+        env.reset(seed=episode["seed"])
+        env.action_space.seed(episode["seed"])
+        for action in [env.action_space.sample() for _ in range(episode["steps"])]:
+            start = clock()
+            _, _, terminated, truncated, _ = env.step(action)
+            seconds += clock() - start
+            steps += 1
+            if terminated or truncated:  # a robot that has ended is not simulated: its steps would cost nothing
+                raise RuntimeError(f"navground ended the episode at step {steps}")
+    return {"steps": steps, "seconds": seconds}
+
+
+def _serve(requests: IO[str], answers: IO[str]) -> None:
+    """Answer line by line: first the load, then a round for each further line."""
+    load = json.loads(requests.readline())
+    episodes = load["episodes"]
+    env = _navground_env(load["setup"], episodes)
+    first = episodes[0]
+    observation, _ = env.reset(seed=first["seed"])
+    world = env.unwrapped._world  # no public way to look at what stands in it
+    answer: dict[str, Any] = {
+        "walls": len(world.walls),
+        "discs": len(world.obstacles),
+        "scan": observation["lidar/range"].tolist(),
+    }
+    _drive(env, [first | {"steps": min(_WARM_UP_STEPS, first["steps"])}])
+    print(json.dumps(answer), file=answers, flush=True)
+    for _ in requests:
+        print(json.dumps(_drive(env, episodes)), file=answers, flush=True)
+
+
+def _main() -> None:
+    # Answers go to the real standard output; what libraries print there goes to standard error.
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+    try:
+        _serve(sys.stdin, answers)
+    except BaseException as error:
+        print(f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
+        os._exit(1)
+    os._exit(0)  # navground's library may crash while the interpreter takes itself down
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,121 @@
+"""What an episode leaves behind: maps, trajectories, landmarks, configuration, metrics, and its report."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import cv2
+import tomli_w
+
+from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
+from slam.formats import atomic_write, write_map_server, write_tum
+from slam.landmarks.database import write_landmark_map
+from slam.settings import to_mapping
+from training.episodes.explore import ENDINGS, EXTRAS, Episode
+from training.episodes.recording import Recording
+from training.runs.running import interrupt_flag, versions
+from training.views.film import check_video
+from training.views.mcap_file import check_mcap, write_mcap
+from training.views.report_page import episode_page
+from training.views.rerun_file import check_rerun, write_rerun
+
+__all__ = ["check_extras", "config_text", "write_episode"]
+
+
+def check_extras(extras: Collection[str]) -> None:
+    """Raise :class:`training.runs.errors.BadInput` where what one of them needs is not installed."""
+    if "video" in extras:
+        check_video()
+    if "mcap" in extras:
+        check_mcap()
+    if "rerun" in extras:
+        check_rerun()
+
+
+def write_episode(
+    episode: Episode, recording: Recording, *, extras: Collection[str] = (), film: Path | None = None
+) -> dict[str, Any]:
+    """Write every file of an episode and return its metrics.
+
+    Of the extras those are written that need no more than the recording; the film, made while it ran, is moved to
+    its place. Extras not asked for are taken away: they would be another episode's.
+
+    The files are made in a folder beside their place and then renamed, one after the other, ``metrics.json`` last:
+    a run that fails while writing leaves the results of an earlier one as they were.
+    """
+    out = episode.out
+    out.mkdir(parents=True, exist_ok=True)
+    folder = Path(mkdtemp(prefix=".writing-", dir=out))
+    try:
+        with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
+            metrics = _write_into(folder, episode, recording, extras)
+            if film is not None:
+                film.replace(folder / EXTRAS["video"])
+            for name in ("metrics.json", *(file for extra, file in EXTRAS.items() if extra not in extras)):
+                (out / name).unlink(missing_ok=True)
+            for path in sorted(folder.iterdir(), key=lambda path: path.name == "metrics.json"):
+                path.replace(out / path.name)
+        return metrics
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:
+    env, record = episode.env, episode.env.truth.record
+    belief, times = env.belief, record.times
+    true_poses, estimates = record.true_poses, record.estimates
+    write_map_server(folder / "map", belief.grid)
+    write_tum(folder / "trajectory_true.tum", times, true_poses)
+    write_tum(folder / "trajectory_estimate.tum", times, estimates)
+    seen, angles = env.backend.landmark_details()
+    write_landmark_map(
+        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
+        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+        backend=episode.config.slam,
+    )  # fmt: skip
+    view = episode_view(env.truth.ground, belief)
+    robot, where = episode.config.robot, _place(episode)
+    who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
+    pictures = {
+        "map.png": draw_map(
+            belief, estimates, view=view, robot=robot,
+            title=f"{where}   {episode.config.slam}, {who}",
+        ),
+        "truth.png": draw_truth(env.truth.ground, true_poses, view=view, robot=robot, title=where),
+    }  # fmt: skip
+    for name, picture in pictures.items():
+        atomic_write(folder / name, cv2.imencode(".png", picture)[1].tobytes())
+    config, metrics = config_text(episode), episode.metrics()
+    atomic_write(folder / "config.toml", config)
+    page = episode_page(
+        env, recording, title=f"{where}: {who} on {episode.config.slam}",
+        metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
+        command="mecanum explore --config config.toml --out again",
+    )  # fmt: skip
+    atomic_write(folder / "report.html", page)
+    title = f"{where}, {who} on {episode.config.slam}"
+    if "mcap" in extras:
+        about = {"title": title, "config.toml": config}
+        write_mcap(recording, folder / EXTRAS["mcap"], robot=robot, lidar=episode.config.lidar, about=about)
+    if "rerun" in extras:
+        write_rerun(recording, folder / EXTRAS["rerun"], robot=robot, lidar=episode.config.lidar, name=title)
+    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    return metrics
+
+
+def config_text(episode: Episode) -> str:
+    """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
+    run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
+    run["versions"] = versions()
+    return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
+
+
+def _place(episode: Episode) -> str:
+    plan = episode.config.floor_plan
+    return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"

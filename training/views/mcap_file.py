@@ -1,0 +1,332 @@
+"""An episode as an MCAP file of ROS 2 messages, for Foxglove, RViz 2 and whatever else reads bags.
+
+Frames follow REP 105: ``map`` (the belief's, which is the start frame) → ``odom`` (dead reckoning) →
+``base_link`` → ``laser``, so that map → odom → base_link is the believed pose; the true one is ``base_link_true``.
+Axes and units follow REP 103, ranges REP 117. Time is the episode's own, from 0 s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.config import LidarConfig, RobotConfig
+from slam.formats import replacing
+from slam.geometry import compose, inverse, wrap
+from slam.motion import twist_between
+from training.episodes.playback import dead_reckoned, ellipses, map_origin, maps
+from training.episodes.recording import Recorded, Recording
+from training.runs.errors import BadInput
+from training.views.ros2_messages import Message, definition, encode
+
+__all__ = ["TOPICS", "check_mcap", "write_mcap"]
+
+Array = NDArray[np.float64]
+
+TOPICS = {
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/robot": "visualization_msgs/msg/MarkerArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/ground_truth": "nav_msgs/msg/Odometry",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/map": "nav_msgs/msg/OccupancyGrid",
+    "/landmarks": "visualization_msgs/msg/MarkerArray",
+    "/plan": "nav_msgs/msg/Path",
+}
+
+_LATCHED = ("/tf_static", "/robot", "/map", "/plan")
+_MAP_EVERY_S = 1.0
+_SIGMAS = 3.0
+_LEAST_AXIS_M = 0.02  # an ellipse smaller than this could not be seen
+_BODY_HEIGHT_M = 0.14
+_LANDMARK_HEIGHT_M = 0.02
+
+_SHAPES = {"CUBE": 1, "CYLINDER": 3}
+_ADD, _DELETE = 0, 2
+_BELIEVED, _TRUE, _LANDMARK = (0.17, 0.38, 0.80, 1.0), (0.09, 0.55, 0.44, 0.5), (0.70, 0.15, 0.50, 0.6)
+
+# A recorder's account of a publisher, in numbers as Humble has it. ``ros2 bag play`` offers the same again, and a
+# listener to static transforms hears none that were not offered as transient local (durability 1).
+_QOS = """\
+- history: 1
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline: {{sec: 9223372036, nsec: 854775807}}
+  lifespan: {{sec: 9223372036, nsec: 854775807}}
+  liveliness: 1
+  liveliness_lease_duration: {{sec: 9223372036, nsec: 854775807}}
+  avoid_ros_namespace_conventions: false
+"""
+# Without this record newer rosbag2 expects words in place of the numbers.
+_ROSBAG2 = ("rosbag2", {"ROS_DISTRO": "humble"})
+
+
+def check_mcap() -> None:
+    """Raise :class:`BadInput` where the library is missing, before an episode is run in vain."""
+    try:
+        import mcap.writer  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise BadInput(
+            f"--mcap needs mcap, and {error.name} is missing; install it with pip install 'mecanum-slam[ros]'"
+        ) from error
+
+
+def write_mcap(
+    recording: Recording,
+    path: str | Path,
+    *,
+    robot: RobotConfig,
+    lidar: LidarConfig,
+    about: Mapping[str, str] | None = None,
+) -> None:
+    """Write an episode as ROS 2 messages; docs/exports.md lists the topics.
+
+    Parameters
+    ----------
+    recording : Recording
+        The episode.
+    path : path
+        The file; written beside it and then renamed.
+    robot, lidar : config
+        Size of the body, and where the lidar is on it.
+    about : mapping, optional
+        What the file says of itself (agent, backend, seed, …), as the metadata record ``mecanum-slam``.
+
+    Raises
+    ------
+    BadInput
+        Where the package ``mcap`` is missing.
+    """
+    check_mcap()
+    from mcap.writer import Writer
+
+    with replacing(path) as temporary, open(temporary, "wb") as stream:
+        writer: Any = Writer(stream)
+        writer.start(profile="ros2", library="mecanum-slam")
+        writer.add_metadata(*_ROSBAG2)
+        if about:
+            writer.add_metadata("mecanum-slam", dict(about))
+        schemas: dict[str, int] = {}
+        channels: dict[str, int] = {}
+        for topic, datatype in TOPICS.items():
+            if datatype not in schemas:
+                schemas[datatype] = writer.register_schema(datatype, "ros2msg", definition(datatype).encode())
+            latched = topic in _LATCHED
+            qos = _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
+            channels[topic] = writer.register_channel(
+                topic, "cdr", schemas[datatype], {"offered_qos_profiles": qos}
+            )
+        for step, topic, message in _messages(recording, robot, lidar):
+            at = _nanoseconds(recording.times[step])
+            writer.add_message(channels[topic], at, encode(TOPICS[topic], message), at)
+        writer.finish()
+
+
+def _messages(recording: Recording, robot: RobotConfig, lidar: LidarConfig) -> Iterator[tuple[int, str, Message]]:
+    """Return every message with its step and topic, in order of time."""
+    yield 0, "/tf_static", {"transforms": [_transform("base_link", "laser", 0.0, [lidar.offset_m, 0.0, 0.0])]}
+    yield 0, "/robot", _robot(robot)
+    odom = dead_reckoned(recording)
+    noted = {
+        "/scan": _by_step(recording.scans),
+        "/landmarks": _by_step(recording.landmarks),
+        "/plan": _by_step(recording.goals),
+    }
+    maps_to_come = maps(recording, least_s=_MAP_EVERY_S)
+    map_step, classes = next(maps_to_come, (-1, None))
+    shown = 0
+    for step, time_s in enumerate(recording.times.tolist()):
+        yield from ((step, topic, message) for topic, message in _poses(recording, step, odom[step]))
+        if step in noted["/scan"]:
+            yield step, "/scan", _scan(recording, time_s, noted["/scan"][step])
+        if step == map_step:
+            yield step, "/map", _map(recording, time_s, classes)
+            map_step, classes = next(maps_to_come, (-1, None))
+        if step in noted["/landmarks"]:
+            rows = noted["/landmarks"][step]
+            yield step, "/landmarks", _landmarks(time_s, rows, shown)
+            shown = len(rows)
+        if step in noted["/plan"]:
+            yield step, "/plan", _plan(time_s, noted["/plan"][step])
+
+
+def _poses(recording: Recording, step: int, odom: Array) -> Iterator[tuple[str, Message]]:
+    """Return what is known of the pose at a step, each with its topic."""
+    time_s = float(recording.times[step])
+    believed, true = recording.estimates[step], recording.true_poses[step]
+    before = recording.true_poses[max(step - 1, 0)]
+    yield (
+        "/tf",
+        {
+            "transforms": [
+                _transform("map", "odom", time_s, compose(believed, inverse(odom))),
+                _transform("odom", "base_link", time_s, odom),
+                _transform("map", "base_link_true", time_s, true),
+            ]
+        },
+    )
+    yield "/odom", _odometry(time_s, "odom", "base_link", odom, recording.twists[step])
+    yield (
+        "/pose",
+        {
+            "header": _header(time_s, "map"),
+            "pose": {"pose": _pose(believed), "covariance": _covariance(recording.pose_covs[step])},
+        },
+    )
+    twist = twist_between(before, true, recording.step_s)
+    yield "/ground_truth", _odometry(time_s, "map", "base_link_true", true, twist)
+
+
+def _by_step(recorded: Recorded) -> dict[int, NDArray[np.generic]]:
+    return dict(zip(recorded.steps.tolist(), recorded.values, strict=True))
+
+
+# ---- messages --------------------------------------------------------------------------------------------------
+
+
+def _scan(recording: Recording, time_s: float, ranges: NDArray[np.generic]) -> Message:
+    scan = recording.scan
+    return {
+        "header": _header(time_s, "laser"),
+        "angle_min": scan.angle_min,
+        "angle_max": scan.angle_min + (len(ranges) - 1) * scan.angle_increment,
+        "angle_increment": scan.angle_increment,
+        "time_increment": 0.0,  # all beams at once
+        "scan_time": recording.step_s,
+        "range_min": scan.range_min,
+        "range_max": scan.range_max,
+        "ranges": ranges,
+    }
+
+
+def _map(recording: Recording, time_s: float, classes: NDArray[np.int8] | None) -> Message:
+    assert classes is not None
+    x, y = map_origin(recording)
+    return {
+        "header": _header(time_s, "map"),
+        "info": {
+            "map_load_time": _stamp(time_s),
+            "resolution": recording.resolution,
+            "width": classes.shape[1],
+            "height": classes.shape[0],
+            "origin": _pose([x, y, 0.0]),
+        },
+        "data": classes.ravel(),  # UNKNOWN, FREE and OCCUPIED are the values that ROS gives them
+    }
+
+
+def _plan(time_s: float, path: NDArray[np.generic]) -> Message:
+    """Return the way ahead, each pose looking along it."""
+    points = np.asarray(path, np.float64)
+    header = _header(time_s, "map")
+    along = np.diff(points, axis=0, append=points[-1:])
+    headings = np.arctan2(along[:, 1], along[:, 0])
+    headings[-1:] = headings[-2:-1] if len(points) > 1 else 0.0
+    poses = np.column_stack([points, headings])
+    return {"header": header, "poses": [{"header": header, "pose": _pose(p)} for p in poses]}
+
+
+def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
+    """Return a flat cylinder for each landmark's 3σ ellipse; of those ``shown`` the rest go."""
+    axes, directions = ellipses(rows, _SIGMAS)
+    size = np.maximum(2.0 * axes, _LEAST_AXIS_M)
+    markers = [
+        {
+            **_marker(k, "landmarks", "CYLINDER", _LANDMARK, "map", time_s),
+            "pose": _pose([x, y, direction]),
+            "scale": {"x": width, "y": height, "z": _LANDMARK_HEIGHT_M},
+        }
+        for k, (x, y, direction, width, height) in enumerate(
+            np.column_stack([rows[:, :2], directions, size]).tolist()
+        )
+    ]
+    gone = [
+        {"header": _header(time_s, "map"), "ns": "landmarks", "id": k, "action": _DELETE}
+        for k in range(len(rows), shown)
+    ]
+    return {"markers": markers + gone}
+
+
+def _robot(robot: RobotConfig) -> Message:
+    """Return the body where it is believed to be and where it is, both moving along with their frames."""
+    return {
+        "markers": [
+            {
+                **_marker(k, "robot", "CUBE", colour, frame, 0.0),
+                "pose": _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M),
+                "scale": {"x": robot.length_m, "y": robot.width_m, "z": _BODY_HEIGHT_M},
+                "frame_locked": True,
+            }
+            for k, (frame, colour) in enumerate((("base_link", _BELIEVED), ("base_link_true", _TRUE)))
+        ]
+    }
+
+
+def _marker(
+    number: int, name: str, kind: str, colour: tuple[float, ...], frame: str, time_s: float
+) -> dict[str, Any]:
+    return {
+        "header": _header(time_s, frame),
+        "ns": name,
+        "id": number,
+        "type": _SHAPES[kind],
+        "action": _ADD,
+        "color": dict(zip("rgba", colour, strict=True)),
+    }
+
+
+def _odometry(time_s: float, frame: str, child: str, pose: Array, twist: Array) -> Message:
+    vx, vy, omega = twist.tolist()
+    return {
+        "header": _header(time_s, frame),
+        "child_frame_id": child,
+        "pose": {"pose": _pose(pose)},
+        "twist": {"twist": {"linear": {"x": vx, "y": vy}, "angular": {"z": omega}}},
+    }
+
+
+def _transform(parent: str, child: str, time_s: float, pose: Array | list[float]) -> Message:
+    placed = _pose(pose)
+    return {
+        "header": _header(time_s, parent),
+        "child_frame_id": child,
+        "transform": {"translation": placed["position"], "rotation": placed["orientation"]},
+    }
+
+
+def _pose(pose: Array | list[float], *, z: float = 0.0) -> dict[str, Any]:
+    x, y, theta = (float(v) for v in pose)
+    half = 0.5 * float(wrap(theta))
+    return {
+        "position": {"x": x, "y": y, "z": z},
+        "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
+    }
+
+
+def _covariance(cov: Array) -> Array:
+    """Return the covariance ``(36,)`` of x, y, z and the turns about them, of a planar pose's ``(3, 3)``."""
+    whole = np.zeros((6, 6))
+    planar = np.array([0, 1, 5])
+    whole[np.ix_(planar, planar)] = cov
+    return whole.ravel()
+
+
+def _header(time_s: float, frame: str) -> dict[str, Any]:
+    return {"stamp": _stamp(time_s), "frame_id": frame}
+
+
+def _stamp(time_s: float) -> dict[str, int]:
+    seconds, nanoseconds = divmod(_nanoseconds(time_s), 10**9)
+    return {"sec": seconds, "nanosec": nanoseconds}
+
+
+def _nanoseconds(time_s: float) -> int:
+    return round(float(time_s) * 1e9)

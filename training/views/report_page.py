@@ -1,0 +1,283 @@
+"""The report of an episode: one page that needs nothing else and replays the run in the browser.
+
+The page is put together from ``assets/episode.html``, ``.css`` and ``.js``. What it replays travels in it as
+arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to have
+``DecompressionStream`` (all major ones since spring 2023).
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.physics.robot import wheel_positions
+from mecanum_env.views.canvas import Canvas, View
+from mecanum_env.views.paint import paint_plan
+from mecanum_env.views.pictures import episode_view
+from slam.geometry import inverse
+from training.episodes.recording import Recorded, Recording
+from training.figures.page_style import STYLE
+
+if TYPE_CHECKING:
+    from mecanum_env.env import ExploreEnv
+
+__all__ = ["LOST", "NO_RETURN", "episode_page", "pack", "unpack"]
+
+_ASSETS = Path(__file__).parent / "assets"
+_TRUTH_PX = 1400  # of the true plan's longer side
+_MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
+_RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
+NO_RETURN, LOST = 253, 254  # … or is one of these
+_FAR = 0xFFFF  # how far the next changed cell is, where that takes more than 16 bits: so far, and on from there
+
+_WALL_CLOCK = {"decision_ms_median", "wall_time_s"}  # in metrics.json alone: one seed makes one page, bit for bit
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def episode_page(
+    env: ExploreEnv, recording: Recording, *, title: str, metrics: Mapping[str, Any], ending: str, config: str,
+    command: str,
+) -> str:  # fmt: skip
+    """Return the page.
+
+    Parameters
+    ----------
+    env : ExploreEnv
+        At the end of the episode: for the true plan, and what the robot is like.
+    recording : Recording
+        What happened.
+    title, ending, command : str
+        What was explored by whom, why it ended, and how to have it again.
+    metrics : mapping
+        As in ``metrics.json``.
+    config : str
+        The effective configuration as TOML.
+    """
+    header, arrays = pack(recording)
+    view = episode_view(env.truth.ground, env.belief, longest_px=_TRUTH_PX)
+    robot, lidar = env.config.robot, env.config.lidar
+    header |= {
+        "robot": {
+            "length": robot.length_m, "width": robot.width_m, "wheel": robot.wheel_radius_m,
+            "wheels": wheel_positions(robot).tolist(),
+        },
+        "lidar": {"offset": lidar.offset_m},
+        "truth": {"left": view.left, "top": view.top, "scale": view.scale, "png": _truth_png(env, view)},
+        "target": env.config.coverage_target,
+    }  # fmt: skip
+    parts = {
+        "TITLE": escape(title),
+        "ENDING": escape(ending),
+        "STYLE": STYLE + _asset("episode.css"),
+        "TILES": _tiles(metrics),
+        "METRICS": _metrics_table(metrics),
+        "COMMAND": escape(command),
+        "CONFIG": escape(config),
+        "HEADER": json.dumps(header).replace("</", "<\\/"),
+        "DATA": _deflated(header["arrays"], arrays),
+        "SCRIPT": _asset("episode.js"),
+    }
+    page = _asset("episode.html")
+    before, *pieces = page.split("{{")
+    return before + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces))
+
+
+# ---- the data --------------------------------------------------------------------------------------------------
+
+
+def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
+    """Return what the page replays: a header that JSON can hold, and arrays of numbers.
+
+    ``header["arrays"]`` lists name, type and length of the arrays in their order. What was noted now and then has
+    its steps in ``*_step`` and how many values belong to each in ``*_count``.
+
+    - Each row: ``true`` and ``estimate`` (x, y, θ), ``cov`` (xx, xy, yy, θθ), ``coverage``, ``nees``,
+      ``collisions``; the time is the row's number times ``step_s``.
+    - ``scan``: ranges in 252nds of the lidar's reach, each less the one before it, modulo 256.
+    - ``landmark``: x, y [mm], semi-axes of the covariance (1σ) [0.1 mm], the longer's direction [°]; a table of
+      five rows, not columns: like stands beside like.
+    - ``map_gap``: how far each changed cell lies behind the one before it, row by row over the rectangle
+      ``map``; ``map_class`` what it is now.
+    """
+    landmarks = _thinned(recording.landmarks, _MOST_LANDMARKS)
+    scans = _thinned(recording.scans, _MOST_SCANS)
+    row0, col0, row1, col1 = recording.bounds()
+    gaps, classes, counts = _map_changes(recording.map_changes, (row0, col0), col1 - col0)
+    covs = recording.pose_covs
+    arrays: Arrays = {
+        "true": recording.true_poses.astype(np.float32),
+        "estimate": recording.estimates.astype(np.float32),
+        "cov": covs[:, (0, 0, 1, 2), (0, 1, 1, 2)].astype(np.float32),
+        "coverage": recording.coverage.astype(np.float32),
+        "nees": recording.nees.astype(np.float32),
+        "collisions": np.minimum(recording.collisions, 65535).astype(np.uint16),
+        "scan_step": scans.steps.astype(np.uint32),
+        "scan": _ranges(scans, recording.scan.range_max),
+        "goal_step": recording.goals.steps.astype(np.uint32),
+        "goal_count": _counts(recording.goals),
+        "goal": _joined(recording.goals, (0, 2)).astype(np.float32),
+        "landmark_step": landmarks.steps.astype(np.uint32),
+        "landmark_count": _counts(landmarks),
+        "landmark": _ellipses(_joined(landmarks, (0, 5))),
+        "map_step": recording.map_changes.steps.astype(np.uint32),
+        "map_count": counts,
+        "map_gap": gaps,
+        "map_class": classes,
+    }
+    header = {
+        "step_s": recording.step_s,
+        "rows": len(recording.times),
+        "beams": len(recording.scan.ranges),
+        "angle_min": recording.scan.angle_min,
+        "angle_increment": recording.scan.angle_increment,
+        "range_max": recording.scan.range_max,
+        "map": {
+            "row0": row0, "col0": col0, "rows": row1 - row0, "cols": col1 - col0,
+            "resolution": recording.resolution,
+        },
+        "arrays": [[name, array.dtype.name, array.size] for name, array in arrays.items()],
+    }  # fmt: skip
+    return header, arrays
+
+
+def unpack(header: Mapping[str, Any], data: str) -> Arrays:
+    """Return the arrays, flat, from the base64 text that the page holds: what its script does."""
+    raw, at, arrays = zlib.decompress(base64.b64decode(data)), 0, {}
+    for name, kind, size in header["arrays"]:
+        arrays[name] = np.frombuffer(raw, np.dtype(kind).newbyteorder("<"), size, at)
+        at += _padded(arrays[name].nbytes)
+    return arrays
+
+
+def _deflated(listed: list[list[Any]], arrays: Arrays) -> str:
+    """Return the arrays in base64, each beginning at a multiple of four bytes, as typed arrays have to."""
+    parts = []
+    for name, kind, _ in listed:
+        data = np.ascontiguousarray(arrays[name]).astype(np.dtype(kind).newbyteorder("<")).tobytes()
+        parts.append(data.ljust(_padded(len(data)), b"\0"))
+    return base64.b64encode(zlib.compress(b"".join(parts), 7)).decode()
+
+
+def _padded(size: int) -> int:
+    return -(-size // 4) * 4
+
+
+def _thinned(recorded: Recorded, most: int) -> Recorded:
+    """Return every second, third, … note, so that there are not more than so many; both ends stay."""
+    stride = max(math.ceil(len(recorded.steps) / (most - 1)), 1)
+    kept = sorted({0, *range(len(recorded.steps) - 1, -1, -stride)}) if len(recorded.steps) else []
+    return Recorded(recorded.steps[kept], tuple(recorded.values[k] for k in kept))
+
+
+def _counts(recorded: Recorded) -> NDArray[np.uint32]:
+    return np.array([len(value) for value in recorded.values], np.uint32)
+
+
+def _joined(recorded: Recorded, empty: tuple[int, ...]) -> NDArray[Any]:
+    return np.concatenate([np.zeros(empty, np.float32), *recorded.values])
+
+
+def _ranges(scans: Recorded, range_max: float) -> NDArray[np.uint8]:
+    ranges = np.array(scans.values, np.float64)
+    codes = np.full(ranges.shape, LOST, np.int64)
+    codes[np.isinf(ranges)] = NO_RETURN
+    known = np.isfinite(ranges)
+    codes[known] = np.rint(np.clip(ranges[known] / range_max, 0.0, 1.0) * _RANGE_STEPS)
+    return np.diff(codes, axis=1, prepend=0).astype(np.uint8)
+
+
+def _ellipses(landmarks: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Return ``(5, n)``: x, y [mm], semi-axes [0.1 mm], direction of the longer one [°]."""
+    x, y, xx, xy, yy = landmarks.astype(np.float64).T
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    axes = [np.sqrt(np.maximum(middle + sign * half, 0.0)) for sign in (1, -1)]
+    angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))
+    rows = [1e3 * x, 1e3 * y, *(1e4 * axis for axis in axes), angle]
+    return np.clip(np.rint(rows), -(2**31), 2**31 - 1).astype(np.int32)
+
+
+def _map_changes(
+    changes: Recorded, origin: tuple[int, int], cols: int
+) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint32]]:
+    """Return the gaps between changed cells, their classes, and how many cells belong to each note.
+
+    A gap that takes more than 16 bits stands as ``_FAR`` as often as needed and the rest; within a note the cells
+    come by row, then column.
+    """
+    gaps: list[NDArray[np.int64]] = []
+    classes: list[NDArray[np.int64]] = []
+    for change in changes.values:
+        row, col, now = np.asarray(change, np.int64).T
+        index = (row - origin[0]) * cols + (col - origin[1])
+        order = np.argsort(index)
+        gap = np.diff(index[order], prepend=0)
+        times = gap // _FAR
+        if times.any():
+            spread = np.full(len(gap) + int(times.sum()), _FAR, np.int64)
+            spread[np.cumsum(times + 1) - 1] = gap % _FAR
+            gap = spread
+        gaps.append(gap)
+        classes.append(now[order])
+    return (
+        np.concatenate([np.zeros(0), *gaps]).astype(np.uint16),
+        (np.concatenate([np.zeros(0), *classes]) + 1).astype(np.uint8),
+        np.array([len(c) for c in classes], np.uint32),
+    )
+
+
+# ---- the page --------------------------------------------------------------------------------------------------
+
+
+def _truth_png(env: ExploreEnv, view: View) -> str:
+    image = np.empty((view.height, view.width, 3), np.uint8)
+    ground = env.truth.ground
+    paint_plan(Canvas(image, view), ground.plan, inverse(ground.start))
+    return base64.b64encode(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()).decode()
+
+
+def _asset(name: str) -> str:
+    return (_ASSETS / name).read_text("utf-8")
+
+
+def _tiles(metrics: Mapping[str, Any]) -> str:
+    """Return what one asks first."""
+    anees = metrics["anees"]
+    tiles = [
+        ("coverage", _number(metrics["coverage"], 100.0, 1), "%"),
+        ("time", _number(metrics["time_s"], 1.0, 1), "s"),
+        ("to 95 %", _number(metrics["time_to_95_s"], 1.0, 1), "s"),
+        ("path", _number(metrics["path_length_m"], 1.0, 1), "m"),
+        ("collisions", str(metrics["collisions"]), ""),
+        ("ATE", _number(metrics["ate_rmse_m"], 100.0, 1), "cm"),
+        ("NEES / 3", _number(anees, 1.0, 2), ""),
+        ("walls, IoU", _number(metrics["map_iou"], 1.0, 3), ""),
+    ]
+    return "".join(
+        f"<div><dt>{name}</dt><dd>{value}<small>{'' if value == '–' else unit}</small></dd></div>"
+        for name, value, unit in tiles
+    )
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return "–" if value is None else f"{factor * value:.{digits}f}"
+
+
+def _metrics_table(metrics: Mapping[str, Any]) -> str:
+    rows = []
+    for name, value in metrics.items():
+        if name in _WALL_CLOCK:
+            continue
+        text = "–" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+        rows.append(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>")
+    return "".join(rows)
