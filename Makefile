@@ -77,11 +77,11 @@ monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo
 
 evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the test seeds
-	$(BIN)/python -m training.benchmark.evaluate --workers $(WORKERS) --out out/evaluate
+	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate
 
 benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (hours; goes on where it was broken off)
 	$(BIN)/mecanum benchmark --suite all --agents $(AGENTS) --workers $(WORKERS) --out out/benchmark --report
-	$(BIN)/python -m training.benchmark.leaderboard out/benchmark BENCHMARK.md
+	$(BIN)/mecanum study leaderboard out/benchmark BENCHMARK.md
 
 docs: $(VENV)/test.stamp ## the documentation as a site, in out/site
 	$(BIN)/python -m mkdocs build --strict --site-dir out/site

@@ -29,6 +29,7 @@ import mecanum_env
 import slam.registry
 from mecanum_env import rooms
 from mecanum_env.config import RewardConfig
+from training.cli.study import STUDIES, study_command
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -138,14 +139,11 @@ def test_commands_parse(page: Path) -> None:
     for line, words in command_lines(page):
         where = f"{page.name}:{line}: {shlex.join(words)}"
         if words[0] == "mecanum":
-            assert words[1] in cli().commands, where
-            command = cli().commands[words[1]]
+            command, arguments = command_of(words, where)
             try:
-                command.make_context(f"mecanum {words[1]}", words[2:])  # parses, and does not run
+                command.make_context(words[1], arguments)  # parses, and does not run
             except Exception as error:
                 raise AssertionError(f"{where}: {error}") from error
-        elif words[:2] == ["python", "-m"] and words[2].startswith("training"):
-            check_module_options(words[2], words[3:], where)
         elif words[0] == "python" and words[1] != "-m":
             assert (ROOT / words[1]).is_file(), where
         elif words[0] == "make":
@@ -157,15 +155,13 @@ def test_commands_parse(page: Path) -> None:
 
 @pytest.mark.parametrize("page", SOURCES, ids=names(SOURCES))
 def test_commands_in_the_text_have_options_that_exist(page: Path) -> None:
-    for span in re.findall(r"`((?:mecanum|python -m training|make)[ .][^`]*)`", prose(page)):
+    for span in re.findall(r"`((?:mecanum|make) [^`]*)`", prose(page)):
         words = span.split()
         where = f"{page.name}: {span}"
         if words[0] == "mecanum" and re.match(r"[a-z]", words[1]):
-            assert words[1] in cli().commands, where
-            known = {option for parameter in cli().commands[words[1]].params for option in parameter.opts}
-            assert {word for word in words if word.startswith("--")} <= known | {"--help"}, where
-        elif words[0] == "python":
-            check_module_options(words[2], words[3:], where)
+            command, arguments = command_of(words, where)
+            known = {option for parameter in command.params for option in parameter.opts}
+            assert {word for word in arguments if word.startswith("--")} <= known | {"--help"}, where
         elif words[0] == "make":
             assert is_target(words[1]), where
 
@@ -175,14 +171,20 @@ def is_target(name: str) -> bool:
     return re.search(rf"^{re.escape(name)}:", makefile, re.MULTILINE) is not None
 
 
-def check_module_options(module: str, words: list[str], where: str) -> None:
-    """Check that a module exists and that its source names the options that it is called with."""
-    path = ROOT.joinpath(*module.split(".")).with_suffix(".py")
-    assert path.is_file(), where
-    source = path.read_text(encoding="utf-8")
-    for word in words:
-        if word.startswith("--"):
-            assert f'"{word}"' in source, f"{where}: no {word}"
+def command_of(words: list[str], where: str) -> tuple[Any, list[str]]:
+    """Return the command that words of ``mecanum …`` start, a study's own if it is one, and its arguments."""
+    assert words[1] in cli().commands, where
+    if words[1] == "study" and len(words) > 2 and re.match(r"[a-z]", words[2]):
+        assert words[2] in STUDIES, where
+        return a_study(words[2]), words[3:]
+    return cli().commands[words[1]], words[2:]
+
+
+@cache
+def a_study(name: str) -> Any:
+    if name == "learned-tour":
+        pytest.importorskip("torch", reason="needs the extra `train`")
+    return study_command(name)
 
 
 # ---- what there is, is documented ------------------------------------------------------------------------------
@@ -198,6 +200,11 @@ def test_every_name_of_the_registries_is_documented() -> None:
     assert sorted(ids) == sorted(ENVIRONMENTS)
     for name in (*ids, *agents.names(), *slam.names(), *rooms.names()):
         assert f"`{name}`" in everything(), name
+
+
+def test_every_study_is_documented() -> None:
+    for name in STUDIES:
+        assert f"mecanum study {name}" in everything(), name
 
 
 def test_every_command_and_option_is_documented() -> None:

@@ -28,7 +28,7 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
     within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
     weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
-    ``python -m training.studies.calibrate`` measures V on the simulated robot.
+    ``mecanum study calibration`` measures V on the simulated robot.
     """
     white = noise.encoder**2 + noise.slip**2 / 3.0
     as_white = _PERSISTENCE * (noise.radius_error**2 / 3.0)

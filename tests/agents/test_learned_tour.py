@@ -288,9 +288,7 @@ def test_settings_are_checked():
 
 def test_its_policy_comes_with_where_it_is_from():
     network, about = load_station_policy(SHIPPED)
-    assert (
-        about["command"].startswith("python -m training.dungeons.training") and min(map(len, about["curves"])) > 1
-    )
+    assert about["command"].startswith("mecanum study learned-tour") and min(map(len, about["curves"])) > 1
     known, robot = rooms(1), (65, 65)
     found, visited = stop(known, robot)
     openings = options(found, LUCK, most=5, most_loss_m=40.0)

@@ -1,13 +1,12 @@
 """The README's accuracy table: episodes over seeds, rooms and backends, one row each, and their medians.
 
-``python -m training.benchmark.evaluate --seeds 10000:10049 --out results/episodes`` runs what is missing in
+``mecanum study accuracy --seeds 10000:10049 --out results/episodes`` runs what is missing in
 ``episodes.jsonl`` (a killed run goes on where it stopped), then writes ``episodes.csv`` and ``summary.json`` and
 prints the table.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
@@ -17,9 +16,10 @@ from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 import agents
 from mecanum_env.config import NOISE_PRESETS
@@ -29,9 +29,10 @@ from slam.metrics.measures import nees_band
 from slam.registry import config_type
 from slam.settings import unknown_name
 from training.episodes.room_pictures import parse_seeds
-from training.runs.errors import BadInput
+from training.runs.errors import bad_input
+from training.runs.options import Workers
 
-__all__ = ["consistency_figures", "evaluate", "main", "summarise"]
+__all__ = ["consistency_figures", "evaluate", "study", "summarise"]
 
 Job = tuple[str, str, int]  # rooms, backend, seed
 Row = dict[str, Any]
@@ -196,47 +197,36 @@ def _table(summaries: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def _check_names(options: argparse.Namespace) -> None:
+def _check_names(kinds: list[str], backends: list[str], agent: str, noise: str) -> None:
     """Raise ``ValueError`` for a name that is not registered, before any episode is run."""
-    for rooms in options.rooms.split(","):
-        check_rooms(rooms)
-    for backend in options.slam.split(","):
+    for kind in kinds:
+        check_rooms(kind)
+    for backend in backends:
         config_type(backend)
-    agents.check(options.agent)
-    if options.noise not in NOISE_PRESETS:
-        raise unknown_name("noise preset", options.noise, NOISE_PRESETS)
+    agents.check(agent)
+    if noise not in NOISE_PRESETS:
+        raise unknown_name("noise preset", noise, NOISE_PRESETS)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.benchmark.evaluate", description=__doc__)
-    parser.add_argument("--rooms", default="apartment,rectangular")
-    parser.add_argument("--slam", default="ekf,odometry,truth")
-    parser.add_argument("--agent", default="nearest-frontier")
-    parser.add_argument("--noise", default="nominal")
-    parser.add_argument("--seeds", default="10000:10049")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--out", type=Path, default=Path("results/episodes"))
-    options = parser.parse_args(argv)
-    try:
-        _check_names(options)
-        seeds = parse_seeds(options.seeds)
-        jobs = [(r, b, s) for r in options.rooms.split(",") for b in options.slam.split(",") for s in seeds]
-        rows = evaluate(jobs, agent=options.agent, noise=options.noise, workers=options.workers, out=options.out)
-    except KeyboardInterrupt:
-        print("interrupted; run the same command again to go on", file=sys.stderr)
-        return 130
-    except (BadInput, ValueError) as error:
-        print(f"training.benchmark.evaluate: {error}", file=sys.stderr)
-        return 2
+def study(
+    rooms: Annotated[
+        str, typer.Option(help="Generators of rooms, separated by commas.")
+    ] = "apartment,rectangular",
+    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf,odometry,truth",
+    agent: Annotated[str, typer.Option(help="Who explores.")] = "nearest-frontier",
+    noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
+    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")] = "10000:10049",
+    workers: Workers = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/accuracy"),
+) -> None:
+    """Explore over seeds, rooms and backends: one row each, and their medians."""
+    with bad_input():
+        _check_names(rooms.split(","), slam.split(","), agent, noise)
+        jobs = [(r, b, s) for r in rooms.split(",") for b in slam.split(",") for s in parse_seeds(seeds)]
+        rows = evaluate(jobs, agent=agent, noise=noise, workers=workers or os.cpu_count() or 1, out=out)
     summaries = summarise(rows)
     versions = {name: version(name) for name in ("mecanum-slam", "numpy", "numba", "pymunk", "gymnasium")}
     text = json.dumps({"versions": versions, "summaries": summaries}, indent=1)
-    atomic_write(options.out / "summary.json", text + "\n")
-    atomic_write(options.out / "episodes.csv", _csv(rows))
+    atomic_write(out / "summary.json", text + "\n")
+    atomic_write(out / "episodes.csv", _csv(rows))
     print(_table(summaries))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Put a benchmark's figures into a page: ``python -m training.benchmark.leaderboard RESULTS PAGE``.
+"""Put a benchmark's figures into a page: ``mecanum study leaderboard RESULTS PAGE``.
 
 ``RESULTS`` is the folder of ``mecanum benchmark``; of it ``summary.json`` is read. What stands in the page outside
 of the marks stays as it is.
@@ -6,18 +6,18 @@ of the marks stays as it is.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from slam.formats import atomic_write
 from training.benchmark.suites import SLIPPERY
 from training.runs.errors import BadInput
 
-__all__ = ["BEGIN", "END", "main", "tables", "update"]
+__all__ = ["BEGIN", "END", "study", "tables", "update"]
 
 BEGIN, END = "<!-- leaderboard -->", "<!-- end of the leaderboard -->"
 
@@ -154,24 +154,14 @@ def update(page: str, content: str) -> str:
     return f"{before}{begin}\n\n{content}\n{end}{after}"
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.benchmark.leaderboard", description=__doc__)
-    parser.add_argument("results", type=Path, help="folder of mecanum benchmark")
-    parser.add_argument("page", type=Path, help="Markdown page with the two marks")
-    options = parser.parse_args(argv)
+def study(
+    results: Annotated[Path, typer.Argument(help="Folder of a mecanum benchmark.")],
+    page: Annotated[Path, typer.Argument(help="Markdown page with the two marks.")],
+) -> None:
+    """Put a benchmark's figures into a page, between its two marks."""
     try:
-        summary = json.loads((options.results / "summary.json").read_text("utf-8"))
-        text = update(options.page.read_text("utf-8"), tables(summary))
-        atomic_write(options.page, text)
-    except (OSError, ValueError, KeyError, BadInput) as error:
-        what = (
-            error if isinstance(error, BadInput) else f"cannot read {options.results} or {options.page}: {error!r}"
-        )
-        print(f"training.benchmark.leaderboard: {what}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        summary = json.loads((results / "summary.json").read_text("utf-8"))
+        text = update(page.read_text("utf-8"), tables(summary))
+        atomic_write(page, text)
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInput(f"cannot read {results} or {page}: {error!r}") from error

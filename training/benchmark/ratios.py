@@ -2,24 +2,23 @@
 
 Means, not interquartile means: a rare large error counts. ::
 
-    python -m training.benchmark.ratios out/benchmark --suite apartments-slippery --agent active
+    mecanum study ratios out/benchmark --suite apartments-slippery --agent active
 """
 
 from __future__ import annotations
 
-import argparse
 import csv
-import sys
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from training.figures.statistics import Interval, interval
 from training.runs.errors import BadInput
 
-__all__ = ["main", "ratio", "table"]
+__all__ = ["ratio", "study", "table"]
 
 Array = NDArray[np.float64]
 
@@ -84,22 +83,10 @@ def _read(episodes: Path, suite: str) -> dict[str, dict[tuple[str, int], list[fl
     return values
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the table; return the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.benchmark.ratios", description=__doc__.splitlines()[0]
-    )
-    parser.add_argument("folder", type=Path, help="of a mecanum benchmark")
-    parser.add_argument("--suite", default="apartments-slippery")
-    parser.add_argument("--agent", default="active")
-    given = parser.parse_args(arguments)
-    try:
-        print(table(given.folder / "episodes.csv", given.suite, given.agent))
-    except BadInput as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def study(
+    folder: Annotated[Path, typer.Argument(help="Folder of a mecanum benchmark.")],
+    suite: Annotated[str, typer.Option(help="Suite whose rows are compared.")] = "apartments-slippery",
+    agent: Annotated[str, typer.Option(help="Who is compared with the others.")] = "active",
+) -> None:
+    """Compare one agent with the others on one suite: ratios of means over the same seeds."""
+    print(table(folder / "episodes.csv", suite, agent))

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from training.cli.options import Json
 from training.runs.errors import BadInput, suggestion
+from training.runs.options import Json
 
 __all__ = ["benchmark"]
 
@@ -86,7 +86,9 @@ def benchmark(
         assert maps is not None
         from training.dungeons import protocol as dungeons
 
-        names = [part.strip() for part in agents.split(",")]
+        names = [part.strip() for part in agents.split(",") if part.strip()]
+        if not names:
+            raise BadInput("--agents names none; give some, separated by commas")
         summary = dungeons.run_dungeons(maps, names, out=out, workers=workers or os.cpu_count() or 1, scan=scan)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return

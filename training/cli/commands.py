@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from training.cli.benchmark import benchmark
-from training.cli.options import Json
 from training.cli.play import play
 from training.cli.policy import policy
+from training.cli.study import study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, bad_input, one_line, suggestion
+from training.runs.options import Json
 
 if TYPE_CHECKING:
     from training.episodes.explore import Progress
@@ -351,6 +352,9 @@ app.command()(benchmark)
 app.command()(train)
 app.command()(play)
 app.command()(policy)
+app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})(
+    study
+)
 
 
 # ---- running it ------------------------------------------------------------------------------------------------

@@ -1,18 +1,16 @@
 """The dungeons protocol: path length of exploration on generated indoor maps, beside the published table.
 
-``python -m training.dungeons.protocol --maps DIR --agents nearest-frontier,tour --out DIR`` runs what is missing
+``mecanum benchmark --protocol dungeons --maps DIR --agents nearest-frontier,tour --out DIR`` runs what is missing
 in ``OUT/rows.jsonl`` (a killed run goes on where it stopped), then writes ``rows.csv`` and ``summary.json`` and
 prints the table. What an episode is stands in :mod:`training.dungeons.episode`.
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import math
 import statistics
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,9 +25,9 @@ from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import Dungeon, layout, load
 from training.runs.campaign import check_settings, installed_version, run_all, write_settings
-from training.runs.errors import BadInput, Interrupted, bad_input
+from training.runs.errors import BadInput, bad_input
 
-__all__ = ["PUBLISHED", "main", "run_dungeons", "summarise", "table"]
+__all__ = ["PUBLISHED", "run_dungeons", "summarise", "table"]
 
 Row = dict[str, Any]
 
@@ -236,33 +234,3 @@ def _csv(rows: Sequence[Row]) -> str:
 
     lines = [",".join(_COLUMNS), *(",".join(cell(row[name]) for name in _COLUMNS) for row in rows)]
     return "\n".join(lines) + "\n"
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.dungeons.protocol", description=__doc__)
-    parser.add_argument("--maps", type=Path, required=True, help="folder of PNG maps")
-    parser.add_argument(
-        "--agents",
-        default="nearest-frontier,tour,learned-tour",
-        help=f"names, separated by commas; {' and '.join(BOUNDS)} are bounds, {NEAREST_VIEW} and {NEAREST} rules",
-    )
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--scan", default="way-points", help=" or ".join(SCANS))
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON, nothing else")
-    options = parser.parse_args(argv)
-    names = [part.strip() for part in options.agents.split(",") if part.strip()]
-    try:
-        if not names:
-            raise BadInput("--agents names none; give some, separated by commas")
-        summary = run_dungeons(options.maps, names, out=options.out, workers=options.workers, scan=options.scan)
-    except (BadInput, Interrupted) as error:
-        print(f"training.dungeons.protocol: {error}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 130
-    print(json.dumps(summary) if options.json else table(summary))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

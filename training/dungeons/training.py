@@ -1,6 +1,6 @@
 """Training of ``learned-tour``: lessons on plans like the benchmark's, and a network that foresees them.
 
-``python -m training.dungeons.training --out DIR`` gathers lessons (plans of seeds 0 …, validated on others from
+``mecanum study learned-tour --out DIR`` gathers lessons (plans of seeds 0 …, validated on others from
 1000 on) in ``DIR/round-1``, driven by the tour, and trains. In the next round what was learned drives, and the
 network is trained anew on the lessons of both. It writes ``learned-tour.safetensors`` and ``.json``. A killed run
 goes on where it stopped: with the next plan, or after the last whole epoch.
@@ -8,7 +8,6 @@ goes on where it stopped: with the next plan, or after the last whole epoch.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import shlex
@@ -17,10 +16,11 @@ import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+import typer
 from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save
@@ -35,9 +35,8 @@ from training.dungeons.lessons import Lessons, gather, joined, read_lessons
 from training.dungeons.networks import StationNetwork
 from training.dungeons.plans import dungeon_plan
 from training.runs.campaign import check_settings, installed_version, write_settings
-from training.runs.errors import BadInput, Interrupted
 
-__all__ = ["Batch", "TrainingConfig", "batch_of", "main", "regret_m", "train", "turned"]
+__all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
 Floats = NDArray[np.float32]
 
@@ -260,34 +259,30 @@ def _resume(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer) ->
 # ---- the command -----------------------------------------------------------------------------------------------
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.dungeons.training", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="folder of the run")
-    for name, value in asdict(TrainingConfig()).items():
-        parser.add_argument(_option(name), type=type(value), default=value)
-    parser.add_argument("--workers", type=int, default=1, help="processes that gather lessons")
-    options = vars(parser.parse_args(argv))
-    out, workers = options.pop("out"), options.pop("workers")
-    try:
-        for name in ("rounds", "plans", "later_plans", "validation_plans", "epochs", "batch"):
-            if options[name] < 1:
-                raise BadInput(f"{_option(name)} must be at least 1, got {options[name]}")
-        if not 0 <= options["untold"] <= 1:
-            raise BadInput(f"--untold must be between 0 and 1, got {options['untold']}")
-        for name in ("plans", "later_plans"):
-            if options[name] > _VALIDATION:
-                raise BadInput(
-                    f"{_option(name)} must be at most {_VALIDATION}: those from there on are validated on"
-                )
-        if workers < 1:
-            raise BadInput(f"--workers must be at least 1, got {workers}")
-        run(out, TrainingConfig(**options), workers=workers)
-    except (BadInput, Interrupted, KeyboardInterrupt) as error:
-        print(f"training.dungeons.training: {error or 'interrupted; the same command goes on'}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 130
+def study(
+    out: Annotated[Path, typer.Option(help="Folder of the run.")],
+    rounds: Annotated[int, typer.Option(min=1, help="Of lessons, each driven by what was learned before.")] = 2,
+    plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the first round, seeds 0 ….")] = 1000,
+    later_plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the others, seeds 0 ….")] = 380,
+    validation_plans: Annotated[int, typer.Option(min=1, help=f"Seeds {_VALIDATION} ….")] = 60,
+    epochs: Annotated[int, typer.Option(min=1)] = 12,
+    batch: Annotated[int, typer.Option(min=1)] = 64,
+    rate: Annotated[float, typer.Option(help="Of learning.")] = 1.5e-3,
+    weight_decay: Annotated[float, typer.Option()] = 1e-2,
+    untold: Annotated[
+        float, typer.Option(min=0, max=1, help="Share of lessons that do not tell how far the plan extends.")
+    ] = 0.125,
+    free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that gather lessons.")] = 1,
+) -> None:
+    """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""
+    config = TrainingConfig(
+        rounds=rounds, plans=plans, later_plans=later_plans, validation_plans=validation_plans, epochs=epochs,
+        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, seed=seed,
+    )  # fmt: skip
+    run(out, config, workers=workers)
     print(out / _WEIGHTS)
-    return 0
 
 
 def _option(name: str) -> str:
@@ -318,7 +313,7 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     last = _VALIDATION + config.validation_plans - 1
     about: dict[str, Any] = {
         "format": FORMAT,
-        "command": shlex.join(["python", "-m", "training.dungeons.training", "--out", "OUT", *arguments]),
+        "command": shlex.join(["mecanum", "study", "learned-tour", "--out", "OUT", *arguments]),
         "config": asdict(config),
         "seeds": f"plans 0-{config.plans - 1}; validation {_VALIDATION}-{last}",
         "curves": curves,
@@ -332,7 +327,3 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
         for name, agent in (("tour", "tour"), ("learned-tour", str(out / _WEIGHTS)))
     }
     atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

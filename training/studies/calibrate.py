@@ -1,26 +1,27 @@
 """Odometry calibration: V as the simulated robot has it, beside V as its estimators are told.
 
-``python -m training.studies.calibrate`` drives each preset's robot over an open floor and prints both
+``mecanum study calibration`` drives each preset's robot over an open floor and prints both
 (:mod:`mecanum_env.sensing.odometry_calibration`, theory.md A).
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
 from mecanum_env.sensing.calibration import odometry_noise
 from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit
 from slam.motion import OdometryNoise
 from slam.settings import unknown_name
+from training.runs.errors import bad_input
+from training.runs.options import Json
 
-__all__ = ["compare", "main", "table"]
+__all__ = ["compare", "study", "table"]
 
 _TERMS = ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m")
 
@@ -71,38 +72,21 @@ def table(results: dict[str, dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.studies.calibrate", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--noise", default="nominal,slippery,cavity", help="presets, separated by commas")
-    parser.add_argument("--episodes", type=int, default=60)
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args(argv)
-    results = {}
-    try:
-        if options.episodes < 1 or options.steps < 10 or options.seed < 0:
-            raise ValueError("needs --episodes ≥ 1, --steps ≥ 10 and --seed ≥ 0")
-        presets = list(dict.fromkeys(options.noise.split(",")))
+def study(
+    noise: Annotated[str, typer.Option(help="Noise presets, separated by commas.")] = "nominal,slippery,cavity",
+    episodes: Annotated[int, typer.Option(min=1, help="Drives of a preset.")] = 60,
+    steps: Annotated[int, typer.Option(min=10, help="Of a drive.")] = 400,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    as_json: Json = False,
+) -> None:
+    """Calibrate odometry: V as the simulated robot has it, beside V as its estimators are told."""
+    presets = list(dict.fromkeys(noise.split(",")))
+    with bad_input():
         for preset in presets:
             if preset not in NOISE_PRESETS:
                 raise unknown_name("noise preset", preset, NOISE_PRESETS)
-    except ValueError as error:
-        print(f"training.studies.calibrate: {error}", file=sys.stderr)
-        return 2
-    try:
-        for preset in presets:
-            print(f"driving {preset} …", file=sys.stderr)
-            results[preset] = compare(preset, episodes=options.episodes, steps=options.steps, seed=options.seed)
-    except KeyboardInterrupt:
-        print("training.studies.calibrate: interrupted", file=sys.stderr)
-        return 130
-    print(json.dumps(results) if options.json else table(results))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    results = {}
+    for preset in presets:
+        print(f"driving {preset} …", file=sys.stderr)
+        results[preset] = compare(preset, episodes=episodes, steps=steps, seed=seed)
+    print(json.dumps(results) if as_json else table(results))

@@ -1,21 +1,21 @@
 """What the maps of DP-SLAM's particles cost: the shared grid beside a grid copied for every particle.
 
-``python -m training.studies.dp_slam_cost --out DIR`` records one drive in a generated room, replays it to
+``mecanum study dp-slam-cost --out DIR`` records one drive in a generated room, replays it to
 ``dp-slam`` with more and more particles, with either kind of map, and writes ``dp_slam_cost.json``, ``memory.png``
 and ``time.png``. Both kinds are the same filter, bit for bit; the last poses are compared to show it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 from pathlib import Path
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import gymnasium as gym
 import numpy as np
+import typer
 
 import agents
 import mecanum_env
@@ -25,12 +25,12 @@ from mecanum_env.sensing.calibration import backend_settings
 from slam.dp_slam import DpSlam, DpSlamConfig
 from slam.formats import atomic_write
 from slam.particles.shared_grid import SharedGrid
-from slam.settings import from_mapping, unknown_name
+from slam.settings import from_mapping
 from slam.types import Odometry, Scan
 from training.figures.charts import Axis, Line, draw_chart, png
-from training.runs.errors import BadInput, check_writable
+from training.runs.errors import BadInput, bad_input, check_writable
 
-__all__ = ["cost", "main", "record"]
+__all__ = ["cost", "record", "study"]
 
 Drive = list[tuple[Odometry, Scan]]
 
@@ -109,29 +109,23 @@ def _replay(drive: Drive, settings: dict[str, Any], particles: int, *, copies: b
     return found
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.studies.dp_slam_cost", description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--particles", default="50,100,200,500,1000")
-    parser.add_argument("--rooms", default="apartment")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=120)
-    parser.add_argument("--limit-mb", type=float, default=1000.0, help="copies that need more are left out")
-    options = parser.parse_args(argv)
-    try:
-        particles = _numbers(options.particles)
-        if options.rooms not in room_registry.names():
-            raise BadInput(str(unknown_name("rooms", options.rooms, room_registry.names())))
-        check_writable(options.out, _FILES)
-    except BadInput as error:
-        print(error, file=sys.stderr)
-        return 2
-    drive, settings = record(options.rooms, seed=options.seed, steps=options.steps)
-    rows = cost(drive, settings, particles, limit_mb=options.limit_mb, seed=options.seed)
-    _write(options.out, rows, {"rooms": options.rooms, "seed": options.seed, "steps": len(drive) - 1})
+def study(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/dp_slam_cost"),
+    particles: Annotated[str, typer.Option(help="Numbers, separated by commas.")] = "50,100,200,500,1000",
+    rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    steps: Annotated[int, typer.Option(min=1, help="Of the drive.")] = 120,
+    limit_mb: Annotated[float, typer.Option(help="Copies that need more are left out.")] = 1000.0,
+) -> None:
+    """Measure what the maps of DP-SLAM's particles cost: one shared grid, or a copy each."""
+    numbers = _numbers(particles)
+    with bad_input():
+        room_registry.check(rooms)
+    check_writable(out, _FILES)
+    drive, settings = record(rooms, seed=seed, steps=steps)
+    rows = cost(drive, settings, numbers, limit_mb=limit_mb, seed=seed)
+    _write(out, rows, {"rooms": rooms, "seed": seed, "steps": len(drive) - 1})
     print(table(rows))
-    return 0
 
 
 def _numbers(text: str) -> list[int]:
@@ -174,7 +168,3 @@ def table(rows: list[dict[str, Any]]) -> str:
             f"{shared['ms_per_update']:>12.1f}{copies_ms:>12}"
         )
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

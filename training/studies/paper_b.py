@@ -1,21 +1,21 @@
 """Paper B's claims as plots (theory.md B, points 1, 2 and 6), in the circle world.
 
-``python -m training.studies.paper_b --out DIR`` follows one run of the EKFs, with the start uncertain by 10 cm,
+``mecanum study paper-b --out DIR`` follows one run of the EKFs, with the start uncertain by 10 cm,
 and one of each FastSLAM, and writes ``determinants.png``, ``variances.png``, ``correlations.png``,
 ``particles.png`` and ``paper_b.json``. What the figures mean: ``docs/consistency.md``.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 import slam
@@ -25,7 +25,7 @@ from training.figures.charts import Axis, Line, draw_chart, png
 from training.runs.errors import BadInput, check_writable
 from training.studies.circle_world import WORLDS, LandmarkWorld, drive
 
-__all__ = ["floor_of", "follow_filter", "follow_particles", "main", "paper_b"]
+__all__ = ["floor_of", "follow_filter", "follow_particles", "paper_b", "study"]
 
 Array = NDArray[np.float64]
 
@@ -229,28 +229,10 @@ def _particle_chart(particles: dict[str, dict[str, Array]]) -> NDArray[np.uint8]
     return draw_chart(lines, title=title, x=x, y=y)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.studies.paper_b", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/paper_b"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=None)
-    options = parser.parse_args(argv)
-    try:
-        if options.seed < 0 or (options.steps is not None and options.steps < 1):
-            raise BadInput("--seed must be at least 0 and --steps at least 1")
-        result = paper_b(options.out, seed=options.seed, steps=options.steps)
-    except BadInput as error:
-        print(f"training.studies.paper_b: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("training.studies.paper_b: interrupted before the results were written", file=sys.stderr)
-        return 130
-    print(json.dumps(result, indent=1, ensure_ascii=False))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def study(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_b"),
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Of the run.")] = None,
+) -> None:
+    """Repeat paper B's claims as plots, in the circle world."""
+    print(json.dumps(paper_b(out, seed=seed, steps=steps), indent=1, ensure_ascii=False))

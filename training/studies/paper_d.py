@@ -1,28 +1,29 @@
 """Paper D's table: how far mapped corners are from the true ones in its corridor systems, backend by backend.
 
-``python -m training.studies.paper_d --out out/paper-d`` drives the ``cavity`` robot (0.5 m/s, 90 °/s, 120° of
+``mecanum study paper-d --out out/paper-d`` drives the ``cavity`` robot (0.5 m/s, 90 °/s, 120° of
 view, slip 0.1) by nearest-frontier through corridors of the paper's total and longest lengths (theory.md D).
 Deviations are measured without alignment: the start pose is the origin.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from mecanum_env.rooms import PAPER_D
 from slam.formats import atomic_write
 from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
-from training.runs.errors import BadInput, Interrupted, bad_input
+from training.runs.errors import bad_input
+from training.runs.options import Workers
 
-__all__ = ["PAPER_MEAN_MAX_M", "main", "run_job", "summarise"]
+__all__ = ["PAPER_MEAN_MAX_M", "run_job", "study", "summarise"]
 
 PAPER_MEAN_MAX_M = {1: (0.09, 0.20), 2: (0.06, 0.16), 3: (0.13, 0.48)}
 """The paper's own result with its EKF: mean and largest deviation on each map."""
@@ -113,44 +114,35 @@ def _m(value: float | None) -> str:
     return "–" if value is None else f"{value:.3f}"
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.studies.paper_d", description=__doc__)
-    parser.add_argument("--slam", default="ekf,invariant-ekf,fastslam1,fastslam2")
-    parser.add_argument("--seeds", default="10000:10019")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--out", type=Path, default=Path("out/paper-d"))
-    options = parser.parse_args(argv)
-    try:
-        with bad_input():
-            backends = backend_names(options.slam)
-            seeds = parse_seeds(options.seeds)
-            settings = {"version": installed_version(), "max_steps": MAX_STEPS}
-            check_settings(options.out, settings, FILES)
-        write_settings(options.out, settings)
-        store = options.out / "episodes.jsonl"
-        rows = _read(store)
-        jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in seeds]
+def study(
+    slam: Annotated[str, typer.Option(help="SLAM backends.")] = "ekf,invariant-ekf,fastslam1,fastslam2",
+    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")] = "10000:10019",
+    workers: Workers = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper-d"),
+) -> None:
+    """Repeat paper D's table: how far mapped corners are from the true ones, backend by backend."""
+    with bad_input():
+        backends = backend_names(slam)
+        chosen = parse_seeds(seeds)
+        settings = {"version": installed_version(), "max_steps": MAX_STEPS}
+        check_settings(out, settings, FILES)
+    write_settings(out, settings)
+    store = out / "episodes.jsonl"
+    rows = _read(store)
+    jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
 
-        with store.open("a", encoding="utf-8") as file:
+    with store.open("a", encoding="utf-8") as file:
 
-            def keep(job: Job, row: Row) -> None:
-                rows[job] = row
-                file.write(json.dumps([*job, row]) + "\n")
-                file.flush()
+        def keep(job: Job, row: Row) -> None:
+            rows[job] = row
+            file.write(json.dumps([*job, row]) + "\n")
+            file.flush()
 
-            run_all([job for job in jobs if job not in rows], run_job, workers=options.workers, keep=keep,
-                    what="episodes")  # fmt: skip
-    except BadInput as error:
-        print(f"training.studies.paper_d: {error}", file=sys.stderr)
-        return 2
-    except Interrupted as error:
-        print(error, file=sys.stderr)
-        return 130
+        missing = [job for job in jobs if job not in rows]
+        run_all(missing, run_job, workers=workers or os.cpu_count() or 1, keep=keep, what="episodes")
     summaries = summarise({job: rows[job] for job in jobs}, backends)
-    atomic_write(options.out / "paper_d.json", json.dumps({**settings, "summaries": summaries}, indent=1) + "\n")
+    atomic_write(out / "paper_d.json", json.dumps({**settings, "summaries": summaries}, indent=1) + "\n")
     print(_table(summaries))
-    return 0
 
 
 def _read(store: Path) -> dict[Job, Row]:
@@ -163,7 +155,3 @@ def _read(store: Path) -> dict[Job, Row]:
             continue
         rows[(number, backend, seed)] = row
     return rows
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""What recording an episode takes: ``python -m training.studies.recording_cost``.
+"""What recording an episode takes: ``mecanum study recording-cost``.
 
 Each seed is explored without, with, with and without a recorder, in one process, so that whatever else the machine
 does falls on both alike; CPU time is compared. Beside it: what the report takes to make, and its size.
@@ -6,21 +6,22 @@ does falls on both alike; CPU time is compared. Beside it: what the report takes
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from training.episodes import explore
 from training.episodes.recording import Recorder
 from training.episodes.room_pictures import parse_seeds
-from training.runs.errors import BadInput, Interrupted, bad_input
+from training.runs.errors import Interrupted, bad_input
 from training.views.report_page import episode_page
 
-__all__ = ["main", "measure"]
+__all__ = ["measure", "study"]
 
 
 def measure(options: explore.ExploreOptions) -> dict[str, Any]:
@@ -45,35 +46,25 @@ def measure(options: explore.ExploreOptions) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.studies.recording_cost", description=__doc__)
-    parser.add_argument("--seeds", default="0:9")
-    parser.add_argument("--agent", default="nearest-frontier")
-    parser.add_argument("--rooms", default=None)
-    parser.add_argument("--floor-plan", type=Path, default=None)
-    parser.add_argument("--max-steps", type=int, default=None)
-    options = parser.parse_args(argv)
-    try:
-        with bad_input():
-            seeds = parse_seeds(options.seeds, most=1000)
-        rows: list[dict[str, Any]] = []
-        for seed in seeds:
-            given = explore.ExploreOptions(
-                out=Path("out/recording_cost"), agent=options.agent, rooms=options.rooms, seed=seed,
-                floor_plan=options.floor_plan, max_steps=options.max_steps,
-            )  # fmt: skip
-            if not rows:
-                explore.run(explore.prepare(given), lambda **_: None, [Recorder()])  # compile first
-            rows.append(measure(given))
-            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    except (BadInput, Interrupted, KeyboardInterrupt) as error:
-        print(f"recording_cost: {error or 'interrupted'}", file=sys.stderr)
-        return 2 if isinstance(error, BadInput) else 130
+def study(
+    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")] = "0:9",
+    agent: Annotated[str, typer.Option(help="Who explores.")] = "nearest-frontier",
+    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.")] = None,
+    floor_plan: Annotated[Path | None, typer.Option(metavar="FILE", help="A real plan instead.")] = None,
+    max_steps: Annotated[int | None, typer.Option(min=1, help="Step limit.")] = None,
+) -> None:
+    """Measure what recording an episode takes: CPU time with and without, in turn."""
+    with bad_input():
+        chosen = parse_seeds(seeds, most=1000)
+    rows: list[dict[str, Any]] = []
+    for seed in chosen:
+        given = explore.ExploreOptions(
+            out=Path("out/recording_cost"), agent=agent, rooms=rooms, seed=seed,
+            floor_plan=floor_plan, max_steps=max_steps,
+        )  # fmt: skip
+        if not rows:
+            explore.run(explore.prepare(given), lambda **_: None, [Recorder()])  # compile first
+        rows.append(measure(given))
+        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     medians = {key: statistics.median(row[key] for row in rows) for key in rows[0] if key != "seed"}
     print(json.dumps({"episodes": len(rows), "median": medians, "worst_ratio": max(r["ratio"] for r in rows)}))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,26 +1,26 @@
-"""The README's moving picture: ``python -m training.views.moving_picture --out docs/images/explore.gif``.
+"""The README's moving picture: ``mecanum study moving-picture --out docs/images/explore.gif``.
 
 An episode until it reaches a coverage, truth beside belief, several times as fast as true.
 """
 
 from __future__ import annotations
 
-import argparse
 import subprocess
-import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from slam.formats import replacing
 from training.episodes import explore
-from training.runs.errors import BadInput, Interrupted
+from training.runs.errors import Interrupted, bad_input
 from training.views.film import Camera, check_video
 
-__all__ = ["main", "moving_picture"]
+__all__ = ["moving_picture", "study"]
 
 _STOPS_S = 2.5  # shown at the end before it begins anew
 # One palette for all frames; without dithering what does not move costs nothing.
@@ -64,32 +64,18 @@ class _Enough(Exception):
     """The coverage is reached."""
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m training.views.moving_picture", description=__doc__)
-    parser.add_argument("--agent", default="brisk-tour")
-    parser.add_argument("--rooms", default="apartment")
-    parser.add_argument("--seed", type=int, default=4)
-    parser.add_argument("--speed", type=int, default=4)
-    parser.add_argument("--width", type=int, default=800)
-    parser.add_argument("--until", type=float, default=0.97, help="coverage")
-    parser.add_argument("--out", type=Path, default=Path("out/explore.gif"))
-    options = parser.parse_args(argv)
-    try:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        given = explore.ExploreOptions(
-            out=options.out.parent, agent=options.agent, rooms=options.rooms, seed=options.seed
-        )
-        count = moving_picture(given, options.out, speed=options.speed, width=options.width, until=options.until)
-    except (BadInput, ValueError, OSError, subprocess.CalledProcessError) as error:
-        print(f"moving_picture: {error}", file=sys.stderr)
-        return 2
-    except (Interrupted, KeyboardInterrupt) as error:
-        print(f"moving_picture: {error or 'interrupted'}", file=sys.stderr)
-        return 130
-    print(f"{options.out}: {count} frames, {options.out.stat().st_size / 1e6:.1f} MB")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+def study(
+    agent: Annotated[str, typer.Option(help="Who explores.")] = "brisk-tour",
+    rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
+    seed: Annotated[int, typer.Option(min=0)] = 4,
+    speed: Annotated[int, typer.Option(min=1, help="Times as fast as true.")] = 4,
+    width: Annotated[int, typer.Option(min=16, help="Of the picture [pixels].")] = 800,
+    until: Annotated[float, typer.Option(help="Coverage at which it ends.")] = 0.97,
+    out: Annotated[Path, typer.Option(metavar="FILE.gif")] = Path("out/explore.gif"),
+) -> None:
+    """Make the README's moving picture of one episode."""
+    given = explore.ExploreOptions(out=out.parent, agent=agent, rooms=rooms, seed=seed)
+    with bad_input():
+        out.parent.mkdir(parents=True, exist_ok=True)
+        count = moving_picture(given, out, speed=speed, width=width, until=until)
+    print(f"{out}: {count} frames, {out.stat().st_size / 1e6:.1f} MB")

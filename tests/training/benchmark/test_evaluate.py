@@ -1,4 +1,4 @@
-"""``python -m training.benchmark.evaluate``: what it refuses, before any episode is run."""
+"""``mecanum study accuracy``: what it refuses, before any episode is run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from training.benchmark.evaluate import main
+from training.cli import main
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from training.benchmark.evaluate import main
 def test_bad_options_are_refused_in_one_line(
     option: tuple[str, str], hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([*option, "--out", str(tmp_path / "out")]) == 2
+    assert main(["study", "accuracy", *option, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert hint in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()

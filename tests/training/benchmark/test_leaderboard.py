@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from training.benchmark.leaderboard import BEGIN, END, main, tables, update
+from training.benchmark.leaderboard import BEGIN, END, tables, update
+from training.cli import main
 from training.runs.errors import BadInput
 
 
@@ -57,7 +58,7 @@ def test_command(tmp_path, capsys):
     (tmp_path / "summary.json").write_text(json.dumps(SUMMARY))
     page = tmp_path / "PAGE.md"
     page.write_text(f"{BEGIN}{END}")
-    assert main([str(tmp_path), str(page)]) == 0
+    assert main(["study", "leaderboard", str(tmp_path), str(page)]) == 0
     assert "### apartments" in page.read_text()
     assert main([str(tmp_path / "none"), str(page)]) == 2
     assert capsys.readouterr().err.count("\n") == 1

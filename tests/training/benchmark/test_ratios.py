@@ -7,7 +7,8 @@ import csv
 import numpy as np
 import pytest
 
-from training.benchmark.ratios import main, ratio, table
+from training.benchmark.ratios import ratio, table
+from training.cli import main
 
 FIELDS = ("suite", "place", "seed", "agent", "time_to_95_s", "time_s", "ate_rmse_m", "corner_mean_m", "limit_s")
 
@@ -28,7 +29,7 @@ def test_the_table_is_of_means_over_shared_seeds(tmp_path, capsys):
     # Never reached: the limit. No corners in caves: nothing to compare.
     expected = "| `two` | 300.0 | 40.0 | 4.0 | – | 0.04 [0.04, 0.04] | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] |  |"
     assert two == expected
-    assert main([str(tmp_path), "--suite", "caves", "--agent", "one"]) == 0
+    assert main(["study", "ratios", str(tmp_path), "--suite", "caves", "--agent", "one"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == expected
 
 
@@ -46,11 +47,11 @@ def test_the_interval_holds_the_true_ratio_nearly_always():
 def test_what_cannot_be_read_is_said_in_one_line(tmp_path, capsys, text):
     if text is not None:
         (tmp_path / "episodes.csv").write_text(text)
-    assert main([str(tmp_path), "--suite", "caves"]) == 2
+    assert main(["study", "ratios", str(tmp_path), "--suite", "caves"]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_an_agent_without_rows_is_named(tmp_path, capsys):
     write(tmp_path / "episodes.csv", [["caves", "cave", 0, "one", 1, 1, 1, 1, 300]])
-    assert main([str(tmp_path), "--suite", "caves", "--agent", "active"]) == 2
+    assert main(["study", "ratios", str(tmp_path), "--suite", "caves", "--agent", "active"]) == 2
     assert "no rows of active on caves" in capsys.readouterr().err

@@ -13,11 +13,12 @@ import agents
 from agents.base import Agent, Goal
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.slam.logs.logs_on_disk import data_folder
+from training.cli import main
 from training.dungeons import episode as dungeon_episode
 from training.dungeons.bound import known_map_path, known_walls_path
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, explore, make_agent
 from training.dungeons.plans import dungeon_plan
-from training.dungeons.protocol import main, run_dungeons, summarise, table
+from training.dungeons.protocol import run_dungeons, summarise, table
 from training.dungeons.world import Dungeon, Lattice, dungeon_of, frontier_points, layout, load, scan
 from training.runs.errors import BadInput
 
@@ -239,7 +240,18 @@ def test_agents_are_set_up_as_far_as_they_can_be():
 def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     maps, out = tmp_path / "maps", tmp_path / "out"
     write(maps, **{"2": hall(), "10": pixels((20, 20, 30, 150), start=(22, 24))})
-    arguments = ["--maps", str(maps), "--agents", "nearest-frontier,tour", "--out", str(out), "--json"]
+    arguments = [
+        "benchmark",
+        "--protocol",
+        "dungeons",
+        "--maps",
+        str(maps),
+        "--agents",
+        "nearest-frontier,tour",
+        "--out",
+        str(out),
+        "--json",
+    ]
     assert main(arguments) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["agents"]["tour"]["maps"] == 2 and summary["agents"]["tour"]["covered"] == 2
@@ -283,7 +295,7 @@ def test_bad_input_is_one_line(change, says, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "maps", a=hall())
     options = {"--maps": "maps", "--agents": "tour", "--out": "out"} | change
-    assert main([part for item in options.items() for part in item]) == 2
+    assert main(["benchmark", "--protocol", "dungeons", *(part for item in options.items() for part in item)]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()

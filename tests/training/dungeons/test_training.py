@@ -12,11 +12,12 @@ import torch
 from agents.learned.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
 from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options
 from slam.grids.occupancy import UNKNOWN
+from training.cli import main
 from training.dungeons import networks as dungeon_networks
 from training.dungeons.episode import _Run
 from training.dungeons.lessons import gather, lessons_of, read_lessons
 from training.dungeons.plans import dungeon_plan, loops
-from training.dungeons.training import TrainingConfig, batch_of, main, train, turned
+from training.dungeons.training import TrainingConfig, batch_of, train, turned
 from training.dungeons.walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
 from training.dungeons.world import CELL_M, Lattice, frontier_points
 
@@ -224,7 +225,18 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     out = tmp_path / "run"
     (out / "round-1").mkdir(parents=True)
     (out / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
-    arguments = ["--out", str(out), "--plans", "2", "--later-plans", "1", "--validation-plans", "1"]
+    arguments = [
+        "study",
+        "learned-tour",
+        "--out",
+        str(out),
+        "--plans",
+        "2",
+        "--later-plans",
+        "1",
+        "--validation-plans",
+        "1",
+    ]
     arguments += ["--epochs", "1", "--batch", "8"]
     assert main(arguments) == 0
     path = out / "learned-tour.safetensors"
@@ -256,7 +268,7 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     ],
 )
 def test_bad_input_is_one_line(change, says, tmp_path, capsys):
-    assert main(["--out", str(tmp_path / "out"), *change]) == 2
+    assert main(["study", "learned-tour", "--out", str(tmp_path / "out"), *change]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
 

@@ -5,14 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from training.studies import dp_slam_cost
+from training.cli import main
 
 
 def test_shared_maps_cost_less_than_copies_and_are_the_same_filter(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["--out", str(tmp_path / "out"), "--particles", "20,5", "--steps", "20", "--rooms", "rectangular"]
-    assert dp_slam_cost.main([*argv, "--limit-mb", "60"]) == 0
+    assert main(["study", "dp-slam-cost", *argv, "--limit-mb", "60"]) == 0
     rows = json.loads((tmp_path / "out" / "dp_slam_cost.json").read_text())["rows"]
     assert [row["particles"] for row in rows] == [5, 20]
     for row in rows:
@@ -28,6 +28,6 @@ def test_shared_maps_cost_less_than_copies_and_are_the_same_filter(
 
 @pytest.mark.parametrize("bad", [["--particles", "0"], ["--particles", "a"], ["--rooms", "castle"]])
 def test_bad_input_is_one_line(bad: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert dp_slam_cost.main(["--out", str(tmp_path / "out"), *bad]) == 2
+    assert main(["study", "dp-slam-cost", "--out", str(tmp_path / "out"), *bad]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not (tmp_path / "out").exists()

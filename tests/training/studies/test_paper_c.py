@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from training.cli import main
 from training.studies.paper_c import figures as paper_c
 from training.studies.paper_c.figures import run_of
 from training.studies.paper_c.odometry import accelerating, best, drives, errors
@@ -30,7 +31,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_everything_is_written(small: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     del small
-    assert paper_c.main(["--out", str(tmp_path / "out"), *TINY]) == 0
+    assert main(["study", "paper-c", "--out", str(tmp_path / "out"), *TINY]) == 0
     told = json.loads(capsys.readouterr().out)
     result = json.loads((tmp_path / "out" / "paper_c.json").read_text("utf-8"))
     for name, row in told["covariance"].items():
@@ -50,7 +51,7 @@ def test_everything_is_written(small: None, tmp_path: Path, capsys: pytest.Captu
 
 @pytest.mark.parametrize("more", [["--runs", "0"], ["--seed", "-1"], ["--workers", "0"]])
 def test_bad_input_is_one_line(more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert paper_c.main(["--out", str(tmp_path / "out"), *more]) == 2
+    assert main(["study", "paper-c", "--out", str(tmp_path / "out"), *more]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 

@@ -1,6 +1,6 @@
 """Paper C's figures (theory.md C): a filter by differential transforms, its cost, its use on board.
 
-``python -m training.studies.paper_c.figures --out DIR`` writes ``figure_2.png`` (the covariance against a stiff
+``mecanum study paper-c --out DIR`` writes ``figure_2.png`` (the covariance against a stiff
 solver), ``figure_3.png`` (the estimate's error with exact initial conditions, and 10 % off), ``work.png``
 (operations and time against RK45 and matrix exponentials), ``odometry.png`` (the odometry of an accelerating
 robot, filtered) and ``paper_c.json``. What they mean: ``docs/differential_transform.md``.
@@ -8,14 +8,13 @@ robot, filtered) and ``paper_c.json``. What they mean: ``docs/differential_trans
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 
 from slam.formats import atomic_write
@@ -24,12 +23,12 @@ from slam.odometry.filters import OdometryFilterConfig
 from slam.odometry.riccati import RECOVERIES, Tolerances
 from slam.odometry.transform_filter import KalmanBucyFilter
 from training.figures.charts import Axis, Line, draw_chart, png
-from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.errors import check_writable
 from training.runs.running import versions
 from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
 
-__all__ = ["covariances", "estimates", "main", "paper_c", "run_of"]
+__all__ = ["covariances", "estimates", "paper_c", "run_of", "study"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -293,39 +292,19 @@ def _summary(result: dict[str, Any]) -> dict[str, Any]:
     return {"covariance": result["covariance"], "estimate": result["estimate"], "work": work, "odometry": told}
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the module's command line; return its exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m training.studies.paper_c.figures", description=(__doc__ or "").splitlines()[0]
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/paper_c"))
-    defaults = (
-        ("seed", 0),
-        ("runs", 200),
-        ("repeats", 31),
-        ("episodes", 20),
-        ("explorations", 20),
-        ("steps", 1000),
-    )
-    for name, default in defaults:
-        parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--workers", type=int, default=1)
-    options = parser.parse_args(argv)
-    try:
-        if min(options.seed, options.explorations) < 0:
-            raise BadInput("--seed and --explorations must be at least 0")
-        if min(options.runs, options.repeats, options.episodes, options.steps, options.workers) < 1:
-            raise BadInput("--runs, --repeats, --episodes, --steps and --workers must be at least 1")
-        result = paper_c(**vars(options))
-    except BadInput as error:
-        print(f"training.studies.paper_c.figures: {error}", file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, Interrupted):
-        print("training.studies.paper_c.figures: interrupted before the results were written", file=sys.stderr)
-        return 130
+def study(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    runs: Annotated[int, typer.Option(min=1, help="Of the filter, for its errors.")] = 200,
+    repeats: Annotated[int, typer.Option(min=1, help="Of each timing.")] = 31,
+    episodes: Annotated[int, typer.Option(min=1, help="Drives of the accelerating robot.")] = 20,
+    explorations: Annotated[int, typer.Option(min=0, help="Episodes with filtered odometry.")] = 20,
+    steps: Annotated[int, typer.Option(min=1, help="Of a drive.")] = 1000,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+) -> None:
+    """Repeat paper C's figures: a filter by differential transforms, its cost, its use on board."""
+    result = paper_c(
+        out, seed=seed, runs=runs, repeats=repeats, episodes=episodes, explorations=explorations, steps=steps,
+        workers=workers,
+    )  # fmt: skip
     print(json.dumps(_summary(result), indent=1, ensure_ascii=False))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
