@@ -14,7 +14,7 @@ from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive
 from mecanum_env.sensing.sensors import WheelEncoders
 from slam.geometry import wrap
 from slam.motion import OdometryNoise
-from training.studies.calibrate import main
+from training.cli import main
 
 ROBOT = RobotConfig()
 LEVER = ROBOT.lever_m
@@ -118,13 +118,13 @@ def test_a_v_of_one_s_own_is_the_whole_of_it() -> None:
 
 
 def test_the_command_prints_measured_beside_declared(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--noise", "nominal", "--episodes", "3", "--steps", "40", "--json"]) == 0
+    assert main(["study", "calibration", "--noise", "nominal", "--episodes", "3", "--steps", "40", "--json"]) == 0
     result = json.loads(capsys.readouterr().out)["nominal"]
     assert {"white", "lasting", "lasting_without_gain", "declared", "gain", "bins", "steps"} <= result.keys()
     assert result["declared"]["speed_share"] == pytest.approx(0.0096, abs=1e-4)
-    assert main(["--noise", "nominall"]) == 2
+    assert main(["study", "calibration", "--noise", "nominall"]) == 2
     assert "did you mean 'nominal'?" in capsys.readouterr().err
-    assert main(["--episodes", "0"]) == 2
+    assert main(["study", "calibration", "--episodes", "0"]) == 2
 
 
 def test_headings_stay_wrapped(nominal: Drives) -> None:
