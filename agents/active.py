@@ -29,8 +29,8 @@ from agents.view_points.sightings import expected_sightings
 from agents.ways import cost_map as cost_maps
 from agents.ways.planning import shortest_path
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["ActiveConfig", "ActiveSlam", "LookConfig", "RevisitConfig"]
 

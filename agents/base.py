@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, resolve
+from slam.belief import Belief
 from slam.settings import require
-from slam.types import Belief
 
 __all__ = ["ENDINGS", "Agent", "Goal"]
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["CostUtility", "CostUtilityConfig"]
 

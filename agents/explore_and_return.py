@@ -21,8 +21,8 @@ from agents.ways import cost_map as cost_maps
 from agents.ways.planning import shortest_path, travel_costs
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
 

@@ -25,8 +25,8 @@ from agents.ways.cost_map import CostMap, PlannerConfig
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.env import ExploreEnv
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["ExploreFrontierEnv", "as_observation", "choice_space"]
 

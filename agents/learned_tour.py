@@ -23,9 +23,9 @@ from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
 from agents.ways.routing import draw_luck
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["FORMAT", "PRECISION", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
 

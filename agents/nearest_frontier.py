@@ -17,8 +17,8 @@ from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.stop import StationRound, StationsConfig
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["NearestFrontier", "NearestFrontierConfig"]
 

@@ -26,8 +26,8 @@ from agents.view_points.sight import first_in_good_sight
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
 

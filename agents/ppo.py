@@ -20,9 +20,9 @@ from agents.learned.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.observation import draw_maps
 from slam import geometry
+from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["Ppo", "PpoConfig", "load_drive_policy"]
 

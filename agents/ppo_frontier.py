@@ -15,8 +15,8 @@ from agents.learned.choice_network import ChoiceEnsemble
 from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping
-from slam.types import Belief
 
 __all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from agents.base import Agent, Goal
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["RandomAgent", "RandomConfig"]
 

@@ -27,8 +27,8 @@ from agents.view_points.gain import expected_area
 from agents.view_points.rrt_tree import Tree, mean_shift
 from agents.ways.cost_map import CostMap
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["Rrt", "RrtConfig"]
 

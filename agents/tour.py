@@ -23,9 +23,9 @@ from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 

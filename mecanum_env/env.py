@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import math
 from collections.abc import Mapping
@@ -16,119 +15,37 @@ from gymnasium.wrappers import TimeLimit
 from numba import njit
 from numpy.typing import NDArray
 
-import slam
 from mecanum_env import rooms as room_registry
+from mecanum_env.arguments import Settings, make_backend, make_config
 from mecanum_env.config import (
-    LIDAR_PRESETS,
-    NOISE_PRESETS,
-    ROBOT_PRESETS,
     EnvConfig,
     LidarConfig,
     NoiseConfig,
     RewardConfig,
     RobotConfig,
-    from_toml,
-    resolve,
 )
-from mecanum_env.episode import EpisodeRecord
+from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
 from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import World
 from mecanum_env.reward import StepOutcome, reward_terms
 from mecanum_env.rooms import FloorPlan
-from mecanum_env.rooms.registry import check as check_rooms
-from mecanum_env.sensing.calibration import backend_settings
 from mecanum_env.sensing.noise import noise_stream
 from mecanum_env.sensing.sensors import FilteredEncoders, Lidar, WheelEncoders
 from mecanum_env.views.window import make_viewer
-from slam.backend import Backend
+from slam.belief import Belief
 from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
 from slam.odometry.filters import make_odometry_filter
-from slam.settings import from_mapping, unknown_name
-from slam.types import Belief, Odometry, Scan
+from slam.settings import unknown_name
+from slam.types import Odometry
 
-__all__ = ["ExploreEnv", "Truth", "make_config"]
+__all__ = ["ExploreEnv"]
 
 Array = NDArray[np.float64]
-Settings = str | Mapping[str, Any]
 
 ACTIONS = {"twist": 3, "wheels": 4}
-
-
-@dataclasses.dataclass
-class Truth:
-    """What is really so: for metrics and drawing only."""
-
-    ground: GroundTruth
-    world: World
-    record: EpisodeRecord
-    scan: Scan
-
-    @property
-    def plan(self) -> FloorPlan:
-        """The floor plan, in the world frame."""
-        return self.ground.plan
-
-    @property
-    def pose(self) -> Array:
-        """True pose ``(3,)`` in the start frame, which is the belief's."""
-        return self.ground.in_start_frame(self.world.pose)
-
-
-def make_config(
-    *,
-    config: EnvConfig | str | Path | Mapping[str, Any] | None = None,
-    rooms: Settings | None = None,
-    slam: Settings | None = None,
-    robot: Settings | RobotConfig | None = None,
-    lidar: Settings | LidarConfig | None = None,
-    noise: Settings | NoiseConfig | None = None,
-    reward: Mapping[str, Any] | RewardConfig | None = None,
-    floor_plan: str | Path | None = None,
-    odometry_filter: Settings | None = None,
-) -> EnvConfig:
-    """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
-
-    A string names a preset, generator, backend or filter; a mapping configures it (``{"preset": "youbot", …}``,
-    ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
-    Unknown names and keys raise ``ValueError`` that lists the valid ones.
-    """
-    base = from_toml(config) if isinstance(config, str | Path) else from_mapping(EnvConfig, config)
-    changes: dict[str, Any] = {}
-    if isinstance(robot, str) and robot in ROBOT_PRESETS:
-        given_parts = config if isinstance(config, Mapping) else {}
-        lidar = robot if lidar is None and "lidar" not in given_parts else lidar
-        noise = robot if noise is None and "noise" not in given_parts else noise
-    for name, given in (("rooms", rooms), ("slam", slam), ("odometry_filter", odometry_filter)):
-        if isinstance(given, Mapping):
-            options = dict(given)
-            changes[name] = str(options.pop("name", getattr(base, name)))
-            changes[f"{name}_config"] = options
-        elif given is not None:
-            changes[name] = given
-            if given != getattr(base, name):
-                changes[f"{name}_config"] = {}
-    if robot is not None:
-        changes["robot"] = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
-    if lidar is not None:
-        changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
-    if noise is not None:
-        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
-    if reward is not None:
-        changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
-    if floor_plan is not None:
-        changes["floor_plan"] = str(floor_plan)
-    made = dataclasses.replace(base, **changes)
-    check_rooms(made.rooms, made.rooms_config)
-    _check_backend(made)
-    make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
-    return made
-
-
-def _check_backend(config: EnvConfig) -> None:
-    from_mapping(slam.config_type(config.slam), backend_settings(config))
 
 
 class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -139,7 +56,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     action : str
         ``"twist"``: body twist as fractions of the limits; ``"wheels"``: wheel speeds FL, FR, RL, RR.
     config, rooms, slam, robot, lidar, noise, reward, floor_plan, odometry_filter
-        See :func:`make_config`.
+        See :func:`mecanum_env.arguments.make_config`.
     render_mode : str, optional
         ``"rgb_array"``: truth beside belief. ``"human"``: the same in a window, shown by ``reset`` and ``step``.
 
@@ -188,7 +105,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._knows_truth = isinstance(self.backend, TruthSlam)
         self.lidar = Lidar(self.config.lidar, self.config.noise)
         self._filter = make_odometry_filter(self.config.odometry_filter, self.config.odometry_filter_config)
-        self._viewer = make_viewer(render_mode)
+        self._viewer = make_viewer(render_mode, fps=self.metadata["render_fps"])
         self._ready = False
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
@@ -404,11 +321,6 @@ def _time_limit_of_caller() -> int | None:
             return int(wrapper._max_episode_steps)
         frame = frame.f_back
     return None
-
-
-def make_backend(config: EnvConfig) -> Backend:
-    """Return the backend that an environment's configuration asks for, told of its robot and noise."""
-    return slam.make(config.slam, config=backend_settings(config))
 
 
 @njit(cache=True, nogil=True)

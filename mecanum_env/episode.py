@@ -1,21 +1,22 @@
-"""The record of one episode: what happened, and what it amounts to (contract.md, "Command line")."""
+"""One episode: what is really so, what happened, and what it amounts to (contract.md, "Command line")."""
 
 from __future__ import annotations
 
 import math
 from array import array
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth, occupied, on_lattice
+from mecanum_env.physics.world import World
+from mecanum_env.rooms.floor_plan import FloorPlan
+from slam.belief import Belief
 from slam.metrics import measures as metrics
+from slam.types import Scan
 
-if TYPE_CHECKING:
-    from slam.types import Belief
-
-__all__ = ["EpisodeRecord"]
+__all__ = ["EpisodeRecord", "Truth"]
 
 Array = NDArray[np.float64]
 
@@ -108,6 +109,26 @@ class EpisodeRecord:
             "anees": float(nees.mean() / 3.0) if len(nees) else None,
             "landmarks": len(belief.landmarks),
         }
+
+
+@dataclass
+class Truth:
+    """What is really so: for metrics and drawing only."""
+
+    ground: GroundTruth
+    world: World
+    record: EpisodeRecord
+    scan: Scan
+
+    @property
+    def plan(self) -> FloorPlan:
+        """The floor plan, in the world frame."""
+        return self.ground.plan
+
+    @property
+    def pose(self) -> Array:
+        """True pose ``(3,)`` in the start frame, which is the belief's."""
+        return self.ground.in_start_frame(self.world.pose)
 
 
 def score_map(truth: GroundTruth, belief: Belief) -> metrics.MapScore:

@@ -9,8 +9,9 @@ Nothing here knows of a simulator: the same backends run on the logs of real rob
     backend.belief.pose
 """
 
+from slam.belief import Belief
 from slam.registry import config_type, make, names, register
-from slam.types import CONCAVE, CONVEX, LINE, Belief, Observations, Odometry, Scan
+from slam.types import CONCAVE, CONVEX, LINE, Observations, Odometry, Scan
 
 __all__ = [
     "CONCAVE",

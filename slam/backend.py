@@ -10,13 +10,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.belief import Belief
 from slam.features.extraction import FeatureConfig, FeatureExtractor
 from slam.grids.key_scans import KeyScanConfig, KeyScans
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
 from slam.settings import require
-from slam.types import Belief, Observations, Odometry, Scan
+from slam.types import Observations, Odometry, Scan
 
 __all__ = ["Backend", "BackendConfig"]
 

@@ -23,13 +23,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.belief import Belief
 from slam.ekf import EkfConfig, EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import solve
 from slam.gaussian.tiles import add_combination, downdate, product, subtract
 from slam.settings import require
-from slam.types import LINE, Belief, Observations, Odometry, Scan
+from slam.types import LINE, Observations, Odometry, Scan
 
 __all__ = ["CompressedEkfConfig", "CompressedEkfSlam"]
 

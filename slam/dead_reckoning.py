@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend
+from slam.belief import Belief
 from slam.ekf import EkfSlam
-from slam.types import Belief, Odometry
+from slam.types import Odometry
 
 __all__ = ["OdometrySlam", "TruthSlam"]
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend, BackendConfig
+from slam.belief import Belief
 from slam.geometry import compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
@@ -25,7 +26,7 @@ from slam.particles.paths import Paths
 from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import require
-from slam.types import Belief, Observations, Odometry, Scan
+from slam.types import Observations, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]
 

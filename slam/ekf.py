@@ -10,21 +10,21 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from slam.backend import Backend, BackendConfig
-from slam.gaussian.joint_gaussian import add_landmark, near_landmarks, read_block, symmetric_block
+from slam.belief import Belief
+from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
-from slam.landmarks.association import UNMATCHED, joint_compatibility, nearest_neighbour, refuse_unlikely
-from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, count_recent
+from slam.landmarks.association import UNMATCHED, joint_compatibility, refuse_unlikely
+from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, match_and_recall
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
-from slam.types import LINE, Belief, Observations, Odometry, Scan
+from slam.types import LINE, Observations, Odometry, Scan
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
 
@@ -179,7 +179,7 @@ class EkfSlam(Backend):
             self._recall = self._book.recently_seen(match)
             return match
         match, book = self._match[: len(z)], self._book
-        self._recall = _match_and_recall(
+        self._recall = match_and_recall(
             self._x, self._p, config.lidar_offset_m, z, book.marks, book.now, self._gates,
             config.association == "individual", match, self._distance,
         )  # fmt: skip
@@ -292,7 +292,7 @@ class EkfSlam(Backend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
-        _leave_out(self._x, self._p, self._n, 3 + 2 * row)
+        leave_out(self._x, self._p, self._n, 3 + 2 * row)
         self._n -= 2
         self._book.drop(row)
 
@@ -394,26 +394,3 @@ class EkfSlam(Backend):
         n = np.column_stack([np.cos(alpha), np.sin(alpha)])
         along = np.column_stack([-n[:, 1], n[:, 0]])
         return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _leave_out(x: Array, p: Array, n: int, i: int) -> None:
-    """Move up what stands behind the two states from ``i`` on; ``p`` is an upper triangle."""
-    for a in range(n - 2):
-        above = a if a < i else a + 2
-        for b in range(a, n - 2):
-            p[a, b] = p[above, b if b < i else b + 2]
-    for a in range(i, n - 2):
-        x[a] = x[a + 2]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _match_and_recall(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
-    match: NDArray[np.int64], distance: Array,
-) -> tuple[int, int]:  # fmt: skip
-    """Match by nearest neighbour; return what the book says of it (``LandmarkBook.recently_seen``)."""
-    gate, near, max_turn = gates[0], gates[1], gates[2]
-    h = np.empty((2, 5))
-    nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)
-    return count_recent(marks, match, now)

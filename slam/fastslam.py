@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend, BackendConfig
+from slam.belief import Belief
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.geometry import compose, rotation, wrap
 from slam.landmarks.association import joint_compatibility
@@ -25,7 +26,7 @@ from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
 from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
 from slam.settings import require
-from slam.types import Belief, Observations, Odometry, Scan
+from slam.types import Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
 

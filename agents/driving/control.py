@@ -14,8 +14,8 @@ from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
 from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import require
-from slam.types import Belief
 
 __all__ = ["ControlConfig", "PathFollower"]
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig, PathFollower
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.motion import OdometryNoise, twist_between
-from slam.types import Belief
 
 __all__ = ["GentleFollower", "WheelWatch"]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.types import Belief
+from slam.belief import Belief
 
 __all__ = [
     "Guard",

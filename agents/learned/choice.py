@@ -20,9 +20,9 @@ from agents.view_points.sightings import SensorModel, expected_sightings
 from agents.ways.cost_map import CostMap
 from agents.ways.travel import between
 from mecanum_env.config import LidarConfig
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import require
-from slam.types import Belief
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe", "mirrored"]
 

@@ -16,8 +16,8 @@ from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.settings import from_mapping, require
-from slam.types import Belief
 
 __all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
 from slam.settings import require
-from slam.types import Belief
 
 __all__ = ["StationRound", "StationStop", "StationsConfig"]
 

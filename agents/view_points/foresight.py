@@ -24,13 +24,14 @@ from agents.view_points.sightings import BEAM, SensorModel, expected_sightings
 from agents.ways.cost_map import CostMap
 from mecanum_env.config import LidarConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import whiten, work_space
 from slam.gaussian.tiles import downdate
 from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, predict_robot, twist_between
 from slam.settings import require
-from slam.types import LINE, Belief
+from slam.types import LINE
 
 __all__ = [
     "Foreseen",

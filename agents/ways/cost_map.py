@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
 from mecanum_env.config import RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import require
-from slam.types import Belief
 
 __all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
 

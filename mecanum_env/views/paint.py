@@ -12,8 +12,8 @@ from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms.draw import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, _loops
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.views.canvas import Canvas, Colour, View
+from slam.belief import Belief
 from slam.geometry import transform_points
-from slam.types import Belief
 
 __all__ = [
     "BEAM", "BELIEVED_PATH", "FRONTIER", "LANDMARK", "PLANNED_PATH", "SIGMAS", "TRUE_PATH", "UNSEEN", "Box",

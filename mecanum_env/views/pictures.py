@@ -28,9 +28,9 @@ from mecanum_env.views.paint import (
     thinned,
     with_margin,
 )
+from slam.belief import Belief
 from slam.geometry import inverse
 from slam.grids.occupancy import OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Belief
 
 __all__ = ["draw_map", "draw_truth", "episode_view"]
 

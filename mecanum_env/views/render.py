@@ -7,13 +7,14 @@ Inside, colours are blue, green, red, as everywhere in OpenCV; the frame that is
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms.draw import FLOOR, INK, PAGE, ROBOT, WALL
 from mecanum_env.views.canvas import Canvas, View, blend, put_text, text_width
@@ -32,14 +33,12 @@ from mecanum_env.views.paint import (
     thinned,
     with_margin,
 )
+from slam.belief import Belief
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Scan
 
-if TYPE_CHECKING:
-    from mecanum_env.env import ExploreEnv
-
-__all__ = ["FRAME_SHAPE", "frontier_cells", "render_frame"]
+__all__ = ["FRAME_SHAPE", "Shown", "frontier_cells", "render_frame"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -55,6 +54,22 @@ _LEAST_FRONTIER = 5  # cells; smaller specks are noise at the rim of what was se
 _FIXED: WeakKeyDictionary[GroundTruth, tuple[View, Image]] = WeakKeyDictionary()
 
 
+class Shown(Protocol):
+    """What a frame is made of: an environment after ``reset``, or a moment put together from one."""
+
+    @property
+    def config(self) -> EnvConfig:
+        """The environment's configuration."""
+
+    @property
+    def belief(self) -> Belief:
+        """What the robot knows."""
+
+    @property
+    def truth(self) -> Any:
+        """A :class:`mecanum_env.episode.Truth`, or what has its ``ground``, ``record``, ``pose`` and ``scan``."""
+
+
 def _colours() -> Image:
     """Return what each probability × 255 of a cell looks like ``(256, 1, 3)``: white, grey where unsure, dark."""
     p = np.arange(256) / 255.0
@@ -65,7 +80,7 @@ def _colours() -> Image:
 _COLOURS = _colours()
 
 
-def render_frame(env: ExploreEnv, *, planned_path: Array | None = None) -> Image:
+def render_frame(env: Shown, *, planned_path: Array | None = None) -> Image:
     """Return truth beside belief as an RGB image ``(720, 1280, 3)``.
 
     Left: the true plan, the robot, where it really drove, and the scan. Right: the belief's grid with frontier
@@ -75,7 +90,7 @@ def render_frame(env: ExploreEnv, *, planned_path: Array | None = None) -> Image
     Parameters
     ----------
     env : ExploreEnv
-        After ``reset``.
+        After ``reset``; or a moment of one.
     planned_path : (n, 2) array, optional
         The way an agent means to go [m]; by default the environment's attribute ``planned_path``, if it has one.
     """
@@ -184,7 +199,7 @@ def _paint_grid(canvas: Canvas, grid: OccupancyGrid) -> None:
     canvas.squares(cells, FRONTIER, px=max(2, math.ceil(grid.resolution * view.scale)))
 
 
-def _write_caption(frame: Image, env: ExploreEnv, *, coverage: float, time_s: float, error: str) -> None:
+def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, error: str) -> None:
     at = _RIGHT + text_width("Belief", size=19, bold=True) + 12
     put_text(frame, env.config.slam, (at, 30), INK, size=17)
     height, width = FRAME_SHAPE
@@ -195,7 +210,7 @@ def _write_caption(frame: Image, env: ExploreEnv, *, coverage: float, time_s: fl
         ("path", f"{env.truth.record.path_length_m:.1f} m", 352),
         ("collisions", f"{env.truth.record.collisions}", 505),
         ("position error", error, 632),
-        ("landmarks", f"{env.backend.landmark_count}", 1100),
+        ("landmarks", f"{len(env.belief.landmarks) + len(env.belief.lines)}", 1100),
     )
     for name, value, x in entries:
         put_text(frame, name, (_LEFT + x, y), INK, size=17)

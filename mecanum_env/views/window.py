@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import gymnasium
@@ -16,9 +16,7 @@ from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.draw import PAGE
-
-if TYPE_CHECKING:
-    from mecanum_env.env import ExploreEnv
+from mecanum_env.views.render import FRAME_SHAPE, Shown, render_frame
 
 __all__ = ["NoDisplay", "NoViewer", "Viewer", "Window", "load_pygame", "make_viewer"]
 
@@ -150,7 +148,7 @@ def _fitted(width: int, height: int, room_x: int, room_y: int) -> tuple[int, int
 class NoViewer:
     """Shows nothing: every render mode but ``human``."""
 
-    def show(self, env: ExploreEnv) -> None:
+    def show(self, env: Shown) -> None:
         """Do nothing."""
 
     def close(self) -> None:
@@ -158,21 +156,20 @@ class NoViewer:
 
 
 class Viewer:
-    """Shows an environment's frames in a window, at the pace of its ``metadata["render_fps"]``.
+    """Shows an environment's frames in a window, so many a second.
 
     The window opens with the first frame. When it is closed by hand, that is said in a warning and the
     environment goes on without it, at full speed; after ``close()`` the next frame opens another.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fps: float) -> None:
         self._pygame = load_pygame()
+        self._fps = fps
         self._clock = self._pygame.time.Clock()
         self._window: Window | None = None
 
-    def show(self, env: ExploreEnv) -> None:
+    def show(self, env: Shown) -> None:
         """Show the environment as it is now, and wait until the frame is due."""
-        from mecanum_env.views.render import FRAME_SHAPE, render_frame
-
         if self._window is None:
             self._window = Window("mecanum-slam", (FRAME_SHAPE[1], FRAME_SHAPE[0]))
             if self._window.unseen:
@@ -186,7 +183,7 @@ class Viewer:
             gymnasium.logger.warn("the window was closed; the environment goes on without it")
             return
         window.show(render_frame(env))
-        self._clock.tick(env.metadata["render_fps"])
+        self._clock.tick(self._fps)
 
     def close(self) -> None:
         """Close the window; a second time nothing happens."""
@@ -195,6 +192,6 @@ class Viewer:
             self._window = None
 
 
-def make_viewer(render_mode: str | None) -> Viewer | NoViewer:
+def make_viewer(render_mode: str | None, *, fps: float) -> Viewer | NoViewer:
     """Return what shows an environment of a render mode to a person."""
-    return Viewer() if render_mode == "human" else NoViewer()
+    return Viewer(fps) if render_mode == "human" else NoViewer()

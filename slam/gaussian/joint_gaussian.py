@@ -20,6 +20,7 @@ __all__ = [
     "OBSERVED_LIMIT",
     "add_landmark",
     "landmark_by_pose",
+    "leave_out",
     "near_landmarks",
     "read_block",
     "symmetric_block",
@@ -81,6 +82,17 @@ def _add_line(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
         nx * p[0, n + 1] + ny * p[1, n + 1] + turn * p[2, n + 1]
         + z[2] + 2.0 * lever * z[3] + lever * lever * z[4]
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leave_out(x: Array, p: Array, n: int, i: int) -> None:
+    """Move up what stands behind the two states from ``i`` on; ``p`` is an upper triangle."""
+    for a in range(n - 2):
+        above = a if a < i else a + 2
+        for b in range(a, n - 2):
+            p[a, b] = p[above, b if b < i else b + 2]
+    for a in range(i, n - 2):
+        x[a] = x[a + 2]
 
 
 def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:

@@ -14,11 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.landmarks.association import UNMATCHED
+from slam.landmarks.association import UNMATCHED, nearest_neighbour
 from slam.settings import require
 from slam.types import LINE, Scan
 
-__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy"]
+__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy", "match_and_recall"]
 
 Array = NDArray[np.float64]
 
@@ -375,3 +375,15 @@ def _review_scan(
     # over apartments with slippery floors it was four fifths of the whole.
     found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, now == 1, new)
     return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def match_and_recall(
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
+    match: NDArray[np.int64], distance: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """Match by nearest neighbour; return what the book says of it (``LandmarkBook.recently_seen``)."""
+    gate, near, max_turn = gates[0], gates[1], gates[2]
+    h = np.empty((2, 5))
+    nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)
+    return count_recent(marks, match, now)

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from agents.driving.safety import footprint
 from mecanum_env.config import RobotConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Belief
 
 RESOLUTION = 0.05
 

@@ -15,8 +15,8 @@ from agents.active import ActiveSlam
 from agents.driving.control import ControlConfig
 from agents.driving.grip import GentleFollower, WheelWatch
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
-from slam.types import Belief
 from tests.agents.grids import belief_of, drive, fill, half_known, room
 
 ROBOT, LIDAR = RobotConfig(), LidarConfig()

@@ -15,8 +15,9 @@ from agents.base import Agent, Goal
 from agents.brisk_tour import BRISK
 from agents.ppo_frontier import SHIPPED, load_choice_policy
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from slam.types import Belief, Scan
+from slam.types import Scan
 from tests.agents.grids import RESOLUTION, belief_of, body_gap, drive, fill, half_known, room, two_rooms
 
 ROBOT, LIDAR = RobotConfig(), LidarConfig()

@@ -14,8 +14,8 @@ from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
 from agents.stations.lattice import edges, join, lengths, ways
 from agents.stations.survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
 from agents.ways.routing import draw_luck
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Belief
 
 STATIONS = {"spacing_m": 4.0, "hop": 2}
 LUCK = draw_luck(6, 200)

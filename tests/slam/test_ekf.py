@@ -10,8 +10,7 @@ from scipy.optimize import least_squares
 
 import slam
 from slam import Observations, Odometry
-from slam.ekf import _leave_out
-from slam.gaussian.joint_gaussian import add_landmark, near_landmarks
+from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
 from slam.landmarks.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
@@ -346,7 +345,7 @@ def test_leaving_a_landmark_out_takes_its_rows_and_columns(seed: int, landmarks:
     n, i = len(x), 3 + 2 * int(rng.integers(landmarks))
     keep = np.r_[0:i, i + 2 : n]
     left_x, left_p = x.copy(), np.triu(p)
-    _leave_out(left_x, left_p, n, i)
+    leave_out(left_x, left_p, n, i)
     np.testing.assert_array_equal(left_x[: n - 2], x[keep])
     np.testing.assert_array_equal(np.triu(left_p[: n - 2, : n - 2]), np.triu(p[np.ix_(keep, keep)]))
 

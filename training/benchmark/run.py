@@ -13,8 +13,8 @@ import tomli_w
 
 import agents
 import slam
+from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
-from mecanum_env.env import make_config
 from slam.formats import atomic_write
 from slam.settings import to_mapping, unknown_name
 from training.benchmark import store as benchmark_store

@@ -1,5 +1,5 @@
-"""The ``mecanum`` command: one module for each larger command, the short ones in ``commands``."""
+"""The ``mecanum`` command: a module for each command, and ``app``, which runs them and says what went wrong."""
 
-from training.cli.commands import app, main
+from training.cli.app import app, main
 
 __all__ = ["app", "main"]

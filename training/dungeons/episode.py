@@ -20,8 +20,8 @@ import agents
 from agents.base import Agent, Goal
 from agents.stations.lattice import line_is_free
 from mecanum_env.config import LidarConfig, RobotConfig
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN, OccupancyGrid
-from slam.types import Belief
 from training.dungeons.world import CELL_M, HOP, RANGE_M, STRIDE, Dungeon, Lattice, scan
 
 __all__ = ["NEAREST", "NEAREST_VIEW", "SCANS", "explore", "make_agent"]

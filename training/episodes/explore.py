@@ -18,8 +18,9 @@ import agents
 from agents.base import ENDINGS as AGENT_ENDINGS
 from agents.base import Agent, Goal
 from mecanum_env import rooms as room_registry
+from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
-from mecanum_env.env import ExploreEnv, make_config
+from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap

@@ -21,7 +21,7 @@ from agents.explorer import Candidates, Explorer
 from agents.ways.planning import shortest_path, travel_costs
 from agents.ways.routing import best_tour, draw_luck
 from mecanum_env.ground_truth import GroundTruth
-from slam.types import Belief
+from slam.belief import Belief
 from training.episodes.true_places import TruePlaces
 
 __all__ = ["NAME", "KnownMap"]

@@ -17,8 +17,8 @@ from agents.ways.cost_map import CostMap, PlannerConfig
 from agents.ways.planning import travel_costs
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth, on_lattice
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Belief
 
 __all__ = ["TILE", "TruePlaces", "cells_per_tile"]
 

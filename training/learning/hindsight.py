@@ -18,7 +18,7 @@ from agents.learned.choice import Choice
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import way_cells
 from agents.ways.routing import improve
-from slam.types import Belief
+from slam.belief import Belief
 from training.episodes.true_places import TruePlaces
 
 __all__ = ["Hindsight"]

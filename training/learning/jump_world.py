@@ -24,11 +24,12 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from slam.belief import Belief
 from slam.features.extraction import FeatureExtractor
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import OccupancyGrid
 from slam.settings import from_mapping
-from slam.types import Belief, Scan
+from slam.types import Scan
 
 __all__ = ["COVERED", "JumpWorld"]
 

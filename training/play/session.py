@@ -14,8 +14,9 @@ import agents
 import slam
 from agents.base import ENDINGS, Agent
 from mecanum_env import rooms as room_registry
+from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
-from mecanum_env.env import ExploreEnv, make_config
+from mecanum_env.env import ExploreEnv
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
 from training.play.controls import Command

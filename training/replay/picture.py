@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mecanum_env.views.canvas import View
 from mecanum_env.views.paint import extent, with_margin
 from mecanum_env.views.pictures import draw_map
+from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
-from slam.types import Belief
 
 __all__ = ["draw_belief", "draw_replay"]
 

@@ -17,12 +17,12 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from slam.belief import Belief
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.logs import ScanLog
 from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
-from slam.types import Belief
 from training.replay.picture import draw_belief, draw_replay
 from training.replay.run import FILES, Replay
 from training.replay.scans import scan_metrics

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -292,10 +292,10 @@ def _frame_between(env: ExploreEnv, share: float, before: Image) -> Image:
         collisions=record.collisions,
     )
     moment = SimpleNamespace(
-        config=config, belief=env.belief, backend=env.backend,
+        config=config, belief=env.belief,
         truth=SimpleNamespace(ground=ground, record=so_far, pose=pose, scan=truth.scan._replace(ranges=ranges)),
     )  # fmt: skip
-    frame = render_frame(cast("ExploreEnv", moment))
+    frame = render_frame(moment)
     middle = frame.shape[1] // 2  # the belief, on the right
     frame[:, middle:] = before[:, middle:]
     return frame

@@ -14,7 +14,7 @@ from agents.driving.follow import WINDOW_M
 from agents.driving.safety import LocalMap, body_gaps, local_map
 from mecanum_env.config import LidarConfig
 from slam import geometry
-from slam.types import Belief
+from slam.belief import Belief
 
 Array = NDArray[np.float64]
 

@@ -16,10 +16,11 @@ from agents.ways import cost_map as cost_maps
 from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
+from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, jacobians, move, twist_between
-from slam.types import LINE, Belief, Observations, Odometry
+from slam.types import LINE, Observations, Odometry
 from tests.agents.grids import belief_of, fill, room
 
 LIDAR, ROBOT = LidarConfig(), RobotConfig()

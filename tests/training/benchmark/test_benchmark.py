@@ -481,7 +481,7 @@ def test_a_digest_follows_imports_and_nothing_else(tmp_path: Path, monkeypatch: 
         not {
             "training.benchmark.report",
             "training.figures.statistics",
-            "training.cli.commands",
+            "training.cli.app",
             "agents",
             "agents.random",
         }

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mecanum_env.arguments import make_config
 from mecanum_env.config import from_toml
-from mecanum_env.env import make_config
 from slam.formats import read_map_server, read_tum
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.landmarks.database import read_landmark_map

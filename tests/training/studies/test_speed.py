@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mecanum_env import rooms
-from mecanum_env.env import make_config
+from mecanum_env.arguments import make_config
 from mecanum_env.sensing.sensors import Lidar
 from training.cli import main
 from training.studies import peers

@@ -22,8 +22,8 @@ from mecanum_env.config import RobotConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, map_frame
 from slam import geometry
+from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Belief
 
 __all__ = ["LOG_PRICE", "NO_WAY", "FollowingTeacher", "map_lesson"]
 

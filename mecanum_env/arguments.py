@@ -1,0 +1,88 @@
+"""From the keyword arguments of ``gym.make`` to a checked configuration, and the backend it asks for."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mecanum_env.config import (
+    LIDAR_PRESETS,
+    NOISE_PRESETS,
+    ROBOT_PRESETS,
+    EnvConfig,
+    LidarConfig,
+    NoiseConfig,
+    RewardConfig,
+    RobotConfig,
+    from_toml,
+    resolve,
+)
+from mecanum_env.rooms.registry import check as check_rooms
+from mecanum_env.sensing.calibration import backend_settings
+from slam.backend import Backend
+from slam.odometry.filters import make_odometry_filter
+from slam.registry import config_type
+from slam.registry import make as make_slam
+from slam.settings import from_mapping
+
+__all__ = ["Settings", "make_backend", "make_config"]
+
+Settings = str | Mapping[str, Any]
+"""A name, or a mapping that configures what it names."""
+
+
+def make_config(
+    *,
+    config: EnvConfig | str | Path | Mapping[str, Any] | None = None,
+    rooms: Settings | None = None,
+    slam: Settings | None = None,
+    robot: Settings | RobotConfig | None = None,
+    lidar: Settings | LidarConfig | None = None,
+    noise: Settings | NoiseConfig | None = None,
+    reward: Mapping[str, Any] | RewardConfig | None = None,
+    floor_plan: str | Path | None = None,
+    odometry_filter: Settings | None = None,
+) -> EnvConfig:
+    """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
+
+    A string names a preset, generator, backend or filter; a mapping configures it (``{"preset": "youbot", …}``,
+    ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
+    Unknown names and keys raise ``ValueError`` that lists the valid ones.
+    """
+    base = from_toml(config) if isinstance(config, str | Path) else from_mapping(EnvConfig, config)
+    changes: dict[str, Any] = {}
+    if isinstance(robot, str) and robot in ROBOT_PRESETS:
+        given_parts = config if isinstance(config, Mapping) else {}
+        lidar = robot if lidar is None and "lidar" not in given_parts else lidar
+        noise = robot if noise is None and "noise" not in given_parts else noise
+    for name, given in (("rooms", rooms), ("slam", slam), ("odometry_filter", odometry_filter)):
+        if isinstance(given, Mapping):
+            options = dict(given)
+            changes[name] = str(options.pop("name", getattr(base, name)))
+            changes[f"{name}_config"] = options
+        elif given is not None:
+            changes[name] = given
+            if given != getattr(base, name):
+                changes[f"{name}_config"] = {}
+    if robot is not None:
+        changes["robot"] = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
+    if lidar is not None:
+        changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
+    if noise is not None:
+        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
+    if reward is not None:
+        changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
+    if floor_plan is not None:
+        changes["floor_plan"] = str(floor_plan)
+    made = dataclasses.replace(base, **changes)
+    check_rooms(made.rooms, made.rooms_config)
+    from_mapping(config_type(made.slam), backend_settings(made))
+    make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
+    return made
+
+
+def make_backend(config: EnvConfig) -> Backend:
+    """Return the backend that an environment's configuration asks for, told of its robot and noise."""
+    return make_slam(config.slam, config=backend_settings(config))

@@ -1,0 +1,185 @@
+"""``mecanum explore`` on the command line."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from training.runs.errors import BadInput, Interrupted, one_line
+from training.runs.options import Json
+
+if TYPE_CHECKING:
+    from training.episodes.explore import Progress
+
+__all__ = ["explore"]
+
+_LOG_EVERY_S = 30.0  # between two lines of progress where standard error is no terminal
+
+
+def explore(
+    agent: Annotated[
+        str | None, typer.Option(help="Who decides where to go, or a policy file.  [default: nearest-frontier]")
+    ] = None,
+    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.  [default: 0]")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/explore"),
+    floor_plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="X,Y,THETA", help="Start pose in the plan's frame, m and rad.")
+    ] = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
+    ] = None,
+    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+    ] = None,
+    max_steps: Annotated[
+        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
+    ] = None,
+    coverage_target: Annotated[
+        float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
+    ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Also film it: episode.mp4, at true speed.")] = False,
+    video_substeps: Annotated[
+        bool, typer.Option("--video-substeps", help="The same, a frame for every substep of the physics.")
+    ] = False,
+    mcap: Annotated[
+        bool, typer.Option("--mcap", help="Also write episode.mcap, ROS 2 messages for Foxglove and RViz.")
+    ] = False,
+    rerun: Annotated[bool, typer.Option("--rerun", help="Also write episode.rrd, for Rerun.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Explore rooms for one episode, until the agent has nothing left to explore.
+
+    Writes into --out: map.png, truth.png, map.pgm + map.yaml (ROS map_server), trajectory_true.tum and
+    trajectory_estimate.tum, landmarks.db (SQLite), config.toml, metrics.json and report.html, which replays the
+    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came.
+
+    \b
+    Examples:
+      mecanum explore
+      mecanum explore --agent nearest-frontier --rooms apartment --slam ekf --seed 3 --out out/seed3
+      mecanum explore --floor-plan office.yaml --start 2.5,1.0,0 --out out/office
+      mecanum explore --config out/seed3/config.toml --out out/again
+      mecanum explore --rooms rectangular --noise slippery --json
+      mecanum explore --agent brisk-tour --video --mcap
+    """  # noqa: D301
+    pose = _parse_start(start)
+    if coverage_target is not None and not 0 < coverage_target <= 1:
+        raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
+    from training.episodes import explore as task
+    from training.episodes.recording import Recorder
+    from training.runs.running import interrupt_flag
+    from training.views.episode_files import check_extras, write_episode
+    from training.views.film import filmed
+
+    options = task.ExploreOptions(
+        out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
+        start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
+    )  # fmt: skip
+    asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
+    extras = [name for name, wanted in asked.items() if wanted]
+    check_extras(extras)
+    episode, recorder = task.prepare(options), Recorder()
+    # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
+    with interrupt_flag() as late, ExitStack() as stack:
+        witnesses: list[task.Witness] = [recorder]
+        film = stack.enter_context(filmed(out, episode.config, video_substeps)) if "video" in extras else None
+        witnesses += [film] if film is not None else []
+        with ExitStack() as progress:
+            task.run(episode, _progress(progress), witnesses)
+        path = film.finish() if film is not None else None
+        if path is None and film is not None:
+            extras.remove("video")
+        metrics = write_episode(episode, recorder.recording(), extras=extras, film=path)
+    if as_json:
+        print(json.dumps(metrics, ensure_ascii=False))
+    else:
+        files = (*task.FILES, *(task.EXTRAS[name] for name in extras))
+        print(_summary(metrics, out, files, task.ENDINGS[metrics["end"]]))
+    if film is not None and film.failure is not None:
+        raise OSError(f"{one_line(film.failure)}; all but the film is in {out}")
+    if episode.interrupted or late.is_set():
+        raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
+
+
+def _parse_start(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, theta = (float(word) for word in text.split(","))
+    except ValueError:
+        raise BadInput(f"--start {text!r} is not X,Y,THETA in m and rad; give for instance 2.5,1.0,0") from None
+    if not all(map(math.isfinite, (x, y, theta))):
+        raise BadInput(f"--start {text!r} must be finite; give for instance 2.5,1.0,0")
+    return x, y, theta
+
+
+def _progress(stack: ExitStack) -> Progress:
+    """Return a progress bar on standard error, or a line now and then where that is no terminal."""
+    if not sys.stderr.isatty():
+        return _LogLines()
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    bar = stack.enter_context(
+        Progress(
+            TextColumn("exploring"), BarColumn(), TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
+            console=Console(stderr=True), transient=True,
+        )
+    )  # fmt: skip
+    task = bar.add_task("exploring", total=1.0, status="")
+
+    def show(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        if steps % 10 == 0:
+            bar.update(task, completed=coverage, status=f"{100 * coverage:.1f} % mapped at {time_s:.0f} s")
+
+    return show
+
+
+class _LogLines:
+    """A line on standard error at the start, and every half a minute."""
+
+    def __init__(self) -> None:
+        self._next = 0.0
+
+    def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+        if steps % 10 == 1 and time.monotonic() >= self._next:
+            self._next = time.monotonic() + _LOG_EVERY_S
+            done = f"{100 * coverage:.1f} % mapped at {time_s:.0f} s"
+            print(f"exploring: step {steps} of at most {max_steps}, {done}", file=sys.stderr, flush=True)
+
+
+def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: str) -> str:
+    def shown(key: str, unit: str, digits: int, factor: float = 1.0) -> str:
+        value = metrics[key]
+        return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
+
+    where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
+    verdict = "success" if metrics["success"] else "target not reached"
+    corners = shown("corner_mean_m", "cm", 1, 100.0)
+    heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
+    rows = (
+        ("explored", f"{where} with {metrics['slam']} and {metrics['agent']}"),
+        ("ended", f"{metrics['end']} ({ending}) after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
+        ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
+        ("path", f"{shown('path_length_m', 'm', 1)}, {metrics['collisions']} collisions"),
+        ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {corners} off on average"),
+        ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
+        ("files", f"{out}/: {', '.join(files)}"),
+    )
+    return "\n".join(f"{name:<12} {text}" for name, text in rows)

@@ -1,0 +1,75 @@
+"""``mecanum replay`` on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from training.runs.errors import Interrupted
+from training.runs.options import Json
+
+__all__ = ["replay"]
+
+
+def replay(
+    log: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG",
+            help="CARMEN or DP-SLAM log; UTIAS: Robot1_Odometry.dat or folder; Victoria Park: folder.",
+        ),
+    ],
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
+    association: Annotated[
+        str | None, typer.Option(help="known or unknown landmark ids.  [default: known where the log has them]")
+    ] = None,
+    robot: Annotated[int | None, typer.Option(min=1, help="Which robot of a UTIAS folder.")] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Log of the same scans with corrected poses.  [default: none]"),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
+    ] = None,
+    limit_s: Annotated[float | None, typer.Option(help="Stop after so many seconds of the log.")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/replay"),
+    as_json: Json = False,
+) -> None:
+    """Run a SLAM backend on the recorded log of a real robot, and compare it with the log's reference.
+
+    Writes into --out: trajectory_estimate.tum, trajectory_true.tum, trajectory.png, landmarks.db (SQLite),
+    landmarks.csv, config.toml and metrics.json; of a log with scans also map.png and map.pgm with map.yaml (ROS
+    map_server). Ctrl-C ends the replay and keeps it as far as it came.
+
+    \b
+    Examples:
+      mecanum replay utias6/Robot1_Odometry.dat.gz --slam ekf --out out/utias1
+      mecanum replay utias6 --robot 3 --association unknown --json
+      mecanum replay victoria_park --slam ekf --limit-s 300 --out out/park
+      mecanum replay intel.gfs.log.gz --reference intel-corrected.log.gz --slam invariant-ekf
+    """  # noqa: D301
+    from training.replay import report as replay_report
+    from training.replay import run as task
+
+    options = task.ReplayOptions(
+        log=log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
+        limit_s=limit_s, config=config,
+    )  # fmt: skip
+    prepared = task.prepare(options)
+    progress = task.Progress(prepared.log.duration_s)
+    try:
+        task.run(prepared, progress)
+    finally:
+        progress.close()
+    metrics = replay_report.write(prepared)
+    print(
+        json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out, prepared.files)
+    )
+    if prepared.interrupted:
+        raise Interrupted(f"interrupted after {metrics['duration_s']:.1f} s of the log; what was done is in {out}")
