@@ -49,8 +49,13 @@ $(RAY).stamp: pyproject.toml constraints.txt
 install: $(VENV)/core.stamp ## install the core into .venv
 
 explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and mapped (SEED, OUT)
-	$(BIN)/mecanum explore --agent nearest-frontier --rooms apartment --slam ekf --seed $(SEED) --out $(OUT)
-	@echo "Open $(OUT)/report.html in a browser: it replays the episode. The figures are in $(OUT)/metrics.json."
+	$(BIN)/mecanum explore --agent ppo-frontier --rooms apartment --seed $(SEED) --out $(OUT)
+	@echo
+	@echo "Open $(OUT)/report.html in a browser: it replays the episode. Then try:"
+	@echo "  make explore SEED=7                              another apartment"
+	@echo "  $(BIN)/mecanum explore --rooms cave              another kind of room"
+	@echo "  $(BIN)/mecanum explore --floor-plan office.yaml  a plan of your own: ROS map or image"
+	@echo "  $(BIN)/mecanum --help                            all else"
 
 test: lint types pytest other-gymnasium ## everything CI checks (WORKERS)
 

@@ -1,4 +1,4 @@
-"""The house keeps its floors: imports flow downward, agents see no truth, importing stays light."""
+"""The house is as its page says: imports flow one way, agents see no truth, importing stays light."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 FLOORS = ("slam", "mecanum_env", "agents", "training")  # lowest first
 HEAVY = ("torch", "stable_baselines3", "pygame", "imageio_ffmpeg", "mcap", "rerun", "mkdocs")
 
@@ -80,6 +83,133 @@ def test_no_agent_touches_the_truth() -> None:
         if (lines := touches_of_truth(path.read_text("utf-8")))
     }
     assert not bad
+
+
+# ---- rooms within the floors -----------------------------------------------------------------------------------
+
+
+@cache
+def module_imports() -> dict[str, frozenset[str]]:
+    """Return per module of the house the modules of the house that it imports, anywhere in its source."""
+    modules = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+        for floor in FLOORS
+        for path in sources(floor)
+    }
+
+    def module(name: str) -> str:
+        return name if name in modules else name.rpartition(".")[0]
+
+    return {
+        name: frozenset(
+            module(other)
+            for _, other in imported(ast.parse(path.read_text("utf-8")))
+            if module(other) in modules and module(other) != name
+        )
+        for name, path in modules.items()
+    }
+
+
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1])
+    return []
+
+
+def within(folder: str) -> dict[str, set[str]]:
+    """Return what a folder's files and folders import of each other, each folder taken as one."""
+    depth = folder.count(".") + 2
+    graph: dict[str, set[str]] = {}
+    for name, others in module_imports().items():
+        if name.startswith(f"{folder}."):
+            child = ".".join(name.split(".")[:depth])
+            inside = {".".join(o.split(".")[:depth]) for o in others if o.startswith(f"{folder}.")}
+            graph.setdefault(child, set()).update(inside - {child})
+    return graph
+
+
+def test_no_two_modules_import_each_other() -> None:
+    assert not circle({name: set(others) for name, others in module_imports().items()})
+
+
+@pytest.mark.parametrize(
+    "folder",
+    sorted({str(p.parent.relative_to(ROOT)).replace("/", ".") for f in FLOORS for p in sources(f)}),
+)
+def test_rooms_import_each_other_in_one_direction(folder: str) -> None:
+    assert not circle(within(folder))
+
+
+def test_circles_are_noticed() -> None:
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+
+
+def test_no_room_is_crowded_and_no_file_long() -> None:
+    for floor in FLOORS:
+        for path in (ROOT / floor).rglob("*"):
+            if path.suffix in (".py", ".js", ".css", ".html"):
+                assert len(path.read_text("utf-8").splitlines()) <= 400, path
+    for folder in {path.parent for floor in FLOORS for path in sources(floor)}:
+        assert len(list(folder.glob("*.py"))) <= 16, folder  # a dozen, and the strategies that are picked by name
+
+
+def test_every_room_has_a_face_that_says_what_it_is_for() -> None:
+    for folder in {path.parent for floor in FLOORS for path in sources(floor)}:
+        face = folder / "__init__.py"
+        assert face.is_file() and ast.get_docstring(ast.parse(face.read_text("utf-8"))), folder
+
+
+# ---- the page --------------------------------------------------------------------------------------------------
+
+
+def rooms_on_the_page() -> list[str]:
+    """Return the modules and folders in the page's tables of rooms, dotted, in its order."""
+    text = PAGE.partition("## Rooms")[2].partition("## How one step flows")[0]
+    rows = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    return [
+        name.strip("/").removesuffix(".py").replace("/", ".")
+        for row in rows
+        for name in re.findall("`(.*?)`", row)
+    ]
+
+
+def room_of(module: str, rooms: list[str]) -> str:
+    return max((r for r in rooms if module == r or module.startswith(f"{r}.")), key=len, default="")
+
+
+def test_the_page_names_every_room() -> None:
+    rooms = rooms_on_the_page()
+    there = set(module_imports())
+    assert set(rooms) <= there
+    folders = {name for name in there if (ROOT / name.replace(".", "/")).is_dir()} - set(FLOORS)
+    top = {name for name in there if name.count(".") == 1}
+    assert folders | top == set(rooms)
+
+
+def test_rooms_import_only_what_stands_before_them_on_the_page() -> None:
+    rooms = rooms_on_the_page()
+    place = {name: k for k, name in enumerate(rooms)}
+    wrong = [
+        f"{name} imports {other}"
+        for name, others in module_imports().items()
+        for other in others
+        if (room := room_of(name, rooms)) and (behind := room_of(other, rooms))
+        # A room and those within it are one concern; their own order is tested above.
+        if not (room.startswith(behind) or behind.startswith(room)) and place[behind] > place[room]
+    ]
+    assert not wrong
+
+
+def test_every_path_on_the_page_exists() -> None:
+    paths = re.findall(r"`((?:slam|mecanum_env|agents|training)/[\w/.]*)(?::(\w+))?`", PAGE)
+    assert len(paths) > 50
+    for path, definition in paths:
+        assert (ROOT / path).exists(), path
+        if definition:
+            source = (ROOT / path).read_text("utf-8")
+            assert re.search(rf"^\s*(def|class) {definition}\b", source, re.MULTILINE), f"{path}: {definition}"
 
 
 @pytest.mark.parametrize(
