@@ -14,6 +14,7 @@ __all__ = ["STUDIES", "study", "study_command"]
 STUDIES = {
     "accuracy": ("training.benchmark.evaluate", "errors of explored maps over seeds, rooms and backends"),
     "calibration": ("training.studies.calibrate", "V of the simulated robot, beside what its estimators are told"),
+    "digests": ("training.studies.digests", "same seed, same bits: digests of episodes, to compare commits by"),
     "dp-slam-cost": (
         "training.studies.dp_slam_cost",
         "cost of DP-SLAM's particles: one grid, or one each",
