@@ -51,7 +51,9 @@ def study(
         print("\n".join(f"  {known:<15} {line}" for known, (_, line) in STUDIES.items()))
         return
     assert name is not None
-    study_command(name).main(args=context.args, prog_name=f"mecanum study {name}", standalone_mode=False)
+    code = study_command(name).main(args=context.args, prog_name=f"mecanum study {name}", standalone_mode=False)
+    if isinstance(code, int) and code:
+        raise typer.Exit(code)
 
 
 def study_command(name: str) -> Any:

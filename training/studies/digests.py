@@ -67,7 +67,7 @@ def digest(episode: Episode) -> str:
         if terminated or truncated:
             break
     belief = inner.belief
-    metrics = getattr(inner, "episode_metrics", dict)()
+    metrics: dict[str, Any] = inner.episode_metrics() if hasattr(inner, "episode_metrics") else {}
     _feed(made, [belief.pose, belief.pose_cov, belief.landmarks, belief.grid.log_odds, metrics])
     env.close()
     return made.hexdigest()
