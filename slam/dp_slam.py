@@ -43,7 +43,7 @@ class DpSlamConfig(BackendConfig):
     update_m: float = 0.2  # the particles are updated when the robot has moved …
     update_rad: float = 0.2  # … or turned so far since the last time
     # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More
-    # than it does: particles that all go one way cannot close a loop (docs/dp_slam.md).
+    # than it does: particles that all go one way cannot close a loop (docs/reference/dp_slam.md).
     drift_m: float = 0.02
     drift_rad: float = 0.01
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows

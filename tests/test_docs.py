@@ -33,12 +33,12 @@ from training.cli.study import STUDIES, study_command
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(DOCS.glob("*.md"))
+PAGES = sorted(DOCS.rglob("*.md"))
 SOURCES = [*PAGES, ROOT / "README.md", ROOT / "BENCHMARK.md", ROOT / "CHANGELOG.md"]
 ENVIRONMENTS = {
-    "mecanum_env/Explore-v0": "environment.md",
-    "mecanum_env/ExploreWheels-v0": "wheels_environment.md",
-    "mecanum_env/ExploreFrontier-v0": "frontier_environment.md",
+    "mecanum_env/Explore-v0": "reference/environment.md",
+    "mecanum_env/ExploreWheels-v0": "reference/wheels_environment.md",
+    "mecanum_env/ExploreFrontier-v0": "reference/frontier_environment.md",
 }
 
 assert mecanum_env, "registers the environments"
@@ -240,7 +240,7 @@ def test_environment_pages_have_the_spaces_of_the_code(name: str) -> None:
 
 
 def test_the_reward_table_has_the_weights_of_the_code() -> None:
-    page = (DOCS / "environment.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference/environment.md").read_text(encoding="utf-8")
     for field in dataclasses.fields(RewardConfig):
         assert f"| `{field.name}` | {field.default} |" in page
 
@@ -363,7 +363,7 @@ def test_the_site_builds_whole_and_loads_nothing_from_elsewhere(
     site = tmp_path / "site"
     config = load_config(str(ROOT / "mkdocs.yml"), site_dir=str(site), strict=True)
     build(config)  # raises where there is a warning: a link, an anchor, an equation, a page that nav leaves out
-    pages = {path: Site(path.read_text(encoding="utf-8")) for path in sorted(site.glob("*.html"))}
+    pages = {path: Site(path.read_text(encoding="utf-8")) for path in sorted(site.rglob("*.html"))}
     assert len(pages) >= len(PAGES) + 3, "README, BENCHMARK and CHANGELOG are pages, too"
     for path, page in pages.items():
         text = path.read_text(encoding="utf-8")

@@ -173,7 +173,7 @@ def edge(
     # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still. And what
     # was seen of an end face: its points pass for the surface's while they lie within a few σ of it, so the end is
     # seen too far or, the line tilted by them, too near. That is much the same from look to look; as noise of each
-    # look it is counted for more than it is, and so adds up to no less (docs/consistency.md).
+    # look it is counted for more than it is, and so adds up to no less (docs/studies/consistency.md).
     along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + 4.0 * limits[SIGMA] ** 2
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]

@@ -1,4 +1,4 @@
-"""Recorded logs of real robots: one reader a format (``docs/replay.md``).
+"""Recorded logs of real robots: one reader a format (``docs/how-to/replay.md``).
 
 Logs of landmark observations become a :class:`RecordedLog`, logs of laser scans a :class:`ScanLog`.
 """

@@ -2,7 +2,7 @@
 
 The wheels' twists are summed up to coordinates x, y, θ, each of which a Kalman-Bucy filter takes for measurements;
 the twist that leads from one filtered pose to the next is what the backend is given. What it brings, and what it
-costs in consistency: ``docs/differential_transform.md``.
+costs in consistency: ``docs/reference/differential_transform.md``.
 """
 
 from __future__ import annotations

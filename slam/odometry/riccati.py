@@ -4,7 +4,7 @@
 
 Where the step would leave what the spectra can tell, it ends there and they are taken anew about its end
 (:func:`advance`). The kernels know no numbers' type: as plain Python they run on numbers that count what is done
-with them, too. Equations and figures: ``docs/differential_transform.md``.
+with them, too. Equations and figures: ``docs/reference/differential_transform.md``.
 """
 
 from __future__ import annotations

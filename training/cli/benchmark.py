@@ -66,7 +66,7 @@ def benchmark(
     Writes into --out: results.sqlite with each episode as it comes, so that the same command goes on where it was
     broken off and more agents, backends, suites or seeds are added to those that are there; episodes.csv,
     summary.csv, comparison.csv, tables.md, summary.json, config.toml, settings.json and, with --report,
-    report.html. docs/benchmark.md says what is counted, and how.
+    report.html. docs/how-to/benchmark.md says what is counted, and how.
 
     \b
     Examples:

@@ -41,7 +41,7 @@ def play(
     """Drive the robot yourself in a window, and watch what it believes.
 
     W A S D drive and strafe, Q E turn, Space lets an agent drive, Tab takes the next SLAM backend, N the next
-    room, F1 shows all keys, Esc quits. A gamepad drives, too. Needs the extra `human`. docs/play.md has the
+    room, F1 shows all keys, Esc quits. A gamepad drives, too. Needs the extra `human`. docs/how-to/play.md has the
     details.
 
     \b

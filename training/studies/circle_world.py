@@ -2,7 +2,7 @@
 
 A robot drives round and round; its odometry is the true twist plus white noise of the covariance that the filter
 is told, and it sees the landmarks within reach, with known ids, in range and bearing with noise of the covariance
-that comes with them. Whatever inconsistency a filter shows here is its own (``docs/consistency.md``).
+that comes with them. Whatever inconsistency a filter shows here is its own (``docs/studies/consistency.md``).
 """
 
 from __future__ import annotations

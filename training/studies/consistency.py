@@ -1,7 +1,7 @@
 """``mecanum consistency``: is the error as large as the covariance says? NEES and NIS over Monte-Carlo runs.
 
 In a :mod:`training.studies.circle_world`, where nothing but the filter can be wrong, or in generated rooms,
-explored by the nearest-frontier agent. ``docs/consistency.md`` has the equations and what was measured.
+explored by the nearest-frontier agent. ``docs/studies/consistency.md`` has the equations and what was measured.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ def write_mcap(
     lidar: LidarConfig,
     about: Mapping[str, str] | None = None,
 ) -> None:
-    """Write an episode as ROS 2 messages; docs/exports.md lists the topics.
+    """Write an episode as ROS 2 messages; docs/how-to/exports.md lists the topics.
 
     Parameters
     ----------

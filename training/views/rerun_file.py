@@ -48,7 +48,7 @@ def check_rerun() -> None:
 def write_rerun(
     recording: Recording, path: str | Path, *, robot: RobotConfig, lidar: LidarConfig, name: str = "episode"
 ) -> None:
-    """Write an episode as a Rerun recording with its blueprint; docs/exports.md lists the entities.
+    """Write an episode as a Rerun recording with its blueprint; docs/how-to/exports.md lists the entities.
 
     Parameters
     ----------
