@@ -81,7 +81,7 @@ rllib: $(RAY).stamp ## the RLlib example, in an environment of its own (not in C
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo
 
-evaluate: $(VENV)/core.stamp ## the README's accuracy table: 300 episodes on the test seeds
+evaluate: $(VENV)/core.stamp ## the table of docs/studies/estimators.md: 300 episodes on the test seeds
 	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate
 
 benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (hours; goes on where it was broken off)

@@ -21,7 +21,7 @@ __all__ = ["SETTINGS", "ScanLog", "chain", "rising", "without_returns"]
 Array = NDArray[np.float64]
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
-# way as measured on the Intel log against its corrected poses, see docs/how-to/replay.md.
+# way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.
 SETTINGS = {
     "lidar_offset_m": 0.0,
     "odometry": {

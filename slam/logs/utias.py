@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 FIRST_LANDMARK = 6
 """Subjects below this are robots."""
 
-# Both measured against Vicon on robots 1 and 3 of data set 6, see docs/how-to/replay.md.
+# Both measured against Vicon on robots 1 and 3 of data set 6, see docs/studies/real-logs.md.
 NOISE = ObservationNoise(range_m=0.17, bearing_deg=1.1)
 
 SETTINGS = {

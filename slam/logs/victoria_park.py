@@ -37,7 +37,7 @@ LASER_AHEAD_M, LASER_LEFT_M = 3.78, 0.5
 """a, b: where the laser sits, from the rear axle's centre."""
 
 START_HEADING = math.radians(35.5)
-"""Heading at the start [rad]; of the reference's frame, no estimator can know it (docs/how-to/replay.md)."""
+"""Heading at the start [rad]; of the reference's frame, no estimator can know it (docs/studies/real-logs.md)."""
 
 NOISE = ObservationNoise(range_m=1.5, bearing_deg=2.8)
 

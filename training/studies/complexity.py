@@ -1,7 +1,7 @@
 """``mecanum complexity``: how long one step of an estimator takes, against the number of landmarks in its map.
 
 The landmarks stand one a square metre however many there are, so that the robot, which drives in their midst,
-always sees as many: what grows is the map that it does not see. ``docs/studies/consistency.md`` has what was measured.
+always sees as many: what grows is the map that it does not see. ``docs/studies/speed.md`` has what was measured.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 ``mecanum study paper-b --out DIR`` follows one run of the EKFs, with the start uncertain by 10 cm,
 and one of each FastSLAM, and writes ``determinants.png``, ``variances.png``, ``correlations.png``,
-``particles.png`` and ``paper_b.json``. What the figures mean: ``docs/studies/consistency.md``.
+``particles.png`` and ``paper_b.json``. What the figures mean: ``docs/studies/paper-b.md``.
 """
 
 from __future__ import annotations

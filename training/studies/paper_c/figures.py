@@ -3,7 +3,7 @@
 ``mecanum study paper-c --out DIR`` writes ``figure_2.png`` (the covariance against a stiff
 solver), ``figure_3.png`` (the estimate's error with exact initial conditions, and 10 % off), ``work.png``
 (operations and time against RK45 and matrix exponentials), ``odometry.png`` (the odometry of an accelerating
-robot, filtered) and ``paper_c.json``. What they mean: ``docs/reference/differential_transform.md``.
+robot, filtered) and ``paper_c.json``. What they mean: ``docs/studies/paper-c.md``.
 """
 
 from __future__ import annotations
