@@ -1,7 +1,8 @@
 """Nearest frontier first (Yamauchi, 1997), by the cost of the way there.
 
 Of a robot that hops over the stations of a lattice and looks only where it stops, the nearest station from which
-enough of the frontier is in sight: the rule that the benchmark of ``docs/studies/dungeons.md`` has under this name.
+enough of the frontier is in sight: the rule that the benchmark of ``docs/studies/dungeons.md`` has under this
+name.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How good a belief is: the only place where metrics are computed. Pure functions of arrays.
 
-Trajectories, consistency, corners, maps and coverage; ``docs/reference/metrics.md`` has the equations on one page. A
-metric of nothing (no landmark, no cell) is ``nan``, so that it can be told from a bad one.
+Trajectories, consistency, corners, maps and coverage; ``docs/reference/metrics.md`` has the equations.
+A metric of nothing (no landmark, no cell) is ``nan``, so that it can be told from a bad one.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 The spectrum of x about t₀ with scale h is X(k) = hᵏ/k! x⁽ᵏ⁾(t₀), an array ``(order + 1,)`` in the units of x; the
 original is x(t₀ + θ h) = Σ X(k) θᵏ, or a Padé fraction that agrees with it (theory.md C, differential transform).
-The filter that these serve is in :mod:`slam.odometry.riccati`. Equations: ``docs/reference/differential_transform.md``.
+The filter that these serve is in :mod:`slam.odometry.riccati`.
+Equations: ``docs/reference/differential_transform.md``.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ def _ranked(agents: Summary) -> list[str]:
 
 
 def _name(agent: str) -> str:
-    return f"*{agent}* (a bound, no agent)" if agent.split("@")[0] == _BOUND else f"`{agent}`"
+    return f"*{agent}* (knows the plan, no agent)" if agent.split("@")[0] == _BOUND else f"`{agent}`"
 
 
 def _value(figures: Summary | None, key: str, factor: float, digits: int, interval: bool = False) -> str:

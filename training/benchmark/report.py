@@ -31,8 +31,8 @@ _READING = """<p>Figures are interquartile means over the episodes (the mean of 
 and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
 reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
 
-_BOUND = f"""<p><b>{KNOWN_MAP}</b> is no agent: it plans on the true map, and stands here as a bound in practice
-for what agents can do.</p>"""
+_BOUND = f"""<p><b>{KNOWN_MAP}</b> is no agent: it plans on the true map, and stands here for comparison. Its tours
+are found by local search, so it is no true bound.</p>"""
 
 
 def write_report(out: Path, report: Report) -> None:

@@ -1,4 +1,4 @@
-"""``mecanum benchmark``: agents × backends × suites × seeds, kept row by row; ``docs/how-to/benchmark.md`` says how."""
+"""``mecanum benchmark``: agents × backends × suites × seeds, kept row by row; see ``docs/how-to/benchmark.md``."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def benchmark(
         ),
     ] = None,
     agents: Annotated[
-        str, typer.Option(help="Agents or policy files, separated by commas; known-map for a bound.")
+        str, typer.Option(help="Agents or policy files, separated by commas; known-map knows the plan.")
     ] = "nearest-frontier",
     slam: Annotated[
         str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")

@@ -46,7 +46,7 @@ def train(
 
     Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
     curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes
-    on from its last checkpoint with --resume, and ends as it would have without. docs/how-to/training.md has the details.
+    on from its last checkpoint with --resume, and ends as it would have without. See docs/how-to/training.md.
 
     \b
     Examples:

@@ -1,7 +1,7 @@
 """Robust averages with bootstrap intervals, and comparisons in pairs.
 
 Interquartile means, stratified bootstrap and probability of improvement as in Agarwal et al., "Deep reinforcement
-learning at the edge of the statistical precipice", NeurIPS 2021; ``docs/how-to/benchmark.md`` says what is made of them.
+learning at the edge of the statistical precipice", NeurIPS 2021; ``docs/how-to/benchmark.md`` says what for.
 Everything is drawn from fixed seeds: the same values give the same intervals.
 """
 
