@@ -1,4 +1,4 @@
-"""The accuracy table of ``docs/studies/estimators.md``: episodes over seeds, rooms and backends, and their medians.
+"""The accuracy table of ``docs/studies/estimators.md``: episodes over seeds, rooms, backends; their medians.
 
 ``mecanum study accuracy --seeds 10000:10049 --out results/episodes`` runs what is missing in
 ``episodes.jsonl`` (a killed run goes on where it stopped), then writes ``episodes.csv`` and ``summary.json`` and
