@@ -270,6 +270,17 @@ def config_defaults() -> dict[str, set[float]]:
     return found
 
 
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 200
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+def test_pages_say_first_what_they_are_for(page: Path) -> None:
+    title, after = page.read_text(encoding="utf-8").split("\n\n", 2)[:2]
+    assert re.fullmatch(r"# .+", title)
+    assert re.match(r"[A-Z`\[]", after) and not after.startswith(("Code:", "```")), "prose follows the title"
+
+
 # ---- links -----------------------------------------------------------------------------------------------------
 
 
