@@ -1,7 +1,7 @@
 """The report of an episode: one page that needs nothing else and replays the run in the browser.
 
-The page is put together from ``assets/episode.html``, ``.css`` and ``.js``. What it replays travels in it as
-arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to have
+The page is put together from ``assets/``: a frame, a style sheet and scripts, one a concern. What it replays
+travels in it as arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to have
 ``DecompressionStream`` (all major ones since spring 2023).
 """
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["LOST", "NO_RETURN", "episode_page", "pack", "unpack"]
 
 _ASSETS = Path(__file__).parent / "assets"
+_SCRIPTS = ("recording.js", "plan_views.js", "curves.js", "player.js")  # the last puts the others to work
 _TRUTH_PX = 1400  # of the true plan's longer side
 _MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
 _RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
@@ -86,7 +87,7 @@ def episode_page(
         "CONFIG": escape(config),
         "HEADER": json.dumps(header).replace("</", "<\\/"),
         "DATA": _deflated(header["arrays"], arrays),
-        "SCRIPT": _asset("episode.js"),
+        "SCRIPT": "".join(map(_asset, _SCRIPTS)),
     }
     page = _asset("episode.html")
     before, *pieces = page.split("{{")
