@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Classes = NDArray[np.int8]
 
 
-def maps(recording: Recording, *, least_s: float = 0.0) -> Iterator[tuple[int, Classes]]:
+def maps(recording: Recording, *, least_s: float = 1.0) -> Iterator[tuple[int, Classes]]:
     """Return the map each time it had changed: the step, and the classes ``(rows, cols)``.
 
     Every map covers :meth:`Recording.bounds`, row 0 at the lowest y. Two of them are at least ``least_s`` [s]
@@ -27,7 +27,7 @@ def maps(recording: Recording, *, least_s: float = 0.0) -> Iterator[tuple[int, C
     classes = np.full((row1 - row0, col1 - col0), UNKNOWN, np.int8)
     changes = recording.map_changes
     due_s = -np.inf
-    for k, (step, cells) in enumerate(zip(changes.steps.tolist(), changes.values, strict=True)):
+    for k, (step, cells) in enumerate(changes.items()):
         classes[cells[:, 0] - row0, cells[:, 1] - col0] = cells[:, 2]
         time_s = float(recording.times[step])
         # Half a step's grace: times are sums of steps that binary numbers do not hold exactly.

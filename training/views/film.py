@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mecanum_env.views.render import render_frame
 from slam.formats import replacing
 from slam.geometry import compose, exp, inverse, log
-from training.runs.errors import BadInput
+from training.runs.errors import BadInput, needs_extra
 
 if TYPE_CHECKING:
     from agents.base import Goal
@@ -180,12 +180,10 @@ def film(path: str | Path, *, fps: float) -> Iterator[Write]:
 
 def check_video() -> str:
     """Return the path of ffmpeg; raise :class:`BadInput` where it is missing, before an episode is run in vain."""
-    try:
+    with needs_extra("video", "a film"):
         import imageio_ffmpeg
-
+    try:
         program = str(imageio_ffmpeg.get_ffmpeg_exe())
-    except ModuleNotFoundError as error:
-        raise BadInput(f"a film needs {error.name}; install it with pip install 'mecanum-slam[video]'") from error
     except RuntimeError as error:
         raise BadInput(f"a film needs ffmpeg, and there is none for this machine: {error}") from error
     if shutil.which(program) is None:

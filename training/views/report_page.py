@@ -1,8 +1,8 @@
 """The report of an episode: one page that needs nothing else and replays the run in the browser.
 
 The page is put together from ``assets/``: a frame, a style sheet and scripts, one a concern. What it replays
-travels in it as arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to have
-``DecompressionStream`` (all major ones since spring 2023).
+travels in it as arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to
+have ``DecompressionStream`` (all major ones since spring 2023).
 """
 
 from __future__ import annotations

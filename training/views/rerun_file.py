@@ -16,8 +16,8 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam.formats import replacing
 from slam.geometry import wrap
 from training.episodes.playback import ellipses, map_origin, maps
-from training.episodes.recording import Recorded, Recording
-from training.runs.errors import BadInput
+from training.episodes.recording import Recording
+from training.runs.errors import needs_extra
 
 __all__ = ["check_rerun", "write_rerun"]
 
@@ -26,8 +26,6 @@ Array = NDArray[np.float64]
 APPLICATION = "mecanum-slam"
 TIMELINE = "time"
 
-_MAP_EVERY_S = 1.0
-_SIGMAS = 3.0
 _BODY_HEIGHT_M, _LANDMARK_HEIGHT_M = 0.14, 0.01
 _SCAN_Z_M, _PATH_Z_M, _LANDMARK_Z_M = 0.03, 0.02, 0.04  # above the map, which would hide them
 _SCAN_PX, _PATH_PX, _LANDMARK_PX = 1.2, 1.2, 3.0  # radii on the screen
@@ -39,10 +37,8 @@ _BELIEVED, _TRUE, _PLANNED, _LANDMARK = (44, 96, 205), (22, 140, 112), (222, 92,
 
 def check_rerun() -> None:
     """Raise :class:`BadInput` where the library is missing, before an episode is run in vain."""
-    try:
+    with needs_extra("rerun", "--rerun"):
         import rerun  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise BadInput(f"--rerun needs {error.name}; install it with pip install 'mecanum-slam[rerun]'") from error
 
 
 def write_rerun(
@@ -107,7 +103,7 @@ def _log_map(log: _Log) -> None:
 
     steps, cells = [], []
     rows = cols = 0
-    for step, classes in maps(log.recording, least_s=_MAP_EVERY_S):
+    for step, classes in maps(log.recording):
         rows, cols = classes.shape
         steps.append(step)
         cells.append(classes[::-1].tobytes())  # an image: its first row is the highest y
@@ -188,19 +184,19 @@ def _log_landmarks(log: _Log) -> None:
     """Log the landmarks, and of each its 3σ ellipse, flat."""
     import rerun as rr
 
-    noted = _last_of_each_step(log.recording.landmarks)
-    rows = np.concatenate(list(noted.values()))
-    counts = [len(values) for values in noted.values()]
+    noted = log.recording.landmarks
+    rows = np.concatenate(noted.values)
+    counts = [len(values) for values in noted.values]
     centres = np.column_stack([rows[:, :2], np.full(len(rows), _LANDMARK_Z_M)])
-    axes, directions = ellipses(rows, _SIGMAS)
+    axes, directions = ellipses(rows)
     half_sizes = np.column_stack([axes, np.full(len(rows), _LANDMARK_HEIGHT_M)])
     dots = rr.Points3D.from_fields(colors=[_LANDMARK], radii=rr.Radius.ui_points(_LANDMARK_PX))
     log.stream.log("world/landmarks", dots, static=True)
-    log.columns("world/landmarks", list(noted), rr.Points3D.columns(positions=centres).partition(counts))
+    log.columns("world/landmarks", noted.steps, rr.Points3D.columns(positions=centres).partition(counts))
     rims = rr.Ellipsoids3D.from_fields(colors=[_LANDMARK], fill_mode=rr.components.FillMode.Solid)
     log.stream.log("world/landmarks/ellipses", rims, static=True)
     columns = rr.Ellipsoids3D.columns(half_sizes=half_sizes, centers=centres, quaternions=_quaternions(directions))
-    log.columns("world/landmarks/ellipses", list(noted), columns.partition(counts))
+    log.columns("world/landmarks/ellipses", noted.steps, columns.partition(counts))
 
 
 def _log_curves(log: _Log) -> None:
@@ -248,10 +244,6 @@ def _blueprint(recording: Recording) -> Any:
 
 
 # ---- helpers ---------------------------------------------------------------------------------------------------
-
-
-def _last_of_each_step(recorded: Recorded) -> dict[int, NDArray[Any]]:
-    return dict(zip(recorded.steps.tolist(), recorded.values, strict=True))
 
 
 def _quaternions(headings: Array) -> Array:
