@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.rooms.draw import FLOOR, INK, PAGE, ROBOT, WALL
-from mecanum_env.views.canvas import Canvas, View, blend, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, ROBOT, WALL, Canvas, View, blend, put_text, text_width
 from mecanum_env.views.paint import (
     BEAM,
     BELIEVED_PATH,
