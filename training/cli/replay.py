@@ -10,6 +10,7 @@ import typer
 
 from training.runs.errors import Interrupted
 from training.runs.options import Json
+from training.runs.progress import Progress
 
 __all__ = ["replay"]
 
@@ -62,11 +63,9 @@ def replay(
         limit_s=limit_s, config=config,
     )  # fmt: skip
     prepared = task.prepare(options)
-    progress = task.Progress(prepared.log.duration_s)
-    try:
-        task.run(prepared, progress)
-    finally:
-        progress.close()
+    whole_s = prepared.log.duration_s
+    with Progress("replaying", whole_s) as progress:
+        task.run(prepared, lambda time_s: progress.show(time_s, f"{time_s:.0f} of {whole_s:.0f} s"))
     metrics = replay_report.write(prepared)
     print(
         json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out, prepared.files)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ from training.runs.running import interrupt_flag
 __all__ = [
     "FILES",
     "MAP_FILES",
-    "Progress",
     "Replay",
     "ReplayConfig",
     "ReplayOptions",
@@ -278,30 +276,3 @@ def _pose_nees(backend: Backend, true_pose: Array) -> float:
     if own is not None:  # a filter whose error is not the plain difference
         return float(own(true_pose))
     return float(nees_pose(backend.pose, backend.pose_cov, true_pose))
-
-
-class Progress:
-    """How far a replay is, and how long it will take: one line that changes, or now and then a line."""
-
-    def __init__(self, duration_s: float, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stderr
-        self._duration = duration_s
-        self._terminal = self._stream.isatty()
-        self._began = time.monotonic()
-        self._next = self._began + (0.2 if self._terminal else 5.0)
-
-    def __call__(self, time_s: float) -> None:
-        """Show it, where it is time to."""
-        now = time.monotonic()
-        if now < self._next or time_s <= 0.0:
-            return
-        self._next = now + (0.2 if self._terminal else 30.0)
-        left = (now - self._began) * (self._duration - time_s) / max(time_s, 1e-9)
-        text = f"replaying: {time_s:.0f} of {self._duration:.0f} s, {left:.0f} s to go"
-        print(f"\r{text:<60}" if self._terminal else text, end="" if self._terminal else "\n",
-              file=self._stream, flush=True)  # fmt: skip
-
-    def close(self) -> None:
-        """Take the line away."""
-        if self._terminal:
-            print(f"\r{'':<60}\r", end="", file=self._stream, flush=True)
