@@ -17,8 +17,8 @@ from mecanum_env import rooms as room_registry
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 from training.episodes.known_map import NAME as KNOWN_MAP
-from training.episodes.known_map import KnownMap
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 
@@ -167,12 +167,7 @@ class Session:
 
     def _make_agent(self, env: ExploreEnv, seed: int) -> Agent:
         """Return the agent, told of the belief as it is now: it may take over anywhere."""
-        config = env.config
-        agent: Agent
-        if self.agent_name == KNOWN_MAP:
-            agent = KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-        else:
-            agent = agents.make(self.agent_name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent = make_agent(self.agent_name, env)
         agent.reset(env.belief, seed)
         return agent
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +18,8 @@ from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_referenc
 from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.settings import from_mapping, require, to_mapping, unknown_name
-from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.config_files import read_config
+from training.runs.errors import bad_input, check_writable
 from training.runs.running import interrupt_flag
 
 __all__ = [
@@ -129,9 +129,8 @@ def prepare(options: ReplayOptions) -> Replay:
         if options.slam is not None:
             slam.config_type(options.slam)  # before a log is read in vain
         check_writable(options.out, (*MAP_FILES, *FILES))
-        values = _read_config(options.config) if options.config is not None else {}
-        run = {"seed": 0} | _run_table(values.pop("run", {}), options.config)
-        run |= {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
+        values, past = read_config(options.config, _RUN_KINDS) if options.config is not None else ({}, {})
+        run = {"seed": 0} | past | {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
         log = open_log(options.log, robot=options.robot)
         if "reference" in run:
             log = with_reference(log, run["reference"])
@@ -195,27 +194,6 @@ def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) ->
     known = {key: value for key, value in log.settings.items() if key in kind.__dataclass_fields__}
     settings = from_mapping(kind, config.slam_config, base=from_mapping(kind, known))
     return ReplayConfig(observation=config.observation, slam=name, slam_config=to_mapping(settings))
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
-
-
-def _run_table(run: object, path: Path | None) -> dict[str, Any]:
-    """Return association, seed, limit and reference from a config's [run] table, where it has them."""
-    if not isinstance(run, dict):
-        raise BadInput(f"config {path}: [run] must be a table; see a config.toml")
-    for key, kinds in _RUN_KINDS.items():
-        if key in run and type(run[key]) not in kinds:
-            raise BadInput(f"config {path}: [run] {key} has the wrong type; see a config.toml")
-    if run.get("seed", 0) < 0:
-        raise BadInput(f"config {path}: [run] needs seed ≥ 0")
-    return {key: run[key] for key in _RUN_KINDS if key in run}
 
 
 # ---- the replay ------------------------------------------------------------------------------------------------

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,11 +100,9 @@ def film_episode(
 class Film:
     """A camera whose film may fail: then it films no more, and what it was told of the episode goes on."""
 
-    def __init__(self, path: Path, config: EnvConfig, *, substeps: bool) -> None:
-        self._path = path
+    def __init__(self, path: Path, camera: Camera, stack: ExitStack) -> None:
+        self._path, self._camera, self._open = path, camera, stack
         self.failure: OSError | None = None
-        self._open = ExitStack()
-        self._camera = self._open.enter_context(film_episode(path, config, substeps=substeps))
 
     def take(self, env: ExploreEnv, goal: Goal | None) -> None:
         """Film the environment as it is after ``reset`` or a step."""
@@ -123,22 +120,14 @@ class Film:
             self.failure = self.failure or error
         return self._path if self.failure is None else None
 
-    def give_up(self, *error: Any) -> None:
-        """Leave nothing of a film that is not finished, for an error as ``__exit__`` is told of it."""
-        self._open.__exit__(*error)
-
 
 @contextmanager
 def filmed(out: Path, config: EnvConfig, substeps: bool) -> Iterator[Film]:
     """Give a :class:`Film` that is made in a folder within ``out``, which goes when the block ends."""
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder:
-        made = Film(Path(folder) / "episode.mp4", config, substeps=substeps)
-        try:
-            yield made
-        except BaseException:
-            made.give_up(*sys.exc_info())
-            raise
+    with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder, ExitStack() as stack:
+        path = Path(folder) / "episode.mp4"
+        yield Film(path, stack.enter_context(film_episode(path, config, substeps=substeps)), stack)
 
 
 @contextmanager

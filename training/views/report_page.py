@@ -25,13 +25,14 @@ from mecanum_env.views.canvas import Canvas, View
 from mecanum_env.views.paint import paint_plan
 from mecanum_env.views.pictures import episode_view
 from slam.geometry import inverse
+from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
     from mecanum_env.env import ExploreEnv
 
-__all__ = ["LOST", "NO_RETURN", "episode_page", "pack", "unpack"]
+__all__ = ["LOST", "NO_RETURN", "episode_page", "pack"]
 
 _ASSETS = Path(__file__).parent / "assets"
 _SCRIPTS = ("recording.js", "plan_views.js", "curves.js", "player.js")  # the last puts the others to work
@@ -152,15 +153,6 @@ def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
     return header, arrays
 
 
-def unpack(header: Mapping[str, Any], data: str) -> Arrays:
-    """Return the arrays, flat, from the base64 text that the page holds: what its script does."""
-    raw, at, arrays = zlib.decompress(base64.b64decode(data)), 0, {}
-    for name, kind, size in header["arrays"]:
-        arrays[name] = np.frombuffer(raw, np.dtype(kind).newbyteorder("<"), size, at)
-        at += _padded(arrays[name].nbytes)
-    return arrays
-
-
 def _deflated(listed: list[list[Any]], arrays: Arrays) -> str:
     """Return the arrays in base64, each beginning at a multiple of four bytes, as typed arrays have to."""
     parts = []
@@ -200,11 +192,8 @@ def _ranges(scans: Recorded, range_max: float) -> NDArray[np.uint8]:
 
 def _ellipses(landmarks: NDArray[np.float32]) -> NDArray[np.int32]:
     """Return ``(5, n)``: x, y [mm], semi-axes [0.1 mm], direction of the longer one [°]."""
-    x, y, xx, xy, yy = landmarks.astype(np.float64).T
-    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    axes = [np.sqrt(np.maximum(middle + sign * half, 0.0)) for sign in (1, -1)]
-    angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))
-    rows = [1e3 * x, 1e3 * y, *(1e4 * axis for axis in axes), angle]
+    axes, directions = ellipses(landmarks, sigmas=1.0)
+    rows = [*(1e3 * landmarks[:, :2].T), *(1e4 * axes.T), np.degrees(directions)]
     return np.clip(np.rint(rows), -(2**31), 2**31 - 1).astype(np.int32)
 
 
