@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import BadInput, suggestion
-from training.runs.options import Json
 
 __all__ = ["benchmark"]
 
@@ -51,15 +51,13 @@ def benchmark(
     scan: Annotated[
         str, typer.Option(help="How that protocol looks around: way-points or continuous.")
     ] = "way-points",
-    max_steps: Annotated[
-        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
-    ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/benchmark"),
+    max_steps: opt.MaxSteps = None,
+    workers: opt.Workers = None,
+    out: opt.Out = Path("out/benchmark"),
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html, one page of all of it.")
     ] = False,
-    as_json: Json = False,
+    as_json: opt.Json = False,
 ) -> None:
     """Let agents explore suites of rooms, and compare them with confidence intervals.
 

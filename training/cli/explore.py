@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import BadInput, Interrupted, one_line
-from training.runs.options import Json
 from training.runs.progress import Progress
 
 __all__ = ["explore"]
@@ -22,28 +22,18 @@ def explore(
     agent: Annotated[
         str | None, typer.Option(help="Who decides where to go, or a policy file.  [default: nearest-frontier]")
     ] = None,
-    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
-    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.  [default: 0]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/explore"),
-    floor_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
-    ] = None,
+    rooms: opt.Rooms = None,
+    slam: opt.Slam = None,
+    seed: opt.SeedOrNone = None,
+    out: opt.Out = Path("out/explore"),
+    floor_plan: opt.FloorPlanFile = None,
     start: Annotated[
         str | None, typer.Option(metavar="X,Y,THETA", help="Start pose in the plan's frame, m and rad.")
     ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
-    ] = None,
-    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
-    ] = None,
-    max_steps: Annotated[
-        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
-    ] = None,
+    robot: opt.Robot = None,
+    noise: opt.Noise = None,
+    config: opt.ConfigFile = None,
+    max_steps: opt.MaxSteps = None,
     coverage_target: Annotated[
         float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
     ] = None,
@@ -55,7 +45,7 @@ def explore(
         bool, typer.Option("--mcap", help="Also write episode.mcap, ROS 2 messages for Foxglove and RViz.")
     ] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="Also write episode.rrd, for Rerun.")] = False,
-    as_json: Json = False,
+    as_json: opt.Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
 
