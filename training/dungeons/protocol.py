@@ -24,12 +24,10 @@ from slam.settings import unknown_name
 from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import Dungeon, layout, load
-from training.runs.campaign import check_settings, installed_version, run_all, write_settings
+from training.runs.campaign import Row, all_rows, check_settings, installed_version, write_settings
 from training.runs.errors import BadInput, bad_input
 
 __all__ = ["PUBLISHED", "run_dungeons", "summarise", "table"]
-
-Row = dict[str, Any]
 
 BASELINE = "nearest-frontier"
 """The agent that the others' ratios are taken to: the published rule, as far as it is known."""
@@ -90,17 +88,10 @@ def run_dungeons(
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
     write_settings(out, settings)
     jobs = [_Job(name, path, digests[path], scan) for path in paths for name in dict.fromkeys(agent_names)]
-    done = {(row["agent"], row["digest"]): row for row in _read(out / _STORE)}
-    with (out / _STORE).open("a", encoding="utf-8") as file:
-
-        def keep(job: _Job, row: Row) -> None:
-            done[job.agent, job.digest] = row
-            # One write a row: what is killed in between leaves whole rows behind.
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-
-        missing = [job for job in jobs if (job.agent, job.digest) not in done]
-        run_all(missing, _run, workers=workers, keep=keep, what="episodes")
+    done = all_rows(
+        out / _STORE, {(job.agent, job.digest): job for job in jobs}, _run,
+        key=lambda row: (row["agent"], row["digest"]), workers=workers, what="episodes",
+    )  # fmt: skip
     rows = [done[job.agent, job.digest] | {"map": job.path.stem, "layout": layouts[job.path]} for job in jobs]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
     atomic_write(out / _CSV, _csv(rows))
@@ -214,16 +205,6 @@ def _bound(dungeon: Dungeon, name: str) -> Row:
         "unseen_cells": 0,
         "end": "covered",
     }
-
-
-def _read(store: Path) -> list[Row]:
-    rows = []
-    for line in store.read_text(encoding="utf-8").splitlines() if store.exists() else ():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue  # the row that was being written when the run was killed: it is run again
-    return rows
 
 
 def _csv(rows: Sequence[Row]) -> str:

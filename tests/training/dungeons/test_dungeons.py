@@ -263,8 +263,6 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     assert [line.split(",")[:2] for line in csv[1:3]] == [["nearest-frontier", "2"], ["tour", "2"]]
     # Broken off in the middle of a row: only that one is run again.
     store.write_text("\n".join(rows[:3]) + "\n" + rows[3][:20])
-    with store.open("a") as file:
-        file.write("\n")
     ran = []
     import training.dungeons.protocol as command
 
