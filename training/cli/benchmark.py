@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -87,7 +86,7 @@ def benchmark(
         names = [part.strip() for part in agents.split(",") if part.strip()]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers or os.cpu_count() or 1, scan=scan)
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers, scan=scan)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task
@@ -100,7 +99,7 @@ def benchmark(
         floor_plans=floor_plans, max_steps=max_steps,
     )  # fmt: skip
     try:
-        result = task.benchmark(plan, out=out, workers=workers or os.cpu_count() or 1)
+        result = task.benchmark(plan, out=out, workers=workers)
     except task.EpisodesFailed as failed:
         if report:
             write_report(out, failed.report)

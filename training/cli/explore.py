@@ -24,7 +24,7 @@ def explore(
     ] = None,
     rooms: opt.Rooms = None,
     slam: opt.Slam = None,
-    seed: opt.SeedOrNone = None,
+    seed: opt.RoomSeedOrNone = None,
     out: opt.Out = Path("out/explore"),
     floor_plan: opt.FloorPlanFile = None,
     start: Annotated[

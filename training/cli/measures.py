@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from training.runs import options as opt
 from training.runs.errors import bad_input
+from training.runs.options import Json
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -20,11 +20,11 @@ def speed(
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
     beams: Annotated[int, typer.Option(min=8, help="Beams of the lidar.")] = 360,
-    seed: opt.Seed = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
     peer: Annotated[
         str | None, typer.Option(help="Another simulator to measure in turn, in the same rooms: navground.")
     ] = None,
-    as_json: opt.Json = False,
+    as_json: Json = False,
 ) -> None:
     """Measure the steps per second of one environment, and where the time goes.
 
@@ -46,7 +46,7 @@ def speed(
 
 
 def consistency(
-    slam: opt.Slams = "ekf",
+    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
     rooms: Annotated[
         str, typer.Option(help="A world of landmarks (circle, room), or a generator of rooms.")
     ] = "circle",
@@ -56,9 +56,9 @@ def consistency(
     ] = None,
     noise: Annotated[float, typer.Option(help="Times the noise, told to the backends.")] = 1.0,
     seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
-    workers: opt.Workers = None,
-    out: opt.Out = Path("out/consistency"),
-    as_json: opt.Json = False,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/consistency"),
+    as_json: Json = False,
 ) -> None:
     """Ask whether errors are as large as the covariances say: NEES and NIS over Monte-Carlo runs.
 
@@ -80,13 +80,13 @@ def consistency(
 
 
 def complexity(
-    slam: opt.Slams = "ekf",
+    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
     landmarks: Annotated[
         str, typer.Option(help="Sizes of the map, separated by commas.")
     ] = "25,50,100,200,400,800",
     steps: Annotated[int, typer.Option(min=10, max=100_000, help="Steps that a median is taken of.")] = 100,
-    out: opt.Out = Path("out/complexity"),
-    as_json: opt.Json = False,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/complexity"),
+    as_json: Json = False,
 ) -> None:
     """Measure the time per step against the number of landmarks in the map.
 

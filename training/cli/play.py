@@ -25,7 +25,7 @@ def play(
     ] = "nearest-frontier",
     rooms: opt.Rooms = None,
     slam: opt.Slam = None,
-    seed: opt.Seed = 0,
+    seed: opt.RoomSeed = 0,
     floor_plan: opt.FloorPlanFile = None,
     robot: opt.Robot = None,
     noise: opt.Noise = None,

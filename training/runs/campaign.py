@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from importlib.metadata import PackageNotFoundError, version
@@ -23,8 +23,6 @@ from training.runs.errors import BadInput, Interrupted, check_writable
 from training.runs.progress import Progress
 
 __all__ = [
-    "Row",
-    "all_rows",
     "backend_names",
     "check_settings",
     "installed_version",
@@ -37,9 +35,6 @@ __all__ = [
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
-Key = TypeVar("Key", bound=Hashable)
-Row = dict[str, Any]
-"""What a run left, as JSON has it."""
 
 SETTINGS = "settings.json"
 # The libraries' own threads only get in each other's way where every core has its worker.
@@ -120,47 +115,11 @@ def write_settings(out: Path, settings: Mapping[str, Any]) -> None:
 # ---- running it ------------------------------------------------------------------------------------------------
 
 
-def all_rows(
-    store: Path, jobs: Mapping[Key, Job], work: Callable[[Job], Row], *, key: Callable[[Row], Key], workers: int,
-    what: str = "runs",
-) -> dict[Key, Row]:  # fmt: skip
-    """Return the rows of all jobs; those that a file does not hold yet are run, and kept there as they come.
-
-    Parameters
-    ----------
-    store
-        The file, a JSON object a line. Whatever kills the process leaves whole rows behind: a line that was cut
-        off is run again.
-    jobs, work
-        Job by key; ``work(job)`` is its row. See :func:`run_all`.
-    key
-        Which job a row is of.
-    """
-    rows: dict[Key, Row] = {}
-    text = store.read_text(encoding="utf-8") if store.exists() else ""
-    for line in text.splitlines():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        rows[key(row)] = row
-    with store.open("a", encoding="utf-8") as file:
-        file.write("" if text.endswith("\n") or not text else "\n")  # apart from a line that was cut off
-
-        def keep(_: Job, row: Row) -> None:
-            rows[key(row)] = row
-            file.write(json.dumps(row) + "\n")  # one write a row
-            file.flush()
-
-        run_all([jobs[name] for name in jobs if name not in rows], work, workers=workers, keep=keep, what=what)
-    return {name: rows[name] for name in jobs}
-
-
 def run_all(
-    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int, keep: Callable[[Job, Result], None],
-    what: str = "runs", apart: bool = False,
+    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int | None,
+    keep: Callable[[Job, Result], None], what: str = "runs", apart: bool = False,
 ) -> None:  # fmt: skip
-    """Do every job, in ``workers`` processes, and keep each result as it comes.
+    """Do every job, in ``workers`` processes (None: one a core), and keep each result as it comes.
 
     Parameters
     ----------
@@ -183,10 +142,8 @@ def run_all(
     if not total:
         return
     try:
-        with (
-            Progress(what, total) as progress,
-            closing(_results(jobs, work, min(workers, total), apart)) as results,
-        ):
+        at_most = min(workers or os.cpu_count() or 1, total)
+        with Progress(what, total) as progress, closing(_results(jobs, work, at_most, apart)) as results:
             progress.show(0, f"0/{total}")
             for job, result in results:
                 keep(job, result)

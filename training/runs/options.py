@@ -8,12 +8,13 @@ from typing import Annotated
 import typer
 
 __all__ = [
-    "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Robot", "Rooms", "Seed", "SeedOrNone",
-    "Slam", "Slams", "Workers",
+    "Backends", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Robot", "RoomSeed",
+    "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
 
+Backends = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
 ConfigFile = Annotated[
     Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
 ]
@@ -28,10 +29,11 @@ Noise = Annotated[str | None, typer.Option(help="Noise preset.  [default: nomina
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 Robot = Annotated[str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")]
 Rooms = Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")]
-Seed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
-SeedOrNone = Annotated[
+RoomSeed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
+RoomSeedOrNone = Annotated[
     int | None, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.  [default: 0]")
 ]
+Seed = Annotated[int, typer.Option(min=0)]
+Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
 Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
-Slams = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
