@@ -50,15 +50,14 @@ def play(
     if not (math.isfinite(speed) and 0.01 <= speed <= 1000):
         raise BadInput(f"--speed must be from 0.01 to 1000, got {speed}")
     from training.play.game import Game, open_window
-    from training.play.session import PlayOptions, Session
+    from training.play.session import Session
 
-    options = PlayOptions(
-        agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
-    )
     window = open_window()
     try:
         with _said_where_it_takes_long():
-            session = Session(options)
+            session = Session(
+                agent=agent, seed=seed, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan
+            )
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()

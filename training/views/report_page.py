@@ -40,7 +40,6 @@ _TRUTH_PX = 1400  # of the true plan's longer side
 _MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
 _RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
 NO_RETURN, LOST = 253, 254  # … or is one of these
-_FAR = 0xFFFF  # how far the next changed cell is, where that takes more than 16 bits: so far, and on from there
 
 _WALL_CLOCK = {"decision_ms_median", "wall_time_s"}  # in metrics.json alone: one seed makes one page, bit for bit
 
@@ -199,31 +198,19 @@ def _ellipses(landmarks: NDArray[np.float32]) -> NDArray[np.int32]:
 
 def _map_changes(
     changes: Recorded, origin: tuple[int, int], cols: int
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint32]]:
+) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint32]]:
     """Return the gaps between changed cells, their classes, and how many cells belong to each note.
 
-    A gap that takes more than 16 bits stands as ``_FAR`` as often as needed and the rest; within a note the cells
-    come by row, then column.
+    Within a note the cells come by row, then column.
     """
-    gaps: list[NDArray[np.int64]] = []
-    classes: list[NDArray[np.int64]] = []
+    gaps, classes = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint8)]
     for change in changes.values:
         row, col, now = np.asarray(change, np.int64).T
         index = (row - origin[0]) * cols + (col - origin[1])
         order = np.argsort(index)
-        gap = np.diff(index[order], prepend=0)
-        times = gap // _FAR
-        if times.any():
-            spread = np.full(len(gap) + int(times.sum()), _FAR, np.int64)
-            spread[np.cumsum(times + 1) - 1] = gap % _FAR
-            gap = spread
-        gaps.append(gap)
-        classes.append(now[order])
-    return (
-        np.concatenate([np.zeros(0), *gaps]).astype(np.uint16),
-        (np.concatenate([np.zeros(0), *classes]) + 1).astype(np.uint8),
-        np.array([len(c) for c in classes], np.uint32),
-    )
+        gaps.append(np.diff(index[order], prepend=0).astype(np.uint32))
+        classes.append((now[order] + 1).astype(np.uint8))
+    return np.concatenate(gaps), np.concatenate(classes), _counts(changes)
 
 
 # ---- the page --------------------------------------------------------------------------------------------------

@@ -164,9 +164,7 @@ def decoded_map(header: dict[str, Any], arrays: dict[str, Any]) -> np.ndarray:
     for count in arrays["map_count"].tolist():
         index = 0
         for _ in range(count):
-            while (gap := next(gaps)) == 0xFFFF:
-                index += gap
-            index += gap
+            index += next(gaps)
             classes[index] = next(cells)
     return classes.reshape(rows, cols) - 1
 

@@ -78,9 +78,9 @@ async function openRecording(header, text) {
     const image = context.createImageData(cols, rows), pixels = new Uint32Array(image.data.buffer);
     const classes = new Uint8Array(rows * cols); // 0 unknown, 1 free, 101 occupied
     const shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 };
-    let done = 0, gap = 0, cell = 0, edge = null;
+    let done = 0, cell = 0, edge = null;
     function clear() {
-      done = gap = cell = 0;
+      done = cell = 0;
       classes.fill(0);
       pixels.fill(shades[0]);
     }
@@ -91,9 +91,7 @@ async function openRecording(header, text) {
       for (; done < upTo; done++) {
         let index = 0;
         for (const end = cell + data.map_count[done]; cell < end; cell++) {
-          let far = data.map_gap[gap++];
-          while (far === 65535) { index += far; far = data.map_gap[gap++]; }
-          index += far;
+          index += data.map_gap[cell];
           classes[index] = data.map_class[cell];
           const row = Math.floor(index / cols);
           pixels[(rows - 1 - row) * cols + (index - row * cols)] = shades[classes[index]];
