@@ -17,7 +17,7 @@ from mecanum_env.physics.robot import wheel_positions
 from slam.geometry import transform_points
 
 __all__ = [
-    "FLOOR", "FURNITURE", "FURNITURE_EDGE", "INK", "PAGE", "ROBOT", "WALL", "Canvas", "View", "blend", "put_text",
+    "FLOOR", "FURNITURE", "FURNITURE_EDGE", "INK", "PAGE", "ROBOT", "WALL", "Canvas", "View", "put_text",
     "text_width",
 ]  # fmt: skip
 
@@ -178,11 +178,6 @@ class Canvas:
             self.image[y_px - half : y_px + half, x : x + 2] = INK
         label = f"{metres:g} m"
         put_text(self.image, label, (x_px + length + round(0.6 * size), y_px + round(0.33 * size)), INK, size=size)
-
-
-def blend(image: Image, over: Image, share: float) -> None:
-    """Lay ``over`` on ``image`` in place, ``share`` opaque."""
-    cv2.addWeighted(over, share, image, 1.0 - share, 0.0, dst=image)
 
 
 def put_text(

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +20,7 @@ from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.runs.errors import BadInput, Interrupted, check_writable
 from training.runs.progress import Progress
+from training.runs.running import versions
 
 __all__ = [
     "backend_names",
@@ -72,10 +72,7 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
 
 def installed_version() -> str:
     """Return this project's version, part of what a result depends on."""
-    try:
-        return version("mecanum-slam")
-    except PackageNotFoundError:
-        return "not installed"
+    return versions().get("mecanum-slam", "not installed")
 
 
 def check_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:

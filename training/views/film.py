@@ -140,8 +140,9 @@ def film(path: str | Path, *, fps: float, how: Sequence[str] = _H264) -> Iterato
     """Give a function that takes a film's frames; the film is at ``path`` when the block ends.
 
     It is H.264 in 4:2:0, with its index in front, as browsers want it, or what ffmpeg's options ``how`` make of
-    it. Frames are arrays ``(h, w, 3)`` of uint8, RGB, all of one size, either side even. The film is written beside
-    its place and then renamed. Ctrl-C in the block keeps it as far as it came; any other exception leaves nothing.
+    it. Frames are arrays ``(h, w, 3)`` of uint8, RGB, all of one size, either side even. The film is written
+    beside its place and then renamed. Ctrl-C in the block keeps it as far as it came; any other exception leaves
+    nothing.
 
     Raises
     ------
