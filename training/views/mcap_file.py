@@ -49,7 +49,7 @@ _LEAST_AXIS_M = 0.02  # an ellipse smaller than this could not be seen
 _BODY_HEIGHT_M = 0.14
 _LANDMARK_HEIGHT_M = 0.02
 
-_SHAPES = {"CUBE": 1, "CYLINDER": 3}
+_CUBE, _CYLINDER = 1, 3
 _ADD, _DELETE = 0, 2
 _BELIEVED, _TRUE, _LANDMARK = (0.17, 0.38, 0.80, 1.0), (0.09, 0.55, 0.44, 0.5), (0.70, 0.15, 0.50, 0.6)
 
@@ -238,18 +238,13 @@ def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
     """Return a flat cylinder for each landmark's 3σ ellipse; of those ``shown`` the rest go."""
     axes, directions = ellipses(rows)
     size = np.maximum(2.0 * axes, _LEAST_AXIS_M)
+    ns, header = "landmarks", _header(time_s, "map")
     markers = [
-        {
-            **_marker(k, "landmarks", "CYLINDER", _LANDMARK, "map", time_s),
-            "pose": _pose([x, y, direction]),
-            "scale": {"x": width, "y": height, "z": _LANDMARK_HEIGHT_M},
-        }
-        for k, (x, y, direction, width, height) in enumerate(
-            np.column_stack([rows[:, :2], directions, size]).tolist()
-        )
+        _marker(ns, k, header, _CYLINDER, _LANDMARK, _pose([x, y, turn]), (width, height, _LANDMARK_HEIGHT_M))
+        for k, (x, y, turn, width, height) in enumerate(np.column_stack([rows[:, :2], directions, size]).tolist())
     ]
     gone = [
-        {**_marker(k, "landmarks", "CYLINDER", _LANDMARK, "map", time_s), "action": _DELETE}
+        {"header": header, "ns": ns, "id": k, "action": _DELETE, "pose": _pose([0.0, 0.0, 0.0])}
         for k in range(len(rows), shown)
     ]
     return {"markers": markers + gone}
@@ -257,30 +252,24 @@ def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
 
 def _robot(robot: RobotConfig) -> Message:
     """Return the body where it is believed to be and where it is, both moving along with their frames."""
+    pose, size = _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M), (robot.length_m, robot.width_m, _BODY_HEIGHT_M)
+    bodies = (("base_link", _BELIEVED), ("base_link_true", _TRUE))
     return {
         "markers": [
-            {
-                **_marker(k, "robot", "CUBE", colour, frame, 0.0),
-                "pose": _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M),
-                "scale": {"x": robot.length_m, "y": robot.width_m, "z": _BODY_HEIGHT_M},
-                "frame_locked": True,
-            }
-            for k, (frame, colour) in enumerate((("base_link", _BELIEVED), ("base_link_true", _TRUE)))
+            {**_marker("robot", k, _header(0.0, frame), _CUBE, colour, pose, size), "frame_locked": True}
+            for k, (frame, colour) in enumerate(bodies)
         ]
     }
 
 
 def _marker(
-    number: int, name: str, kind: str, colour: tuple[float, ...], frame: str, time_s: float
-) -> dict[str, Any]:
+    ns: str, number: int, header: Message, kind: int, colour: tuple[float, ...], pose: Message,
+    size: tuple[float, float, float],
+) -> dict[str, Any]:  # fmt: skip
     return {
-        "header": _header(time_s, frame),
-        "ns": name,
-        "id": number,
-        "type": _SHAPES[kind],
-        "action": _ADD,
-        "color": dict(zip("rgba", colour, strict=True)),
-    }
+        "header": header, "ns": ns, "id": number, "type": kind, "action": _ADD, "pose": pose,
+        "scale": dict(zip("xyz", size, strict=True)), "color": dict(zip("rgba", colour, strict=True)),
+    }  # fmt: skip
 
 
 def _odometry(time_s: float, frame: str, child: str, pose: Array, twist: Array) -> Message:
