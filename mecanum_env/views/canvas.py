@@ -14,14 +14,24 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
 from mecanum_env.physics.robot import wheel_positions
-from mecanum_env.rooms.draw import FLOOR, INK, WALL
 from slam.geometry import transform_points
 
-__all__ = ["Canvas", "View", "blend", "put_text", "text_width"]
+__all__ = [
+    "FLOOR", "FURNITURE", "FURNITURE_EDGE", "INK", "PAGE", "ROBOT", "WALL", "Canvas", "View", "put_text",
+    "text_width",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
+
+PAGE: Colour = (244, 246, 247)
+FLOOR: Colour = (255, 255, 255)
+WALL: Colour = (74, 62, 54)
+FURNITURE: Colour = (176, 205, 224)
+FURNITURE_EDGE: Colour = (96, 134, 158)
+ROBOT: Colour = (42, 92, 222)
+INK: Colour = (110, 100, 92)
 
 _SHIFT = 4  # OpenCV's fixed-point fraction bits: antialiased to 1/16 pixel
 _TYRE_SHARE = 0.22  # width of a drawn wheel over the robot's width
@@ -146,20 +156,15 @@ class Canvas:
         points = list(self.view.pixels(rims.reshape(-1, 2)).reshape(len(means), -1, 2))
         cv2.polylines(self.image, points, True, colour, px, cv2.LINE_AA, shift=_SHIFT)
 
-    def robot(self, pose: Array, robot: RobotConfig, colour: Colour, *, wheels: bool = True) -> None:
+    def robot(self, pose: Array, robot: RobotConfig, colour: Colour) -> None:
         """Draw the robot's outline, wheels and heading at a pose ``(3,)``."""
         a, b = 0.5 * robot.length_m, 0.5 * robot.width_m
-        body = _rectangle(0.0, 0.0, a, b)
-        if wheels:
-            tyre = 0.5 * _TYRE_SHARE * robot.width_m
+        tyre = 0.5 * _TYRE_SHARE * robot.width_m
+        for x, y in wheel_positions(robot):
             # Drawn flush with the body's sides, where they can be seen.
-            rects = [
-                _rectangle(x, math.copysign(max(abs(y), b - 0.4 * tyre), y), robot.wheel_radius_m * 1.4, tyre)
-                for x, y in wheel_positions(robot)
-            ]
-            for rect in rects:
-                self.fill([transform_points(pose, rect)], WALL)
-        self.fill([transform_points(pose, body)], colour)
+            out = math.copysign(max(abs(y), b - 0.4 * tyre), y)
+            self.fill([transform_points(pose, _rectangle(x, out, robot.wheel_radius_m * 1.4, tyre))], WALL)
+        self.fill([transform_points(pose, _rectangle(0.0, 0.0, a, b))], colour)
         arrow = np.array([(-0.5 * a, 0.6 * b), (0.75 * a, 0.0), (-0.5 * a, -0.6 * b), (-0.2 * a, 0.0)])
         self.fill([transform_points(pose, arrow)], FLOOR)
 
@@ -173,11 +178,6 @@ class Canvas:
             self.image[y_px - half : y_px + half, x : x + 2] = INK
         label = f"{metres:g} m"
         put_text(self.image, label, (x_px + length + round(0.6 * size), y_px + round(0.33 * size)), INK, size=size)
-
-
-def blend(image: Image, over: Image, share: float) -> None:
-    """Lay ``over`` on ``image`` in place, ``share`` opaque."""
-    cv2.addWeighted(over, share, image, 1.0 - share, 0.0, dst=image)
 
 
 def put_text(

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.rooms.draw import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, _loops
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.views.canvas import Canvas, Colour, View
+from mecanum_env.views.canvas import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, Canvas, Colour, View
 from slam.belief import Belief
 from slam.geometry import transform_points
 
@@ -39,13 +38,13 @@ _MARGIN_M = 0.5
 _PATH_SPACING_PX = 8.0
 
 
-def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array) -> None:
-    """Paint a plan whose frame has the pose ``frame`` ``(3,)`` in the view's."""
+def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array, *, ground: Colour = UNSEEN) -> None:
+    """Paint a plan whose frame has the pose ``frame`` ``(3,)`` in the view's, on a ground of one colour."""
 
     def seen(points: Array) -> Array:
         return transform_points(frame, points)
 
-    canvas.image[:] = UNSEEN
+    canvas.image[:] = ground
     canvas.bands(seen(plan.walls.reshape(-1, 2)).reshape(-1, 4), WALL, _WALL_M)
     loops = _loops(plan.walls)
     if loops is None:
@@ -66,6 +65,31 @@ def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array) -> None:
     for outline in (*plan.polygons, *rims):
         canvas.fill([seen(outline)], FURNITURE)
         canvas.line(seen(outline), FURNITURE_EDGE, px=canvas.width(0.02), closed=True)
+
+
+def _loops(walls: Array) -> list[Array] | None:
+    """Chain walls into closed loops ``(k, 2)``; None where they do not close."""
+    following: dict[tuple[float, float], list[int]] = {}
+    for i, (x, y) in enumerate(np.round(walls[:, :2], 4).tolist()):
+        following.setdefault((x, y), []).append(i)
+    ends = [(x, y) for x, y in np.round(walls[:, 2:], 4).tolist()]
+    loops: list[Array] = []
+    used = np.zeros(len(walls), np.bool_)
+    for first in range(len(walls)):
+        chain, i = [], first
+        while not used[i]:
+            used[i] = True
+            chain.append(i)
+            options = following.get(ends[i], [])
+            open_ones = [j for j in options if not used[j]]
+            if not open_ones:
+                if first not in options:
+                    return None
+                break
+            i = open_ones[0]
+        if chain:
+            loops.append(walls[chain, :2])
+    return loops or None
 
 
 def _signed_area(loop: Array) -> float:

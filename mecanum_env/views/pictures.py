@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.rooms.draw import FLOOR, INK, PAGE, ROBOT, WALL
-from mecanum_env.views.canvas import Canvas, Colour, View, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, ROBOT, WALL, Canvas, Colour, View, put_text, text_width
 from mecanum_env.views.paint import (
     BELIEVED_PATH,
     LANDMARK,

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.rooms.draw import FLOOR, INK, PAGE, ROBOT, WALL
-from mecanum_env.views.canvas import Canvas, View, blend, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, ROBOT, WALL, Canvas, View, put_text, text_width
 from mecanum_env.views.paint import (
     BEAM,
     BELIEVED_PATH,
@@ -179,11 +178,11 @@ def _paint_scan(canvas: Canvas, scan: Scan, sensor_pose: Array) -> None:
     over = canvas.image.copy()
     tinted = Canvas(over, canvas.view)
     tinted.fill([np.vstack([sensor_pose[None, :2], ends])], BEAM)
-    blend(canvas.image, over, 0.25)
+    cv2.addWeighted(over, 0.25, canvas.image, 0.75, 0.0, dst=canvas.image)
     np.copyto(over, canvas.image)
     sensor = np.broadcast_to(sensor_pose[:2], ends[::6].shape)
     tinted.segments(np.hstack([sensor, ends[::6]]), BEAM)
-    blend(canvas.image, over, 0.4)
+    cv2.addWeighted(over, 0.4, canvas.image, 0.6, 0.0, dst=canvas.image)
     canvas.squares(ends[np.isfinite(scan.ranges[known])], TRUE_PATH, px=2)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
-from mecanum_env.rooms.draw import PAGE
+from mecanum_env.views.canvas import PAGE
 from mecanum_env.views.render import FRAME_SHAPE, Shown, render_frame
 
 __all__ = ["NoDisplay", "NoViewer", "Viewer", "Window", "load_pygame", "make_viewer"]

@@ -153,7 +153,7 @@ class BenchmarkPlan:
         return _config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
 
 
-def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int) -> Report:
+def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int | None) -> Report:
     """Run the episodes that ``out`` does not hold yet, write the tables, and return what they hold.
 
     Raises

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,7 +65,8 @@ class Suite:
 
 def names(*, floor_plans: bool = False) -> tuple[str, ...]:
     """Return the suites' names, each nominal before slippery; those of real plans only where there are some."""
-    return tuple(_all_names((*_ROOMS, FLOOR_PLANS) if floor_plans else _ROOMS))
+    bases = (*_ROOMS, FLOOR_PLANS) if floor_plans else _ROOMS
+    return tuple(base + noise for base in bases for noise in ("", SLIPPERY))
 
 
 def choose(text: str, *, floor_plans: Path | None = None) -> tuple[Suite, ...]:
@@ -112,7 +113,8 @@ def read_floor_plans(folder: Path) -> tuple[Place, ...]:
     images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.stem not in drawn]
     if not maps and not images:
         raise BadInput(
-            f"--floor-plans {folder} holds no plan; put ROS maps (.yaml) or images ({_suffixes()}) there"
+            f"--floor-plans {folder} holds no plan; put ROS maps (.yaml) or images "
+            f"({', '.join(IMAGE_SUFFIXES)}) there"
         )
     with bad_input():
         return tuple(_read(path.absolute()) for path in sorted([*maps, *images], key=lambda path: path.name))
@@ -129,13 +131,3 @@ def _make(name: str, plans: tuple[Place, ...]) -> Suite:
     noise = "nominal" if base == name else "slippery"
     places = plans if base == FLOOR_PLANS else (Place(name=_ROOMS[base], rooms=_ROOMS[base]),)
     return Suite(name=name, noise=noise, places=places)
-
-
-def _all_names(bases: Sequence[str] | dict[str, str]) -> Iterator[str]:
-    for base in bases:
-        yield base
-        yield base + SLIPPERY
-
-
-def _suffixes() -> str:
-    return ", ".join(IMAGE_SUFFIXES)

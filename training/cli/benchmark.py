@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import BadInput, suggestion
-from training.runs.options import Json
 
 __all__ = ["benchmark"]
 
@@ -51,15 +50,13 @@ def benchmark(
     scan: Annotated[
         str, typer.Option(help="How that protocol looks around: way-points or continuous.")
     ] = "way-points",
-    max_steps: Annotated[
-        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
-    ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/benchmark"),
+    max_steps: opt.MaxSteps = None,
+    workers: opt.Workers = None,
+    out: opt.Out = Path("out/benchmark"),
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html, one page of all of it.")
     ] = False,
-    as_json: Json = False,
+    as_json: opt.Json = False,
 ) -> None:
     """Let agents explore suites of rooms, and compare them with confidence intervals.
 
@@ -89,7 +86,7 @@ def benchmark(
         names = [part.strip() for part in agents.split(",") if part.strip()]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers or os.cpu_count() or 1, scan=scan)
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers, scan=scan)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task
@@ -102,7 +99,7 @@ def benchmark(
         floor_plans=floor_plans, max_steps=max_steps,
     )  # fmt: skip
     try:
-        result = task.benchmark(plan, out=out, workers=workers or os.cpu_count() or 1)
+        result = task.benchmark(plan, out=out, workers=workers)
     except task.EpisodesFailed as failed:
         if report:
             write_report(out, failed.report)

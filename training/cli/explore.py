@@ -4,52 +4,36 @@ from __future__ import annotations
 
 import json
 import math
-import sys
-import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import BadInput, Interrupted, one_line
-from training.runs.options import Json
-
-if TYPE_CHECKING:
-    from training.episodes.explore import Progress
+from training.runs.progress import Progress
 
 __all__ = ["explore"]
-
-_LOG_EVERY_S = 30.0  # between two lines of progress where standard error is no terminal
 
 
 def explore(
     agent: Annotated[
         str | None, typer.Option(help="Who decides where to go, or a policy file.  [default: nearest-frontier]")
     ] = None,
-    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
-    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
-    seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.  [default: 0]")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/explore"),
-    floor_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
-    ] = None,
+    rooms: opt.Rooms = None,
+    slam: opt.Slam = None,
+    seed: opt.RoomSeedOrNone = None,
+    out: opt.Out = Path("out/explore"),
+    floor_plan: opt.FloorPlanFile = None,
     start: Annotated[
         str | None, typer.Option(metavar="X,Y,THETA", help="Start pose in the plan's frame, m and rad.")
     ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
-    ] = None,
-    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
-    ] = None,
-    max_steps: Annotated[
-        int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
-    ] = None,
+    robot: opt.Robot = None,
+    noise: opt.Noise = None,
+    config: opt.ConfigFile = None,
+    max_steps: opt.MaxSteps = None,
     coverage_target: Annotated[
         float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
     ] = None,
@@ -61,7 +45,7 @@ def explore(
         bool, typer.Option("--mcap", help="Also write episode.mcap, ROS 2 messages for Foxglove and RViz.")
     ] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="Also write episode.rrd, for Rerun.")] = False,
-    as_json: Json = False,
+    as_json: opt.Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
 
@@ -100,8 +84,13 @@ def explore(
         witnesses: list[task.Witness] = [recorder]
         film = stack.enter_context(filmed(out, episode.config, video_substeps)) if "video" in extras else None
         witnesses += [film] if film is not None else []
-        with ExitStack() as progress:
-            task.run(episode, _progress(progress), witnesses)
+        with Progress("exploring", 1.0, eta=False) as shown:
+
+            def progress(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
+                where = f"step {steps} of at most {max_steps}, {100 * coverage:.1f} % mapped at {time_s:.0f} s"
+                shown.show(coverage, where)
+
+            task.run(episode, progress, witnesses)
         path = film.finish() if film is not None else None
         if path is None and film is not None:
             extras.remove("video")
@@ -127,41 +116,6 @@ def _parse_start(text: str | None) -> tuple[float, float, float] | None:
     if not all(map(math.isfinite, (x, y, theta))):
         raise BadInput(f"--start {text!r} must be finite; give for instance 2.5,1.0,0")
     return x, y, theta
-
-
-def _progress(stack: ExitStack) -> Progress:
-    """Return a progress bar on standard error, or a line now and then where that is no terminal."""
-    if not sys.stderr.isatty():
-        return _LogLines()
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    bar = stack.enter_context(
-        Progress(
-            TextColumn("exploring"), BarColumn(), TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
-            console=Console(stderr=True), transient=True,
-        )
-    )  # fmt: skip
-    task = bar.add_task("exploring", total=1.0, status="")
-
-    def show(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
-        if steps % 10 == 0:
-            bar.update(task, completed=coverage, status=f"{100 * coverage:.1f} % mapped at {time_s:.0f} s")
-
-    return show
-
-
-class _LogLines:
-    """A line on standard error at the start, and every half a minute."""
-
-    def __init__(self) -> None:
-        self._next = 0.0
-
-    def __call__(self, *, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
-        if steps % 10 == 1 and time.monotonic() >= self._next:
-            self._next = time.monotonic() + _LOG_EVERY_S
-            done = f"{100 * coverage:.1f} % mapped at {time_s:.0f} s"
-            print(f"exploring: step {steps} of at most {max_steps}, {done}", file=sys.stderr, flush=True)
 
 
 def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: str) -> str:

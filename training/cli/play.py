@@ -6,12 +6,12 @@ import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from threading import Timer
 from typing import Annotated
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import BadInput
 
 __all__ = ["play"]
@@ -23,16 +23,12 @@ def play(
     agent: Annotated[
         str, typer.Option(help="Who drives when Space is pressed, or a policy file.")
     ] = "nearest-frontier",
-    rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")] = None,
-    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
-    floor_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")
-    ] = None,
-    noise: Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")] = None,
+    rooms: opt.Rooms = None,
+    slam: opt.Slam = None,
+    seed: opt.RoomSeed = 0,
+    floor_plan: opt.FloorPlanFile = None,
+    robot: opt.Robot = None,
+    noise: opt.Noise = None,
     speed: Annotated[float, typer.Option(help="Times true speed, which is 10 steps a second.")] = 1.0,
     frames: Annotated[
         int | None, typer.Option(min=1, help="End after so many steps.  [default: when you quit]")
@@ -54,15 +50,14 @@ def play(
     if not (math.isfinite(speed) and 0.01 <= speed <= 1000):
         raise BadInput(f"--speed must be from 0.01 to 1000, got {speed}")
     from training.play.game import Game, open_window
-    from training.play.session import PlayOptions, Session
+    from training.play.session import Session
 
-    options = PlayOptions(
-        agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan
-    )
     window = open_window()
     try:
         with _said_where_it_takes_long():
-            session = Session(options)
+            session = Session(
+                agent=agent, seed=seed, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan
+            )
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()

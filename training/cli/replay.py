@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from training.runs import options as opt
 from training.runs.errors import Interrupted
-from training.runs.options import Json
+from training.runs.progress import Progress
 
 __all__ = ["replay"]
 
@@ -35,11 +36,9 @@ def replay(
         int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
     ] = None,
     limit_s: Annotated[float | None, typer.Option(help="Stop after so many seconds of the log.")] = None,
-    config: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
-    ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/replay"),
-    as_json: Json = False,
+    config: opt.ConfigFile = None,
+    out: opt.Out = Path("out/replay"),
+    as_json: opt.Json = False,
 ) -> None:
     """Run a SLAM backend on the recorded log of a real robot, and compare it with the log's reference.
 
@@ -62,11 +61,9 @@ def replay(
         limit_s=limit_s, config=config,
     )  # fmt: skip
     prepared = task.prepare(options)
-    progress = task.Progress(prepared.log.duration_s)
-    try:
-        task.run(prepared, progress)
-    finally:
-        progress.close()
+    whole_s = prepared.log.duration_s
+    with Progress("replaying", whole_s) as progress:
+        task.run(prepared, lambda time_s: progress.show(time_s, f"{time_s:.0f} of {whole_s:.0f} s"))
     metrics = replay_report.write(prepared)
     print(
         json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out, prepared.files)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from training.runs.errors import BadInput, suggestion
+from training.runs.errors import BadInput, needs_extra, suggestion
 
 __all__ = ["STUDIES", "study", "study_command"]
 
@@ -63,8 +63,6 @@ def study_command(name: str) -> Any:
     app = typer.Typer(
         add_completion=False, rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]}
     )
-    try:
+    with needs_extra("train"):
         app.command(name)(import_module(STUDIES[name][0]).study)
-    except ModuleNotFoundError as error:
-        raise BadInput(f"this needs {error.name}; install it with pip install 'mecanum-slam[train]'") from error
     return typer.main.get_command(app)

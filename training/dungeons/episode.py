@@ -101,7 +101,8 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         at most 250 free cells were unseen, ``None`` where it never came to that.
     """
     run = _Run(dungeon, continuous=scan == "continuous")
-    agent = None if name == NEAREST else make_agent(name, _extent_m(dungeon))
+    rows, cols = dungeon.free.shape
+    agent = None if name == NEAREST else make_agent(name, (cols * CELL_M, rows * CELL_M))
     if agent is not None:
         agent.reset(run.belief(), seed)
     decisions: list[float] = []
@@ -139,11 +140,6 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         "path_to_250_m": run.path_to_250_m,
         "decision_ms_median": statistics.median(decisions) if decisions else None,
     }
-
-
-def _extent_m(dungeon: Dungeon) -> tuple[float, float]:
-    rows, cols = dungeon.free.shape
-    return cols * CELL_M, rows * CELL_M
 
 
 class _Run:

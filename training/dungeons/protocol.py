@@ -11,8 +11,8 @@ import hashlib
 import json
 import math
 import statistics
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,15 @@ from slam.settings import unknown_name
 from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import Dungeon, layout, load
-from training.runs.campaign import check_settings, installed_version, run_all, write_settings
+from training.figures.tables import csv_table, markdown_table, number
+from training.runs.campaign import check_settings, installed_version, write_settings
 from training.runs.errors import BadInput, bad_input
+from training.runs.rows import resume
 
 __all__ = ["PUBLISHED", "run_dungeons", "summarise", "table"]
 
 Row = dict[str, Any]
+_Job = tuple[str, str, str]  # agent; digest of the map's file: another map of the same name is another; scan
 
 BASELINE = "nearest-frontier"
 """The agent that the others' ratios are taken to: the published rule, as far as it is known."""
@@ -57,16 +60,8 @@ _COLUMNS = (
 _RESAMPLES = 10_000
 
 
-@dataclass(frozen=True)
-class _Job:
-    agent: str
-    path: Path
-    digest: str  # of the file: another map of the same name is another map
-    scan: str
-
-
 def run_dungeons(
-    maps: Path, agent_names: Sequence[str], *, out: Path, workers: int = 1, scan: str = "way-points"
+    maps: Path, agent_names: Sequence[str], *, out: Path, workers: int | None = 1, scan: str = "way-points"
 ) -> dict[str, Any]:
     """Run every agent on every map that ``out`` does not hold yet, and return the summary of all asked for.
 
@@ -80,30 +75,22 @@ def run_dungeons(
             agents.check(name, NEAREST, NEAREST_VIEW, *BOUNDS)
     if scan not in SCANS:
         raise BadInput(str(unknown_name("--scan", scan, SCANS)))
-    if workers < 1:
-        raise BadInput(f"--workers must be at least 1, got {workers}")
     paths = _maps(maps)
     settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
     check_settings(out, settings, [_STORE, _CSV, _SUMMARY])
+    if (out / _STORE).exists() and (out / _STORE).read_text("utf-8").startswith("{"):
+        raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
     # A map that cannot be used is found before any work is lost.
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
     write_settings(out, settings)
-    jobs = [_Job(name, path, digests[path], scan) for path in paths for name in dict.fromkeys(agent_names)]
-    done = {(row["agent"], row["digest"]): row for row in _read(out / _STORE)}
-    with (out / _STORE).open("a", encoding="utf-8") as file:
-
-        def keep(job: _Job, row: Row) -> None:
-            done[job.agent, job.digest] = row
-            # One write a row: what is killed in between leaves whole rows behind.
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-
-        missing = [job for job in jobs if (job.agent, job.digest) not in done]
-        run_all(missing, _run, workers=workers, keep=keep, what="episodes")
-    rows = [done[job.agent, job.digest] | {"map": job.path.stem, "layout": layouts[job.path]} for job in jobs]
+    files = {digests[path]: path for path in paths}
+    asked = [(path, (name, digests[path], scan)) for path in paths for name in dict.fromkeys(agent_names)]
+    done = resume(out / _STORE, [job for _, job in asked], partial(_run, files), workers=workers, what="episodes")
+    rows = [done[job] | {"map": path.stem, "layout": layouts[path]} for path, job in asked]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
-    atomic_write(out / _CSV, _csv(rows))
+    shown = [{name: _cell(row[name]) for name in _COLUMNS} for row in rows]
+    atomic_write(out / _CSV, csv_table(shown, _COLUMNS))
     atomic_write(out / _SUMMARY, json.dumps(summary, indent=1) + "\n")
     return summary
 
@@ -163,24 +150,23 @@ def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
 def table(summary: dict[str, Any]) -> str:
     """Return our agents and the published ones as one Markdown table."""
     references = [name for name in REFERENCES if name in summary["agents"]]
-    further = "".join(f"to {name} (95 %) | " for name in references)
-    lines = [
-        f"| agent | maps (layouts) | covered | path, mean ± std [m] | to {BASELINE} (95 %) "
-        f"| {further}decision [ms] |",
-        "|" + "---|" * (6 + len(references)),
-    ]
+    head = [
+        "agent", "maps (layouts)", "covered", "path, mean ± std [m]", f"to {BASELINE} (95 %)",
+        *(f"to {name} (95 %)" for name in references), "decision [ms]",
+    ]  # fmt: skip
+    rows = []
     for name, own in summary["agents"].items():
-        ratios = [_ratio_text(own), *(_ratio_text(own["to"][name]) for name in references)]
-        decision = "" if own["decision_ms_median"] is None else f"{own['decision_ms_median']:.1f}"
-        lines.append(
-            f"| `{name}` | {own['maps']} ({own['layouts']}) | {own['covered']} "
-            f"| {own['path_m_mean']:.0f} ± {own['path_m_std']:.0f} | {' | '.join(ratios)} | {decision} |"
-        )
+        rows.append([
+            f"`{name}`", f"{own['maps']} ({own['layouts']})", str(own["covered"]),
+            f"{own['path_m_mean']:.0f} ± {own['path_m_std']:.0f}",
+            _ratio_text(own), *(_ratio_text(own["to"][name]) for name in references),
+            number(own["decision_ms_median"], 1, ""),
+        ])  # fmt: skip
     base, bound = PUBLISHED["nearest frontier"][0], PUBLISHED["known map"][0]
     for name, (mean, std) in PUBLISHED.items():
         ratios = [f"{mean / base:.3f}", *(f"{mean / bound:.3f}" if r in BOUNDS else "" for r in references)]
-        lines.append(f"| published: {name} | 100 others | | {mean:.0f} ± {std:.0f} | {' | '.join(ratios)} | |")
-    return "\n".join(lines)
+        rows.append([f"published: {name}", "100 others", "", f"{mean:.0f} ± {std:.0f}", *ratios, ""])
+    return markdown_table(head, rows)
 
 
 def _ratio_text(ratio: Row) -> str:
@@ -199,10 +185,10 @@ def _maps(folder: Path) -> list[Path]:
     return sorted(paths, key=lambda p: (not p.stem.isdigit(), int(p.stem) if p.stem.isdigit() else 0, p.stem))
 
 
-def _run(job: _Job) -> Row:
-    dungeon = load(job.path)
-    row = _bound(dungeon, job.agent) if job.agent in BOUNDS else explore(dungeon, job.agent, scan=job.scan)
-    return row | {"digest": job.digest}
+def _run(files: Mapping[str, Path], job: _Job) -> Row:
+    agent, digest, scan = job
+    dungeon = load(files[digest])
+    return _bound(dungeon, agent) if agent in BOUNDS else explore(dungeon, agent, scan=scan)
 
 
 def _bound(dungeon: Dungeon, name: str) -> Row:
@@ -216,21 +202,5 @@ def _bound(dungeon: Dungeon, name: str) -> Row:
     }
 
 
-def _read(store: Path) -> list[Row]:
-    rows = []
-    for line in store.read_text(encoding="utf-8").splitlines() if store.exists() else ():
-        try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue  # the row that was being written when the run was killed: it is run again
-    return rows
-
-
-def _csv(rows: Sequence[Row]) -> str:
-    def cell(value: Any) -> str:
-        if isinstance(value, float):
-            return f"{value:.6g}"
-        return "" if value is None else str(value)
-
-    lines = [",".join(_COLUMNS), *(",".join(cell(row[name]) for name in _COLUMNS) for row in rows)]
-    return "\n".join(lines) + "\n"
+def _cell(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from agents.stations.lattice import count_in_sight, in_sight, join, ways
 from agents.stations.survey import HOP, STRIDE, VOXEL
+from mecanum_env.rooms.files.image_files import read_grey
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from training.runs.errors import BadInput
+from training.runs.errors import BadInput, bad_input
 
 __all__ = [
     "CELL_M", "HOP", "RANGE_M", "STRIDE", "TREE", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "layout",
@@ -59,16 +60,11 @@ def load(path: Path) -> Dungeon:
     BadInput
         In one line: what is wrong with the file.
     """
-    try:
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-    except OSError as error:
-        raise BadInput(f"cannot read map {path}: {error.strerror}; check --maps") from error
-    pixels = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    if pixels is None:
-        raise BadInput(f"map {path} is no picture; give a folder of PNG maps")
+    with bad_input():
+        pixels = read_grey(path).astype(np.uint8)
     if max(pixels.shape) > _MOST_PIXELS or min(pixels.shape) < 2:
         raise BadInput(f"map {path} has {pixels.shape[1]} × {pixels.shape[0]} pixels; 2 to {_MOST_PIXELS} a side")
-    return dungeon_of(np.asarray(pixels), path.stem)
+    return dungeon_of(pixels, path.stem)
 
 
 def dungeon_of(pixels: NDArray[np.uint8], name: str) -> Dungeon:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 import time
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -24,10 +23,22 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
+from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input, check_writable
 from training.runs.running import interrupt_flag, plain
 
-__all__ = ["ENDINGS", "EXTRAS", "FILES", "Episode", "ExploreOptions", "Progress", "Witness", "prepare", "run"]
+__all__ = [
+    "ENDINGS",
+    "EXTRAS",
+    "FILES",
+    "Episode",
+    "ExploreOptions",
+    "Progress",
+    "Witness",
+    "make_agent",
+    "prepare",
+    "run",
+]
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
@@ -51,6 +62,7 @@ ENDINGS = {
 
 _DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
+_RUN_KINDS = {"agent": (str,), "seed": (int,), "start": (list,), "max_steps": (int,)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,17 +176,17 @@ def prepare(options: ExploreOptions) -> Episode:
         observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
         env = wrapped.unwrapped
         assert isinstance(env, ExploreEnv)
-        agent = _make_agent(run["agent"], env)
+        agent = make_agent(run["agent"], env)
         agent.reset(env.belief, run["seed"])
     run |= {"max_steps": limit}
     return Episode(env, wrapped, agent, observation, config, run, options.out)
 
 
-def _make_agent(name: str, env: ExploreEnv) -> Agent:
+def make_agent(name: str, env: ExploreEnv) -> Agent:
+    """Return an agent for an environment's robot, the planner that knows the map among them."""
     config = env.config
-    if name == KNOWN_MAP:
-        return KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-    return agents.make(name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
+    return KnownMap(env.truth.ground, **body) if name == KNOWN_MAP else agents.make(name, **body)
 
 
 def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
@@ -189,22 +201,12 @@ def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:
 
 def _read_run_table(path: Path) -> dict[str, Any]:
     """Return ``agent``, ``seed``, ``start`` and ``max_steps`` from a config's [run] table, where it has one."""
-    try:
-        values = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
-    run = values.get("run", {})
-    kinds = {"agent": str, "seed": int, "start": list, "max_steps": int}
-    wrong = [k for k, kind in kinds.items() if isinstance(run, dict) and k in run and type(run[k]) is not kind]
-    if not isinstance(run, dict) or wrong:
-        raise BadInput(f"config {path}: [run] {wrong[0] if wrong else ''} has the wrong type; see a config.toml")
+    _, run = read_config(path, _RUN_KINDS)
     start = run.get("start", [0.0, 0.0, 0.0])
     good = len(start) == 3 and all(isinstance(v, int | float) and math.isfinite(v) for v in start)
-    if not good or run.get("seed", 0) < 0 or run.get("max_steps", 1) < 1:
-        raise BadInput(f"config {path}: [run] needs seed ≥ 0, max_steps ≥ 1 and start = [x, y, θ]")
-    return {name: run[name] for name in kinds if name in run}
+    if not good or run.get("max_steps", 1) < 1:
+        raise BadInput(f"config {path}: [run] needs max_steps ≥ 1 and start = [x, y, θ]")
+    return run
 
 
 # ---- the episode -----------------------------------------------------------------------------------------------

@@ -16,23 +16,25 @@ __all__ = ["dead_reckoned", "ellipses", "map_origin", "maps"]
 Array = NDArray[np.float64]
 Classes = NDArray[np.int8]
 
+_MAP_EVERY_S = 1.0
 
-def maps(recording: Recording, *, least_s: float = 0.0) -> Iterator[tuple[int, Classes]]:
+
+def maps(recording: Recording) -> Iterator[tuple[int, Classes]]:
     """Return the map each time it had changed: the step, and the classes ``(rows, cols)``.
 
-    Every map covers :meth:`Recording.bounds`, row 0 at the lowest y. Two of them are at least ``least_s`` [s]
+    Every map covers :meth:`Recording.bounds`, row 0 at the lowest y. Two of them are at least a second
     apart, except that the last one is always given.
     """
     row0, col0, row1, col1 = recording.bounds()
     classes = np.full((row1 - row0, col1 - col0), UNKNOWN, np.int8)
     changes = recording.map_changes
     due_s = -np.inf
-    for k, (step, cells) in enumerate(zip(changes.steps.tolist(), changes.values, strict=True)):
+    for k, (step, cells) in enumerate(changes.items()):
         classes[cells[:, 0] - row0, cells[:, 1] - col0] = cells[:, 2]
         time_s = float(recording.times[step])
         # Half a step's grace: times are sums of steps that binary numbers do not hold exactly.
         if time_s > due_s - 0.5 * recording.step_s or k + 1 == len(changes.values):
-            due_s = time_s + least_s
+            due_s = time_s + _MAP_EVERY_S
             yield step, classes.copy()
 
 

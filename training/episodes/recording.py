@@ -5,8 +5,9 @@ While the episode runs little more is done than to keep references; see :class:`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,10 @@ class Recorded:
 
     steps: Ints  # (k,) ascending
     values: tuple[NDArray[np.generic], ...]  # k arrays
+
+    def items(self) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Return each step with the value that was noted then."""
+        return zip(self.steps.tolist(), self.values, strict=True)
 
 
 @dataclass(frozen=True, eq=False)

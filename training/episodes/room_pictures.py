@@ -9,7 +9,7 @@ import cv2
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig, resolve
-from mecanum_env.rooms.draw import contact_sheet, draw_plan
+from mecanum_env.views.plans import contact_sheet, draw_plan
 from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.runs.errors import BadInput, bad_input, check_writable

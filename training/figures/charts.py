@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mecanum_env.rooms.draw import FLOOR, INK, PAGE
-from mecanum_env.views.canvas import put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, put_text, text_width
 
 __all__ = ["Axis", "Line", "draw_chart", "png", "ticks"]
 

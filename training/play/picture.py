@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.rooms.draw import FLOOR, INK, PAGE, WALL
-from mecanum_env.views.canvas import Colour, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, WALL, Colour, put_text, text_width
 from mecanum_env.views.paint import BELIEVED_PATH, PLANNED_PATH, UNSEEN
 from mecanum_env.views.render import FRAME_SHAPE, render_frame
 from training.play.controls import KEYS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,35 +17,31 @@ from mecanum_env import rooms as room_registry
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 from training.episodes.known_map import NAME as KNOWN_MAP
-from training.episodes.known_map import KnownMap
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 
-__all__ = ["PlayOptions", "Session"]
+__all__ = ["Session"]
 
 T = TypeVar("T")
 
 _LAST_SEED = 2**31 - 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlayOptions:
-    """What was asked for; ``None`` where the default decides."""
-
-    agent: str = "nearest-frontier"
-    rooms: str | None = None
-    slam: str | None = None
-    robot: str | None = None
-    noise: str | None = None
-    seed: int = 0
-    floor_plan: Path | None = None
-
-
 class Session:
     """Episodes one after the other, each with its rooms and its backend, and whoever drives.
 
     An episode goes on for as long as somebody drives: all may be mapped, and no limit of time ends it.
+
+    Parameters
+    ----------
+    agent : str
+        Who drives when asked to.
+    seed : int
+        Of the first episode.
+    **where
+        Rooms, robot and backend, as :func:`mecanum_env.arguments.make_config` takes them.
 
     Raises
     ------
@@ -63,22 +59,17 @@ class Session:
     trouble: str = ""
     """Why the last command could not be followed, or nothing."""
 
-    def __init__(self, options: PlayOptions) -> None:
-        self.agent_name = options.agent
+    def __init__(self, *, agent: str = "nearest-frontier", seed: int = 0, **where: Any) -> None:
+        self.agent_name = agent
         with bad_input():
-            agents.check(options.agent, KNOWN_MAP)
-            config = make_config(
-                rooms=options.rooms, slam=options.slam, robot=options.robot, noise=options.noise,
-                floor_plan=options.floor_plan,
-            )  # fmt: skip
+            agents.check(agent, KNOWN_MAP)
+            config = make_config(**where)
             # A plan from a file is a kind of rooms of its own.
             self._kinds: list[tuple[str, str | None]] = [(name, None) for name in room_registry.names()]
             if config.floor_plan is not None:
                 self._kinds.insert(0, (config.rooms, config.floor_plan))
-            self._start(config, options.seed)
-            self._make_agent(
-                self.env, options.seed
-            )  # its settings and its policy's file are looked at now, not at the wheel
+            self._start(config, seed)
+            self._make_agent(self.env, seed)  # its settings and policy are looked at now, not at the wheel
 
     # ---- what is there -------------------------------------------------------------------------------------
 
@@ -167,12 +158,7 @@ class Session:
 
     def _make_agent(self, env: ExploreEnv, seed: int) -> Agent:
         """Return the agent, told of the belief as it is now: it may take over anywhere."""
-        config = env.config
-        agent: Agent
-        if self.agent_name == KNOWN_MAP:
-            agent = KnownMap(env.truth.ground, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-        else:
-            agent = agents.make(self.agent_name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent = make_agent(self.agent_name, env)
         agent.reset(env.belief, seed)
         return agent
 

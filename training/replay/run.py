@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +18,13 @@ from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_referenc
 from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.settings import from_mapping, require, to_mapping, unknown_name
-from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.config_files import read_config
+from training.runs.errors import bad_input, check_writable
 from training.runs.running import interrupt_flag
 
 __all__ = [
     "FILES",
     "MAP_FILES",
-    "Progress",
     "Replay",
     "ReplayConfig",
     "ReplayOptions",
@@ -131,9 +129,8 @@ def prepare(options: ReplayOptions) -> Replay:
         if options.slam is not None:
             slam.config_type(options.slam)  # before a log is read in vain
         check_writable(options.out, (*MAP_FILES, *FILES))
-        values = _read_config(options.config) if options.config is not None else {}
-        run = {"seed": 0} | _run_table(values.pop("run", {}), options.config)
-        run |= {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
+        values, past = read_config(options.config, _RUN_KINDS) if options.config is not None else ({}, {})
+        run = {"seed": 0} | past | {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
         log = open_log(options.log, robot=options.robot)
         if "reference" in run:
             log = with_reference(log, run["reference"])
@@ -199,27 +196,6 @@ def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) ->
     return ReplayConfig(observation=config.observation, slam=name, slam_config=to_mapping(settings))
 
 
-def _read_config(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
-
-
-def _run_table(run: object, path: Path | None) -> dict[str, Any]:
-    """Return association, seed, limit and reference from a config's [run] table, where it has them."""
-    if not isinstance(run, dict):
-        raise BadInput(f"config {path}: [run] must be a table; see a config.toml")
-    for key, kinds in _RUN_KINDS.items():
-        if key in run and type(run[key]) not in kinds:
-            raise BadInput(f"config {path}: [run] {key} has the wrong type; see a config.toml")
-    if run.get("seed", 0) < 0:
-        raise BadInput(f"config {path}: [run] needs seed ≥ 0")
-    return {key: run[key] for key in _RUN_KINDS if key in run}
-
-
 # ---- the replay ------------------------------------------------------------------------------------------------
 
 
@@ -278,30 +254,3 @@ def _pose_nees(backend: Backend, true_pose: Array) -> float:
     if own is not None:  # a filter whose error is not the plain difference
         return float(own(true_pose))
     return float(nees_pose(backend.pose, backend.pose_cov, true_pose))
-
-
-class Progress:
-    """How far a replay is, and how long it will take: one line that changes, or now and then a line."""
-
-    def __init__(self, duration_s: float, stream: TextIO | None = None) -> None:
-        self._stream = stream or sys.stderr
-        self._duration = duration_s
-        self._terminal = self._stream.isatty()
-        self._began = time.monotonic()
-        self._next = self._began + (0.2 if self._terminal else 5.0)
-
-    def __call__(self, time_s: float) -> None:
-        """Show it, where it is time to."""
-        now = time.monotonic()
-        if now < self._next or time_s <= 0.0:
-            return
-        self._next = now + (0.2 if self._terminal else 30.0)
-        left = (now - self._began) * (self._duration - time_s) / max(time_s, 1e-9)
-        text = f"replaying: {time_s:.0f} of {self._duration:.0f} s, {left:.0f} s to go"
-        print(f"\r{text:<60}" if self._terminal else text, end="" if self._terminal else "\n",
-              file=self._stream, flush=True)  # fmt: skip
-
-    def close(self) -> None:
-        """Take the line away."""
-        if self._terminal:
-            print(f"\r{'':<60}\r", end="", file=self._stream, flush=True)

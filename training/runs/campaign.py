@@ -6,15 +6,12 @@ import json
 import multiprocessing
 import os
 import signal
-import sys
 import threading
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import cv2
 
@@ -22,9 +19,8 @@ import slam
 from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.runs.errors import BadInput, Interrupted, check_writable
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from training.runs.progress import Progress
+from training.runs.running import versions
 
 __all__ = [
     "backend_names",
@@ -41,7 +37,6 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 SETTINGS = "settings.json"
-_LOG_EVERY_S = 30.0  # between two lines of progress where standard error is no terminal
 # The libraries' own threads only get in each other's way where every core has its worker.
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -77,10 +72,7 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
 
 def installed_version() -> str:
     """Return this project's version, part of what a result depends on."""
-    try:
-        return version("mecanum-slam")
-    except PackageNotFoundError:
-        return "not installed"
+    return versions().get("mecanum-slam", "not installed")
 
 
 def check_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:
@@ -121,10 +113,10 @@ def write_settings(out: Path, settings: Mapping[str, Any]) -> None:
 
 
 def run_all(
-    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int, keep: Callable[[Job, Result], None],
-    what: str = "runs", apart: bool = False,
+    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int | None,
+    keep: Callable[[Job, Result], None], what: str = "runs", apart: bool = False,
 ) -> None:  # fmt: skip
-    """Do every job, in ``workers`` processes, and keep each result as it comes.
+    """Do every job, in ``workers`` processes (None: one a core), and keep each result as it comes.
 
     Parameters
     ----------
@@ -143,24 +135,27 @@ def run_all(
     Interrupted
         On Ctrl-C; what was kept until then stays.
     """
-    progress = _Progress(len(jobs), what)
+    done, total = 0, len(jobs)
+    if not total:
+        return
     try:
-        with closing(_results(jobs, work, min(workers, len(jobs)), apart)) as results:
+        at_most = min(workers or os.cpu_count() or 1, total)
+        with Progress(what, total) as progress, closing(_results(jobs, work, at_most, apart)) as results:
+            progress.show(0, f"0/{total}")
             for job, result in results:
                 keep(job, result)
-                progress.step()
+                done += 1
+                progress.show(done, f"{done}/{total}")
     except KeyboardInterrupt:
         raise Interrupted(
-            f"interrupted after {progress.done} of {len(jobs)} {what}; run the same command again to go on"
+            f"interrupted after {done} of {total} {what}; run the same command again to go on"
         ) from None
-    finally:
-        progress.close()
 
 
 def _results(
     jobs: Sequence[Job], work: Callable[[Job], Result], workers: int, apart: bool
 ) -> Generator[tuple[Job, Result], None, None]:
-    if workers < 1 or (workers == 1 and not apart):
+    if workers == 1 and not apart:
         for job in jobs:
             yield job, work(job)
         return
@@ -217,48 +212,3 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-class _Progress:
-    """How many are done, and how long the rest will take: a bar on a terminal, else a line now and then."""
-
-    def __init__(self, total: int, what: str) -> None:
-        self.total, self.what, self.done = total, what, 0
-        self._began = self._next = time.monotonic()
-        self._bar: Progress | None = _bar(total, what) if total and sys.stderr.isatty() else None
-        if total:
-            self._show()
-
-    def step(self) -> None:
-        self.done += 1
-        self._show()
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def _show(self) -> None:
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=self.done)
-        elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + _LOG_EVERY_S
-            print(f"{self.done}/{self.total} {self.what}{self._left()}", file=sys.stderr, flush=True)
-
-    def _left(self) -> str:
-        if not 0 < self.done < self.total:
-            return ""
-        seconds = (time.monotonic() - self._began) / self.done * (self.total - self.done)
-        return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"
-
-
-def _bar(total: int, what: str) -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    bar = Progress(
-        BarColumn(), MofNCompleteColumn(), TextColumn(what), TimeRemainingColumn(), TextColumn("left"),
-        console=Console(stderr=True), speed_estimate_period=300.0,
-    )  # fmt: skip
-    bar.add_task(what, total=total)
-    bar.start()
-    return bar

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["BadInput", "Interrupted", "bad_input", "check_writable", "one_line", "suggestion"]
+__all__ = ["BadInput", "Interrupted", "bad_input", "check_writable", "needs_extra", "one_line", "suggestion"]
 
 
 class BadInput(Exception):
@@ -29,6 +29,17 @@ def bad_input() -> Iterator[None]:
         yield
     except ValueError as error:
         raise BadInput(one_line(error)) from error
+
+
+@contextmanager
+def needs_extra(extra: str, what: str = "this") -> Iterator[None]:
+    """Take a library that is found missing inside for :class:`BadInput`: ``what`` needs one of an extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise BadInput(
+            f"{what} needs {error.name}; install it with pip install 'mecanum-slam[{extra}]'"
+        ) from error
 
 
 def one_line(error: object) -> str:

@@ -2,11 +2,38 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["Json", "Workers"]
+__all__ = [
+    "Backends", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Robot", "RoomSeed",
+    "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers",
+]  # fmt: skip
 
+_LAST_SEED = 2**31 - 1
+
+Backends = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+]
+FloorPlanFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
+MaxSteps = Annotated[
+    int | None, typer.Option(min=1, help="Step limit.  [default: 12 per m² of free space, at least 3000]")
+]
+Noise = Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Robot = Annotated[str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")]
+Rooms = Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")]
+RoomSeed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
+RoomSeedOrNone = Annotated[
+    int | None, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.  [default: 0]")
+]
+Seed = Annotated[int, typer.Option(min=0)]
+Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
+Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]

@@ -29,12 +29,9 @@ __all__ = ["check_extras", "config_text", "write_episode"]
 
 def check_extras(extras: Collection[str]) -> None:
     """Raise :class:`training.runs.errors.BadInput` where what one of them needs is not installed."""
-    if "video" in extras:
-        check_video()
-    if "mcap" in extras:
-        check_mcap()
-    if "rerun" in extras:
-        check_rerun()
+    for extra, check in (("video", check_video), ("mcap", check_mcap), ("rerun", check_rerun)):
+        if extra in extras:
+            check()
 
 
 def write_episode(

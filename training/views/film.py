@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from mecanum_env.views.render import render_frame
 from slam.formats import replacing
 from slam.geometry import compose, exp, inverse, log
-from training.runs.errors import BadInput
+from training.runs.errors import BadInput, needs_extra
 
 if TYPE_CHECKING:
     from agents.base import Goal
@@ -33,6 +32,11 @@ Image = NDArray[np.uint8]
 Write = Callable[[Image], None]
 
 _KEY_FRAME_S = 2.0  # how far apart the frames are that a player can jump to
+# Players take a film of this size for BT.709; ffmpeg on its own would write BT.601 and not say so.
+_H264 = (
+    "-vf", "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709",
+    "-c:v", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "23", "-movflags", "+faststart",
+)  # fmt: skip
 
 
 class Camera:
@@ -101,11 +105,9 @@ def film_episode(
 class Film:
     """A camera whose film may fail: then it films no more, and what it was told of the episode goes on."""
 
-    def __init__(self, path: Path, config: EnvConfig, *, substeps: bool) -> None:
-        self._path = path
+    def __init__(self, path: Path, camera: Camera, stack: ExitStack) -> None:
+        self._path, self._camera, self._open = path, camera, stack
         self.failure: OSError | None = None
-        self._open = ExitStack()
-        self._camera = self._open.enter_context(film_episode(path, config, substeps=substeps))
 
     def take(self, env: ExploreEnv, goal: Goal | None) -> None:
         """Film the environment as it is after ``reset`` or a step."""
@@ -123,31 +125,24 @@ class Film:
             self.failure = self.failure or error
         return self._path if self.failure is None else None
 
-    def give_up(self, *error: Any) -> None:
-        """Leave nothing of a film that is not finished, for an error as ``__exit__`` is told of it."""
-        self._open.__exit__(*error)
-
 
 @contextmanager
 def filmed(out: Path, config: EnvConfig, substeps: bool) -> Iterator[Film]:
     """Give a :class:`Film` that is made in a folder within ``out``, which goes when the block ends."""
     out.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder:
-        made = Film(Path(folder) / "episode.mp4", config, substeps=substeps)
-        try:
-            yield made
-        except BaseException:
-            made.give_up(*sys.exc_info())
-            raise
+    with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder, ExitStack() as stack:
+        path = Path(folder) / "episode.mp4"
+        yield Film(path, stack.enter_context(film_episode(path, config, substeps=substeps)), stack)
 
 
 @contextmanager
-def film(path: str | Path, *, fps: float) -> Iterator[Write]:
+def film(path: str | Path, *, fps: float, how: Sequence[str] = _H264) -> Iterator[Write]:
     """Give a function that takes a film's frames; the film is at ``path`` when the block ends.
 
-    It is H.264 in 4:2:0, with its index in front, as browsers want it. Frames are arrays ``(h, w, 3)`` of uint8,
-    RGB, all of one size, either side even. The film is written beside its place and then renamed. Ctrl-C in the
-    block keeps it as far as it came; any other exception leaves nothing.
+    It is H.264 in 4:2:0, with its index in front, as browsers want it, or what ffmpeg's options ``how`` make of
+    it. Frames are arrays ``(h, w, 3)`` of uint8, RGB, all of one size, either side even. The film is written
+    beside its place and then renamed. Ctrl-C in the block keeps it as far as it came; any other exception leaves
+    nothing.
 
     Raises
     ------
@@ -163,29 +158,28 @@ def film(path: str | Path, *, fps: float) -> Iterator[Write]:
         raise ValueError(f"a film has more than 0 frames a second, got {fps}")
     interrupted: KeyboardInterrupt | None = None
     with replacing(path) as temporary:
-        encoder = _Encoder(program, temporary, fps)
+        encoder = _Encoder(program, temporary, fps, how)
         try:
-            yield encoder.write
-        except KeyboardInterrupt as error:
-            if not encoder.started:
-                raise
-            interrupted = error
-        except BaseException:
+            try:
+                yield encoder.write
+            except KeyboardInterrupt as error:
+                if not encoder.started:
+                    raise
+                interrupted = error
+            encoder.finish()
+        except BaseException:  # a second Ctrl-C among them
             encoder.kill()
             raise
-        encoder.finish()
     if interrupted is not None:
         raise interrupted
 
 
 def check_video() -> str:
     """Return the path of ffmpeg; raise :class:`BadInput` where it is missing, before an episode is run in vain."""
-    try:
+    with needs_extra("video", "a film"):
         import imageio_ffmpeg
-
+    try:
         program = str(imageio_ffmpeg.get_ffmpeg_exe())
-    except ModuleNotFoundError as error:
-        raise BadInput(f"a film needs {error.name}; install it with pip install 'mecanum-slam[video]'") from error
     except RuntimeError as error:
         raise BadInput(f"a film needs ffmpeg, and there is none for this machine: {error}") from error
     if shutil.which(program) is None:
@@ -196,11 +190,10 @@ def check_video() -> str:
 class _Encoder:
     """ffmpeg as a process of its own, fed frame by frame; started by the first, which sets the size."""
 
-    def __init__(self, program: str, path: Path, fps: float) -> None:
-        self._program, self._path = program, path
+    def __init__(self, program: str, path: Path, fps: float, how: Sequence[str]) -> None:
+        self._program, self._path, self._how = program, path, how
         self._rate = Fraction(fps).limit_denominator(1001)
         self._shape: tuple[int, ...] = ()
-        self._error: OSError | None = None
 
     @property
     def started(self) -> bool:
@@ -227,10 +220,7 @@ class _Encoder:
         command = [
             self._program, "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
             "-video_size", f"{width}x{height}", "-framerate", str(self._rate), "-i", "pipe:0",
-            # Players take a film of this size for BT.709; ffmpeg on its own would write BT.601 and not say so.
-            "-vf", "scale=out_color_matrix=bt709:out_range=tv,setparams=color_primaries=bt709:color_trc=bt709",
-            "-c:v", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "23",
-            "-g", str(max(1, round(_KEY_FRAME_S * self._rate))), "-movflags", "+faststart", f"file:{self._path}",
+            "-g", str(max(1, round(_KEY_FRAME_S * self._rate))), *self._how, f"file:{self._path}",
         ]  # fmt: skip
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the process; a pipe could fill up
         # In a group of its own: Ctrl-C at the keyboard is for the episode, which then ends the film.
@@ -245,17 +235,9 @@ class _Encoder:
         """Wait for the film to be whole."""
         if not self.started:
             raise ValueError("a film has at least one frame")
-        if self._error is not None:
-            raise self._error
-        try:
+        with suppress(BrokenPipeError):
             self._pipe.close()
-            failed = self._process.wait() != 0
-        except BrokenPipeError:
-            failed = True
-        except BaseException:  # a second Ctrl-C
-            self.kill()
-            raise
-        if failed:
+        if self._process.wait() != 0:
             raise self._failure()
         self._said.close()
 
@@ -271,9 +253,7 @@ class _Encoder:
         self._process.wait()
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
-        self.kill()
-        self._error = OSError(f"cannot write the film: ffmpeg: {lines[-1] if lines else 'ended without a word'}")
-        return self._error
+        return OSError(f"cannot write the film: ffmpeg: {lines[-1] if lines else 'ended without a word'}")
 
 
 def _frame_between(env: ExploreEnv, share: float, before: Image) -> Image:

@@ -7,8 +7,10 @@ Axes and units follow REP 103, ranges REP 117. Time is the episode's own, from 0
 
 from __future__ import annotations
 
+import heapq
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +22,14 @@ from slam.formats import replacing
 from slam.geometry import compose, inverse, wrap
 from slam.motion import twist_between
 from training.episodes.playback import dead_reckoned, ellipses, map_origin, maps
-from training.episodes.recording import Recorded, Recording
-from training.runs.errors import BadInput
-from training.views.ros2_messages import Message, definition, encode
+from training.episodes.recording import Recording
+from training.runs.errors import needs_extra
 
 __all__ = ["TOPICS", "check_mcap", "write_mcap"]
 
 Array = NDArray[np.float64]
+Message = Mapping[str, Any]
+"""A message as nested mappings; a field that is left out is zero or empty."""
 
 TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -42,13 +45,11 @@ TOPICS = {
 }
 
 _LATCHED = ("/tf_static", "/robot", "/map", "/plan")
-_MAP_EVERY_S = 1.0
-_SIGMAS = 3.0
 _LEAST_AXIS_M = 0.02  # an ellipse smaller than this could not be seen
 _BODY_HEIGHT_M = 0.14
 _LANDMARK_HEIGHT_M = 0.02
 
-_SHAPES = {"CUBE": 1, "CYLINDER": 3}
+_CUBE, _CYLINDER = 1, 3
 _ADD, _DELETE = 0, 2
 _BELIEVED, _TRUE, _LANDMARK = (0.17, 0.38, 0.80, 1.0), (0.09, 0.55, 0.44, 0.5), (0.70, 0.15, 0.50, 0.6)
 
@@ -70,13 +71,10 @@ _ROSBAG2 = ("rosbag2", {"ROS_DISTRO": "humble"})
 
 
 def check_mcap() -> None:
-    """Raise :class:`BadInput` where the library is missing, before an episode is run in vain."""
-    try:
+    """Raise :class:`BadInput` where a library is missing, before an episode is run in vain."""
+    with needs_extra("ros", "--mcap"):
         import mcap.writer  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise BadInput(
-            f"--mcap needs mcap, and {error.name} is missing; install it with pip install 'mecanum-slam[ros]'"
-        ) from error
+        import rosbags.typesys  # noqa: F401
 
 
 def write_mcap(
@@ -103,11 +101,13 @@ def write_mcap(
     Raises
     ------
     BadInput
-        Where the package ``mcap`` is missing.
+        Where the packages ``mcap`` and ``rosbags`` are missing.
     """
     check_mcap()
     from mcap.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
 
+    types = get_typestore(Stores.ROS2_HUMBLE)  # what is written here is the same until Kilted
     with replacing(path) as temporary, open(temporary, "wb") as stream:
         writer: Any = Writer(stream)
         writer.start(profile="ros2", library="mecanum-slam")
@@ -118,7 +118,8 @@ def write_mcap(
         channels: dict[str, int] = {}
         for topic, datatype in TOPICS.items():
             if datatype not in schemas:
-                schemas[datatype] = writer.register_schema(datatype, "ros2msg", definition(datatype).encode())
+                definition, _ = types.generate_msgdef(datatype, ros_version=2)
+                schemas[datatype] = writer.register_schema(datatype, "ros2msg", definition.encode())
             latched = topic in _LATCHED
             qos = _QOS.format(depth=1 if latched else 10, durability=1 if latched else 2)
             channels[topic] = writer.register_channel(
@@ -126,67 +127,67 @@ def write_mcap(
             )
         for step, topic, message in _messages(recording, robot, lidar):
             at = _nanoseconds(recording.times[step])
-            writer.add_message(channels[topic], at, encode(TOPICS[topic], message), at)
+            encoded = types.serialize_cdr(_filled(types, TOPICS[topic], message), TOPICS[topic])
+            writer.add_message(channels[topic], at, bytes(encoded), at)
         writer.finish()
 
 
-def _messages(recording: Recording, robot: RobotConfig, lidar: LidarConfig) -> Iterator[tuple[int, str, Message]]:
+def _filled(types: Any, datatype: str, message: Message) -> Any:
+    """Return a message as rosbags takes it, whole: what is left out is zero or empty."""
+    from rosbags.interfaces import Nodetype
+
+    def filled(node: Any, value: Any) -> Any:
+        kind, what = node
+        if kind == Nodetype.NAME:
+            return _filled(types, what, value or {})
+        if kind == Nodetype.BASE:
+            return ("" if what[0] == "string" else 0) if value is None else value
+        (kind, what), length = what
+        if kind == Nodetype.NAME:
+            return [_filled(types, what, one) for one in value or ()]
+        return np.zeros(length, what[0]) if value is None else np.asarray(value, what[0])
+
+    fields = {name: filled(node, message.get(name)) for name, node in types.fielddefs[datatype][1]}
+    return types.types[datatype](**{**message, **fields})
+
+
+def _messages(recording: Recording, robot: RobotConfig, lidar: LidarConfig) -> Iterable[tuple[int, str, Message]]:
     """Return every message with its step and topic, in order of time."""
-    yield 0, "/tf_static", {"transforms": [_transform("base_link", "laser", 0.0, [lidar.offset_m, 0.0, 0.0])]}
-    yield 0, "/robot", _robot(robot)
-    odom = dead_reckoned(recording)
-    noted = {
-        "/scan": _by_step(recording.scans),
-        "/landmarks": _by_step(recording.landmarks),
-        "/plan": _by_step(recording.goals),
-    }
-    maps_to_come = maps(recording, least_s=_MAP_EVERY_S)
-    map_step, classes = next(maps_to_come, (-1, None))
-    shown = 0
-    for step, time_s in enumerate(recording.times.tolist()):
-        yield from ((step, topic, message) for topic, message in _poses(recording, step, odom[step]))
-        if step in noted["/scan"]:
-            yield step, "/scan", _scan(recording, time_s, noted["/scan"][step])
-        if step == map_step:
-            yield step, "/map", _map(recording, time_s, classes)
-            map_step, classes = next(maps_to_come, (-1, None))
-        if step in noted["/landmarks"]:
-            rows = noted["/landmarks"][step]
-            yield step, "/landmarks", _landmarks(time_s, rows, shown)
-            shown = len(rows)
-        if step in noted["/plan"]:
-            yield step, "/plan", _plan(time_s, noted["/plan"][step])
-
-
-def _poses(recording: Recording, step: int, odom: Array) -> Iterator[tuple[str, Message]]:
-    """Return what is known of the pose at a step, each with its topic."""
-    time_s = float(recording.times[step])
-    believed, true = recording.estimates[step], recording.true_poses[step]
-    before = recording.true_poses[max(step - 1, 0)]
-    yield (
-        "/tf",
-        {
-            "transforms": [
-                _transform("map", "odom", time_s, compose(believed, inverse(odom))),
-                _transform("odom", "base_link", time_s, odom),
-                _transform("map", "base_link_true", time_s, true),
-            ]
-        },
+    times, landmarks = recording.times, recording.landmarks
+    before = [0, *map(len, landmarks.values)]
+    laser = {"transforms": [_transform("base_link", "laser", 0.0, [lidar.offset_m, 0.0, 0.0])]}
+    return heapq.merge(
+        [(0, "/tf_static", laser), (0, "/robot", _robot(robot))],
+        _poses(recording),
+        ((step, "/scan", _scan(recording, times[step], ranges)) for step, ranges in recording.scans.items()),
+        ((step, "/map", _map(recording, times[step], classes)) for step, classes in maps(recording)),
+        (
+            (step, "/landmarks", _landmarks(times[step], rows, shown))
+            for (step, rows), shown in zip(landmarks.items(), before, strict=False)
+        ),
+        ((step, "/plan", _plan(times[step], path)) for step, path in recording.goals.items()),
+        key=itemgetter(0),
     )
-    yield "/odom", _odometry(time_s, "odom", "base_link", odom, recording.twists[step])
-    yield (
-        "/pose",
-        {
-            "header": _header(time_s, "map"),
-            "pose": {"pose": _pose(believed), "covariance": _covariance(recording.pose_covs[step])},
-        },
-    )
-    twist = twist_between(before, true, recording.step_s)
-    yield "/ground_truth", _odometry(time_s, "map", "base_link_true", true, twist)
 
 
-def _by_step(recorded: Recorded) -> dict[int, NDArray[np.generic]]:
-    return dict(zip(recorded.steps.tolist(), recorded.values, strict=True))
+def _poses(recording: Recording) -> Iterator[tuple[int, str, Message]]:
+    """Return what is known of the pose at each step."""
+    true_before = recording.true_poses[0]
+    for step, (time_s, odom, believed, true) in enumerate(
+        zip(recording.times, dead_reckoned(recording), recording.estimates, recording.true_poses, strict=True)
+    ):
+        frames = [
+            _transform("map", "odom", time_s, compose(believed, inverse(odom))),
+            _transform("odom", "base_link", time_s, odom),
+            _transform("map", "base_link_true", time_s, true),
+        ]
+        yield step, "/tf", {"transforms": frames}
+        yield step, "/odom", _odometry(time_s, "odom", "base_link", odom, recording.twists[step])
+        pose = {"pose": _pose(believed), "covariance": _covariance(recording.pose_covs[step])}
+        yield step, "/pose", {"header": _header(time_s, "map"), "pose": pose}
+        twist = twist_between(true_before, true, recording.step_s)
+        yield step, "/ground_truth", _odometry(time_s, "map", "base_link_true", true, twist)
+        true_before = true
 
 
 # ---- messages --------------------------------------------------------------------------------------------------
@@ -207,8 +208,7 @@ def _scan(recording: Recording, time_s: float, ranges: NDArray[np.generic]) -> M
     }
 
 
-def _map(recording: Recording, time_s: float, classes: NDArray[np.int8] | None) -> Message:
-    assert classes is not None
+def _map(recording: Recording, time_s: float, classes: NDArray[np.int8]) -> Message:
     x, y = map_origin(recording)
     return {
         "header": _header(time_s, "map"),
@@ -236,20 +236,15 @@ def _plan(time_s: float, path: NDArray[np.generic]) -> Message:
 
 def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
     """Return a flat cylinder for each landmark's 3σ ellipse; of those ``shown`` the rest go."""
-    axes, directions = ellipses(rows, _SIGMAS)
+    axes, directions = ellipses(rows)
     size = np.maximum(2.0 * axes, _LEAST_AXIS_M)
+    ns, header = "landmarks", _header(time_s, "map")
     markers = [
-        {
-            **_marker(k, "landmarks", "CYLINDER", _LANDMARK, "map", time_s),
-            "pose": _pose([x, y, direction]),
-            "scale": {"x": width, "y": height, "z": _LANDMARK_HEIGHT_M},
-        }
-        for k, (x, y, direction, width, height) in enumerate(
-            np.column_stack([rows[:, :2], directions, size]).tolist()
-        )
+        _marker(ns, k, header, _CYLINDER, _LANDMARK, _pose([x, y, turn]), (width, height, _LANDMARK_HEIGHT_M))
+        for k, (x, y, turn, width, height) in enumerate(np.column_stack([rows[:, :2], directions, size]).tolist())
     ]
     gone = [
-        {"header": _header(time_s, "map"), "ns": "landmarks", "id": k, "action": _DELETE}
+        {"header": header, "ns": ns, "id": k, "action": _DELETE, "pose": _pose([0.0, 0.0, 0.0])}
         for k in range(len(rows), shown)
     ]
     return {"markers": markers + gone}
@@ -257,30 +252,24 @@ def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
 
 def _robot(robot: RobotConfig) -> Message:
     """Return the body where it is believed to be and where it is, both moving along with their frames."""
+    pose, size = _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M), (robot.length_m, robot.width_m, _BODY_HEIGHT_M)
+    bodies = (("base_link", _BELIEVED), ("base_link_true", _TRUE))
     return {
         "markers": [
-            {
-                **_marker(k, "robot", "CUBE", colour, frame, 0.0),
-                "pose": _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M),
-                "scale": {"x": robot.length_m, "y": robot.width_m, "z": _BODY_HEIGHT_M},
-                "frame_locked": True,
-            }
-            for k, (frame, colour) in enumerate((("base_link", _BELIEVED), ("base_link_true", _TRUE)))
+            {**_marker("robot", k, _header(0.0, frame), _CUBE, colour, pose, size), "frame_locked": True}
+            for k, (frame, colour) in enumerate(bodies)
         ]
     }
 
 
 def _marker(
-    number: int, name: str, kind: str, colour: tuple[float, ...], frame: str, time_s: float
-) -> dict[str, Any]:
+    ns: str, number: int, header: Message, kind: int, colour: tuple[float, ...], pose: Message,
+    size: tuple[float, float, float],
+) -> dict[str, Any]:  # fmt: skip
     return {
-        "header": _header(time_s, frame),
-        "ns": name,
-        "id": number,
-        "type": _SHAPES[kind],
-        "action": _ADD,
-        "color": dict(zip("rgba", colour, strict=True)),
-    }
+        "header": header, "ns": ns, "id": number, "type": kind, "action": _ADD, "pose": pose,
+        "scale": dict(zip("xyz", size, strict=True)), "color": dict(zip("rgba", colour, strict=True)),
+    }  # fmt: skip
 
 
 def _odometry(time_s: float, frame: str, child: str, pose: Array, twist: Array) -> Message:

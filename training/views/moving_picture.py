@@ -5,7 +5,6 @@ An episode until it reaches a coverage, truth beside belief, several times as fa
 
 from __future__ import annotations
 
-import subprocess
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +14,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from slam.formats import replacing
 from training.episodes import explore
 from training.runs.errors import Interrupted, bad_input
-from training.views.film import Camera, check_video
+from training.views.film import Camera, film
 
 __all__ = ["moving_picture", "study"]
 
@@ -50,13 +48,9 @@ def moving_picture(options: explore.ExploreOptions, path: Path, *, speed: int, w
         raise Interrupted("interrupted; no picture was written")
     fps = 1.0 / episode.config.step_s
     frames += frames[-1:] * round(_STOPS_S * fps)
-    with replacing(path) as temporary:
-        command = [
-            check_video(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24",
-            "-video_size", f"{width}x{frames[0].shape[0]}", "-framerate", f"{fps:g}", "-i", "pipe:0",
-            "-vf", _FILTER, "-loop", "0", f"file:{temporary}",
-        ]  # fmt: skip
-        subprocess.run(command, input=b"".join(frame.tobytes() for frame in frames), check=True)
+    with film(path, fps=fps, how=("-vf", _FILTER, "-loop", "0")) as write:
+        for frame in frames:
+            write(frame)
     return len(frames)
 
 

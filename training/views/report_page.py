@@ -1,8 +1,8 @@
 """The report of an episode: one page that needs nothing else and replays the run in the browser.
 
-The page is put together from ``assets/episode.html``, ``.css`` and ``.js``. What it replays travels in it as
-arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to have
-``DecompressionStream`` (all major ones since spring 2023).
+The page is put together from ``assets/``: a frame, a style sheet and scripts, one a concern. What it replays
+travels in it as arrays, one after the other, deflated and in base64; :func:`pack` says which. The browser has to
+have ``DecompressionStream`` (all major ones since spring 2023).
 """
 
 from __future__ import annotations
@@ -25,20 +25,21 @@ from mecanum_env.views.canvas import Canvas, View
 from mecanum_env.views.paint import paint_plan
 from mecanum_env.views.pictures import episode_view
 from slam.geometry import inverse
+from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
     from mecanum_env.env import ExploreEnv
 
-__all__ = ["LOST", "NO_RETURN", "episode_page", "pack", "unpack"]
+__all__ = ["LOST", "NO_RETURN", "episode_page", "pack"]
 
 _ASSETS = Path(__file__).parent / "assets"
+_SCRIPTS = ("recording.js", "plan_views.js", "curves.js", "player.js")  # the last puts the others to work
 _TRUTH_PX = 1400  # of the true plan's longer side
 _MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
 _RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
 NO_RETURN, LOST = 253, 254  # … or is one of these
-_FAR = 0xFFFF  # how far the next changed cell is, where that takes more than 16 bits: so far, and on from there
 
 _WALL_CLOCK = {"decision_ms_median", "wall_time_s"}  # in metrics.json alone: one seed makes one page, bit for bit
 
@@ -86,7 +87,7 @@ def episode_page(
         "CONFIG": escape(config),
         "HEADER": json.dumps(header).replace("</", "<\\/"),
         "DATA": _deflated(header["arrays"], arrays),
-        "SCRIPT": _asset("episode.js"),
+        "SCRIPT": "".join(map(_asset, _SCRIPTS)),
     }
     page = _asset("episode.html")
     before, *pieces = page.split("{{")
@@ -151,15 +152,6 @@ def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
     return header, arrays
 
 
-def unpack(header: Mapping[str, Any], data: str) -> Arrays:
-    """Return the arrays, flat, from the base64 text that the page holds: what its script does."""
-    raw, at, arrays = zlib.decompress(base64.b64decode(data)), 0, {}
-    for name, kind, size in header["arrays"]:
-        arrays[name] = np.frombuffer(raw, np.dtype(kind).newbyteorder("<"), size, at)
-        at += _padded(arrays[name].nbytes)
-    return arrays
-
-
 def _deflated(listed: list[list[Any]], arrays: Arrays) -> str:
     """Return the arrays in base64, each beginning at a multiple of four bytes, as typed arrays have to."""
     parts = []
@@ -199,41 +191,26 @@ def _ranges(scans: Recorded, range_max: float) -> NDArray[np.uint8]:
 
 def _ellipses(landmarks: NDArray[np.float32]) -> NDArray[np.int32]:
     """Return ``(5, n)``: x, y [mm], semi-axes [0.1 mm], direction of the longer one [°]."""
-    x, y, xx, xy, yy = landmarks.astype(np.float64).T
-    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    axes = [np.sqrt(np.maximum(middle + sign * half, 0.0)) for sign in (1, -1)]
-    angle = np.degrees(0.5 * np.arctan2(2.0 * xy, xx - yy))
-    rows = [1e3 * x, 1e3 * y, *(1e4 * axis for axis in axes), angle]
+    axes, directions = ellipses(landmarks, sigmas=1.0)
+    rows = [*(1e3 * landmarks[:, :2].T), *(1e4 * axes.T), np.degrees(directions)]
     return np.clip(np.rint(rows), -(2**31), 2**31 - 1).astype(np.int32)
 
 
 def _map_changes(
     changes: Recorded, origin: tuple[int, int], cols: int
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8], NDArray[np.uint32]]:
+) -> tuple[NDArray[np.uint32], NDArray[np.uint8], NDArray[np.uint32]]:
     """Return the gaps between changed cells, their classes, and how many cells belong to each note.
 
-    A gap that takes more than 16 bits stands as ``_FAR`` as often as needed and the rest; within a note the cells
-    come by row, then column.
+    Within a note the cells come by row, then column.
     """
-    gaps: list[NDArray[np.int64]] = []
-    classes: list[NDArray[np.int64]] = []
+    gaps, classes = [np.zeros(0, np.uint32)], [np.zeros(0, np.uint8)]
     for change in changes.values:
         row, col, now = np.asarray(change, np.int64).T
         index = (row - origin[0]) * cols + (col - origin[1])
         order = np.argsort(index)
-        gap = np.diff(index[order], prepend=0)
-        times = gap // _FAR
-        if times.any():
-            spread = np.full(len(gap) + int(times.sum()), _FAR, np.int64)
-            spread[np.cumsum(times + 1) - 1] = gap % _FAR
-            gap = spread
-        gaps.append(gap)
-        classes.append(now[order])
-    return (
-        np.concatenate([np.zeros(0), *gaps]).astype(np.uint16),
-        (np.concatenate([np.zeros(0), *classes]) + 1).astype(np.uint8),
-        np.array([len(c) for c in classes], np.uint32),
-    )
+        gaps.append(np.diff(index[order], prepend=0).astype(np.uint32))
+        classes.append((now[order] + 1).astype(np.uint8))
+    return np.concatenate(gaps), np.concatenate(classes), _counts(changes)
 
 
 # ---- the page --------------------------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam.formats import replacing
 from slam.geometry import wrap
 from training.episodes.playback import ellipses, map_origin, maps
-from training.episodes.recording import Recorded, Recording
-from training.runs.errors import BadInput
+from training.episodes.recording import Recording
+from training.runs.errors import needs_extra
 
 __all__ = ["check_rerun", "write_rerun"]
 
@@ -26,8 +26,6 @@ Array = NDArray[np.float64]
 APPLICATION = "mecanum-slam"
 TIMELINE = "time"
 
-_MAP_EVERY_S = 1.0
-_SIGMAS = 3.0
 _BODY_HEIGHT_M, _LANDMARK_HEIGHT_M = 0.14, 0.01
 _SCAN_Z_M, _PATH_Z_M, _LANDMARK_Z_M = 0.03, 0.02, 0.04  # above the map, which would hide them
 _SCAN_PX, _PATH_PX, _LANDMARK_PX = 1.2, 1.2, 3.0  # radii on the screen
@@ -39,10 +37,8 @@ _BELIEVED, _TRUE, _PLANNED, _LANDMARK = (44, 96, 205), (22, 140, 112), (222, 92,
 
 def check_rerun() -> None:
     """Raise :class:`BadInput` where the library is missing, before an episode is run in vain."""
-    try:
+    with needs_extra("rerun", "--rerun"):
         import rerun  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise BadInput(f"--rerun needs {error.name}; install it with pip install 'mecanum-slam[rerun]'") from error
 
 
 def write_rerun(
@@ -75,13 +71,13 @@ def write_rerun(
         stream.send_recording_name(name)
         log = _Log(stream, recording)
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        _log_map(log)
-        _log_robot(log, "world/true", recording.true_poses, robot, _TRUE, solid=False)
-        _log_robot(log, "world/believed", recording.estimates, robot, _BELIEVED, solid=True)
-        _log_scans(log, "world/believed/lidar", lidar)
-        _log_plans(log)
-        _log_landmarks(log)
-        _log_curves(log)
+        log.map()
+        log.robot("world/true", recording.true_poses, robot, _TRUE, solid=False)
+        log.robot("world/believed", recording.estimates, robot, _BELIEVED, solid=True)
+        log.scans("world/believed/lidar", lidar)
+        log.plans()
+        log.landmarks()
+        log.curves()
         stream.flush()
         stream.disconnect()
 
@@ -90,134 +86,116 @@ class _Log:
     """A recording stream, told by step what it is told by time."""
 
     def __init__(self, stream: Any, recording: Recording) -> None:
-        self.stream, self.recording = stream, recording
+        import rerun
+
+        self.rr, self.stream, self.recording = rerun, stream, recording
 
     def columns(self, entity: str, steps: Sequence[int] | NDArray[np.integer[Any]], columns: Any) -> None:
-        import rerun as rr
-
         times = self.recording.times[np.asarray(steps, int)]
-        self.stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=times)], columns, strict=True)
+        self.stream.send_columns(entity, [self.rr.TimeColumn(TIMELINE, duration=times)], columns, strict=True)
 
+    def style(self, entity: str, archetype: Any, colour: tuple[int, int, int], px: float) -> None:
+        """Say once what all of an entity's points or lines look like."""
+        look = archetype.from_fields(colors=[colour], radii=self.rr.Radius.ui_points(px))
+        self.stream.log(entity, look, static=True)
 
-# ---- what is logged --------------------------------------------------------------------------------------------
+    def map(self) -> None:
+        rr = self.rr
+        steps, cells = [], []
+        rows = cols = 0
+        for step, classes in maps(self.recording):
+            rows, cols = classes.shape
+            steps.append(step)
+            cells.append(classes[::-1].tobytes())  # an image: its first row is the highest y
+        x, y = map_origin(self.recording)
+        n = len(steps)
+        image = rr.components.ImageFormat(width=cols, height=rows, color_model="L", channel_datatype="U8")
+        columns = rr.GridMap.columns(
+            data=cells, format=[image] * n, cell_size=[self.recording.resolution] * n,
+            translation=[(x, y, 0.0)] * n, colormap=[rr.components.Colormap.RvizMap] * n,
+        )  # fmt: skip
+        self.columns("world/map", steps, columns)
 
+    def robot(
+        self, entity: str, poses: Array, robot: RobotConfig, colour: tuple[int, int, int], *, solid: bool
+    ) -> None:
+        """Log a robot that moves, and the way it has come: a piece of it a step."""
+        rr = self.rr
+        steps = np.arange(len(poses))
+        flat = np.zeros(len(poses))
+        self.columns(
+            entity, steps,
+            rr.Transform3D.columns(
+                translation=np.column_stack([poses[:, :2], flat]), quaternion=_quaternions(poses[:, 2])
+            ),
+        )  # fmt: skip
+        half_sizes = [[0.5 * robot.length_m, 0.5 * robot.width_m, 0.5 * _BODY_HEIGHT_M]]
+        fill = rr.components.FillMode.Solid if solid else rr.components.FillMode.MajorWireframe
+        body = rr.Boxes3D(
+            half_sizes=half_sizes, centers=[[0.0, 0.0, 0.5 * _BODY_HEIGHT_M]], colors=[colour], fill_mode=fill
+        )
+        self.stream.log(f"{entity}/body", body, static=True)
+        ahead = rr.Arrows3D(vectors=[[0.4 * robot.length_m, 0.0, 0.0]], origins=[[0.0, 0.0, 1.2 * _BODY_HEIGHT_M]])
+        self.stream.log(f"{entity}/ahead", ahead, static=True)
+        points = np.column_stack([poses[:, :2], np.full(len(poses), _PATH_Z_M)])
+        path = f"{entity}_path"
+        self.style(path, rr.LineStrips3D, colour, _PATH_PX)
+        self.columns(path, steps[1:], rr.LineStrips3D.columns(strips=np.stack([points[:-1], points[1:]], axis=1)))
 
-def _log_map(log: _Log) -> None:
-    import rerun as rr
+    def scans(self, entity: str, lidar: LidarConfig) -> None:
+        """Log each scan as points in the lidar's own frame, which the believed robot carries."""
+        rr = self.rr
+        scan = self.recording.scan
+        rays = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
+        rays = np.column_stack([np.cos(rays), np.sin(rays), np.zeros(len(rays))])
+        self.stream.log(entity, rr.Transform3D(translation=[lidar.offset_m, 0.0, _SCAN_Z_M]), static=True)
+        self.style(f"{entity}/scan", rr.Points3D, _TRUE, _SCAN_PX)
+        points = [
+            rays[returned := np.isfinite(ranges)] * ranges[returned, None]
+            for ranges in (values.astype(np.float64) for values in self.recording.scans.values)
+        ]
+        columns = rr.Points3D.columns(positions=np.concatenate(points))
+        self.columns(f"{entity}/scan", self.recording.scans.steps, columns.partition([len(p) for p in points]))
 
-    steps, cells = [], []
-    rows = cols = 0
-    for step, classes in maps(log.recording, least_s=_MAP_EVERY_S):
-        rows, cols = classes.shape
-        steps.append(step)
-        cells.append(classes[::-1].tobytes())  # an image: its first row is the highest y
-    x, y = map_origin(log.recording)
-    n = len(steps)
-    image = rr.components.ImageFormat(width=cols, height=rows, color_model="L", channel_datatype="U8")
-    columns = rr.GridMap.columns(
-        data=cells, format=[image] * n, cell_size=[log.recording.resolution] * n, translation=[(x, y, 0.0)] * n,
-        colormap=[rr.components.Colormap.RvizMap] * n,
-    )  # fmt: skip
-    log.columns("world/map", steps, columns)
+    def plans(self) -> None:
+        rr = self.rr
+        goals = self.recording.goals
+        strips = [np.column_stack([path, np.full(len(path), _PATH_Z_M)]) for path in goals.values]
+        columns = rr.LineStrips3D.columns(strips=[s for s in strips if len(s)])
+        self.style("world/plan", rr.LineStrips3D, _PLANNED, _PATH_PX)
+        self.columns("world/plan", goals.steps, columns.partition([int(len(s) > 0) for s in strips]))
 
+    def landmarks(self) -> None:
+        """Log the landmarks, and of each its 3σ ellipse, flat."""
+        rr = self.rr
+        noted = self.recording.landmarks
+        rows = np.concatenate(noted.values)
+        counts = [len(values) for values in noted.values]
+        centres = np.column_stack([rows[:, :2], np.full(len(rows), _LANDMARK_Z_M)])
+        axes, directions = ellipses(rows)
+        half_sizes = np.column_stack([axes, np.full(len(rows), _LANDMARK_HEIGHT_M)])
+        self.style("world/landmarks", rr.Points3D, _LANDMARK, _LANDMARK_PX)
+        self.columns("world/landmarks", noted.steps, rr.Points3D.columns(positions=centres).partition(counts))
+        rims = rr.Ellipsoids3D.from_fields(colors=[_LANDMARK], fill_mode=rr.components.FillMode.Solid)
+        self.stream.log("world/landmarks/ellipses", rims, static=True)
+        columns = rr.Ellipsoids3D.columns(
+            half_sizes=half_sizes, centers=centres, quaternions=_quaternions(directions)
+        )
+        self.columns("world/landmarks/ellipses", noted.steps, columns.partition(counts))
 
-def _log_robot(
-    log: _Log, entity: str, poses: Array, robot: RobotConfig, colour: tuple[int, int, int], *, solid: bool
-) -> None:
-    """Log a robot that moves, and the way it has come: a piece of it a step."""
-    import rerun as rr
-
-    steps = np.arange(len(poses))
-    flat = np.zeros(len(poses))
-    log.columns(
-        entity, steps,
-        rr.Transform3D.columns(
-            translation=np.column_stack([poses[:, :2], flat]), quaternion=_quaternions(poses[:, 2])
-        ),
-    )  # fmt: skip
-    half_sizes = [[0.5 * robot.length_m, 0.5 * robot.width_m, 0.5 * _BODY_HEIGHT_M]]
-    fill = rr.components.FillMode.Solid if solid else rr.components.FillMode.MajorWireframe
-    body = rr.Boxes3D(
-        half_sizes=half_sizes, centers=[[0.0, 0.0, 0.5 * _BODY_HEIGHT_M]], colors=[colour], fill_mode=fill
-    )
-    log.stream.log(f"{entity}/body", body, static=True)
-    ahead = rr.Arrows3D(vectors=[[0.4 * robot.length_m, 0.0, 0.0]], origins=[[0.0, 0.0, 1.2 * _BODY_HEIGHT_M]])
-    log.stream.log(f"{entity}/ahead", ahead, static=True)
-    points = np.column_stack([poses[:, :2], np.full(len(poses), _PATH_Z_M)])
-    path = f"{entity}_path"
-    log.stream.log(
-        path, rr.LineStrips3D.from_fields(colors=[colour], radii=rr.Radius.ui_points(_PATH_PX)), static=True
-    )
-    log.columns(path, steps[1:], rr.LineStrips3D.columns(strips=np.stack([points[:-1], points[1:]], axis=1)))
-
-
-def _log_scans(log: _Log, entity: str, lidar: LidarConfig) -> None:
-    """Log each scan as points in the lidar's own frame, which the believed robot carries."""
-    import rerun as rr
-
-    scan = log.recording.scan
-    rays = scan.angle_min + scan.angle_increment * np.arange(len(scan.ranges))
-    rays = np.column_stack([np.cos(rays), np.sin(rays), np.zeros(len(rays))])
-    log.stream.log(entity, rr.Transform3D(translation=[lidar.offset_m, 0.0, _SCAN_Z_M]), static=True)
-    log.stream.log(
-        f"{entity}/scan", rr.Points3D.from_fields(colors=[_TRUE], radii=rr.Radius.ui_points(_SCAN_PX)), static=True
-    )
-    points = [
-        rays[returned := np.isfinite(ranges)] * ranges[returned, None]
-        for ranges in (values.astype(np.float64) for values in log.recording.scans.values)
-    ]
-    columns = rr.Points3D.columns(positions=np.concatenate(points))
-    log.columns(f"{entity}/scan", log.recording.scans.steps, columns.partition([len(p) for p in points]))
-
-
-def _log_plans(log: _Log) -> None:
-    import rerun as rr
-
-    goals = log.recording.goals
-    strips = [np.column_stack([path, np.full(len(path), _PATH_Z_M)]) for path in goals.values]
-    columns = rr.LineStrips3D.columns(strips=[s for s in strips if len(s)])
-    log.stream.log(
-        "world/plan",
-        rr.LineStrips3D.from_fields(colors=[_PLANNED], radii=rr.Radius.ui_points(_PATH_PX)),
-        static=True,
-    )
-    log.columns("world/plan", goals.steps, columns.partition([int(len(s) > 0) for s in strips]))
-
-
-def _log_landmarks(log: _Log) -> None:
-    """Log the landmarks, and of each its 3σ ellipse, flat."""
-    import rerun as rr
-
-    noted = _last_of_each_step(log.recording.landmarks)
-    rows = np.concatenate(list(noted.values()))
-    counts = [len(values) for values in noted.values()]
-    centres = np.column_stack([rows[:, :2], np.full(len(rows), _LANDMARK_Z_M)])
-    axes, directions = ellipses(rows, _SIGMAS)
-    half_sizes = np.column_stack([axes, np.full(len(rows), _LANDMARK_HEIGHT_M)])
-    dots = rr.Points3D.from_fields(colors=[_LANDMARK], radii=rr.Radius.ui_points(_LANDMARK_PX))
-    log.stream.log("world/landmarks", dots, static=True)
-    log.columns("world/landmarks", list(noted), rr.Points3D.columns(positions=centres).partition(counts))
-    rims = rr.Ellipsoids3D.from_fields(colors=[_LANDMARK], fill_mode=rr.components.FillMode.Solid)
-    log.stream.log("world/landmarks/ellipses", rims, static=True)
-    columns = rr.Ellipsoids3D.columns(half_sizes=half_sizes, centers=centres, quaternions=_quaternions(directions))
-    log.columns("world/landmarks/ellipses", list(noted), columns.partition(counts))
-
-
-def _log_curves(log: _Log) -> None:
-    import rerun as rr
-
-    recording = log.recording
-    off = recording.true_poses - recording.estimates
-    curves = {
-        "coverage": recording.coverage,
-        "error/position_m": np.hypot(off[:, 0], off[:, 1]),
-        "error/heading_rad": np.abs(wrap(off[:, 2])),
-        "nees": recording.nees,
-        "collisions": recording.collisions.astype(np.float64),
-    }
-    steps = np.arange(len(recording.times))
-    for entity, values in curves.items():
-        log.columns(entity, steps, rr.Scalars.columns(scalars=values))
+    def curves(self) -> None:
+        recording = self.recording
+        off = recording.true_poses - recording.estimates
+        curves = {
+            "coverage": recording.coverage,
+            "error/position_m": np.hypot(off[:, 0], off[:, 1]),
+            "error/heading_rad": np.abs(wrap(off[:, 2])),
+            "nees": recording.nees,
+            "collisions": recording.collisions.astype(np.float64),
+        }
+        steps = np.arange(len(recording.times))
+        for entity, values in curves.items():
+            self.columns(entity, steps, self.rr.Scalars.columns(scalars=values))
 
 
 def _blueprint(recording: Recording) -> Any:
@@ -248,10 +226,6 @@ def _blueprint(recording: Recording) -> Any:
 
 
 # ---- helpers ---------------------------------------------------------------------------------------------------
-
-
-def _last_of_each_step(recorded: Recorded) -> dict[int, NDArray[Any]]:
-    return dict(zip(recorded.steps.tolist(), recorded.values, strict=True))
 
 
 def _quaternions(headings: Array) -> Array:

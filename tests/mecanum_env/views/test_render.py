@@ -11,9 +11,8 @@ from mecanum_env import rooms
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.rooms.draw import FLOOR, ROBOT, WALL
 from mecanum_env.rooms.files.importers import from_raster
-from mecanum_env.views.canvas import Canvas, View, _round_length
+from mecanum_env.views.canvas import FLOOR, ROBOT, WALL, Canvas, View, _round_length
 from mecanum_env.views.paint import FRONTIER, LANDMARK, PLANNED_PATH
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
 from mecanum_env.views.render import FRAME_SHAPE, frontier_cells, render_frame

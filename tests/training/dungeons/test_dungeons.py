@@ -263,21 +263,22 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     assert [line.split(",")[:2] for line in csv[1:3]] == [["nearest-frontier", "2"], ["tour", "2"]]
     # Broken off in the middle of a row: only that one is run again.
     store.write_text("\n".join(rows[:3]) + "\n" + rows[3][:20])
-    with store.open("a") as file:
-        file.write("\n")
     ran = []
     import training.dungeons.protocol as command
 
     real = command._run
-    monkeypatch.setattr(command, "_run", lambda job: ran.append((job.agent, job.path.stem)) or real(job))
+    monkeypatch.setattr(command, "_run", lambda files, job: ran.append(job) or real(files, job))
     assert run_dungeons(maps, ["nearest-frontier", "tour"], out=out)["agents"].keys() == summary["agents"].keys()
-    assert ran == [(json.loads(rows[3])["agent"], json.loads(rows[3])["map"])]
+    assert ran == [tuple(json.loads(rows[3])[0])]
     assert "published: DARE" in table(summary) and "`tour`" in table(summary)
     bound = run_dungeons(maps, ["known-map", "nearest-frontier"], out=out)["agents"]["known-map"]
     assert bound["path_m_mean"] <= summary["agents"]["nearest-frontier"]["path_m_mean"] and bound["ratio"] <= 1.0
-    # The same folder for another protocol is refused.
+    # The same folder for another protocol is refused, and so is one whose rows an earlier version kept.
     assert main([*arguments, "--scan", "continuous"]) == 2
     assert "scan" in capsys.readouterr().err
+    store.write_text(json.dumps(json.loads(rows[0])[1]) + "\n")
+    assert main(arguments) == 2
+    assert "earlier version" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from mecanum_env.views.render import render_frame
 from tests.training.plans import write_room
 from training.play.controls import Command
 from training.play.picture import PICTURE_SHAPE, _shortened, play_picture
-from training.play.session import PlayOptions, Session
+from training.play.session import Session
 from training.runs.errors import BadInput, Interrupted
 
 FAST = 1000.0  # times true speed
@@ -24,7 +24,7 @@ REST = np.zeros(3, np.float32)
 
 
 def session(**options: Any) -> Session:
-    return Session(PlayOptions(**({"rooms": "rectangular"} | options)))
+    return Session(**({"rooms": "rectangular"} | options))
 
 
 # ---- the session: no window is needed ---------------------------------------------------------------------------

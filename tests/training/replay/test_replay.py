@@ -26,6 +26,7 @@ from tests.slam.logs.logs_on_disk import data_folder, write_park, write_utias
 from training.cli import main
 from training.replay import report as replay_report
 from training.replay import run as task
+from training.runs.progress import Progress
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +140,11 @@ def test_a_backends_own_nees_is_asked(logs: Path, tmp_path: Path, monkeypatch: p
 def test_ctrl_c_keeps_the_replay_as_far_as_it_came(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def press(self: task.Progress, time_s: float) -> None:
+    def press(self: Progress, time_s: float, text: str) -> None:
         if time_s >= 4.0:
             os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(task.Progress, "__call__", press)
+    monkeypatch.setattr(Progress, "show", press)
     out = tmp_path / "out"
     assert main(["replay", str(logs / "utias"), "--out", str(out), "--json"]) == 130
     printed = capsys.readouterr()
@@ -152,19 +153,6 @@ def test_ctrl_c_keeps_the_replay_as_far_as_it_came(
     assert "interrupted after 4.0 s" in printed.err and str(out) in printed.err
     assert sorted(p.name for p in out.iterdir()) == sorted(task.FILES)
     assert read_tum(out / "trajectory_estimate.tum")[0][-1] <= 4.1
-
-
-def test_progress_has_an_eta(monkeypatch: pytest.MonkeyPatch) -> None:
-    now = [0.0]
-    monkeypatch.setattr(task.time, "monotonic", lambda: now[0])  # type: ignore[attr-defined]
-    stream = io.StringIO()
-    progress = task.Progress(100.0, stream)
-    for now[0], time_s in ((1.0, 4.0), (10.0, 40.0), (12.0, 48.0), (41.0, 80.0)):
-        progress(time_s)
-    progress.close()
-    assert stream.getvalue().splitlines() == [
-        "replaying: 40 of 100 s, 15 s to go", "replaying: 80 of 100 s, 10 s to go",
-    ]  # fmt: skip
 
 
 gaps = st.lists(st.integers(1, 60), max_size=15)

@@ -20,6 +20,7 @@ from tests.training.replay.test_replay import refused, replayed
 from training.cli import main
 from training.replay import report as replay_report
 from training.replay import run as task
+from training.runs.progress import Progress
 
 SCANS = 140  # more than twice round
 
@@ -156,7 +157,7 @@ def test_the_first_minutes_of_the_intel_log(tmp_path: Path, capsys: pytest.Captu
 def test_ctrl_c_at_the_first_scan_keeps_it(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(task.Progress, "__call__", lambda self, time_s: os.kill(os.getpid(), signal.SIGINT))
+    monkeypatch.setattr(Progress, "show", lambda self, done, text: os.kill(os.getpid(), signal.SIGINT))
     assert main(["replay", *argv(logs, "--out", str(tmp_path), "--json")]) == 130
     found = json.loads(capsys.readouterr().out)
     assert found["interrupted"] and found["scans"] == 1 and (tmp_path / "map.png").exists()

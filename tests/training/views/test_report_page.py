@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +23,7 @@ from training.episodes.explore import ExploreOptions
 from training.episodes.recording import Recorded as Recording_
 from training.episodes.recording import Recorder, Recording, _MapFollower
 from training.views.episode_files import write_episode
-from training.views.report_page import LOST, NO_RETURN, _thinned, pack, unpack
+from training.views.report_page import LOST, NO_RETURN, _thinned, pack
 
 STEPS = 120
 
@@ -50,6 +52,15 @@ def page_data(page: str) -> tuple[dict[str, Any], dict[str, Any]]:
     texts = re.findall(r'<script type="[a-z/]+" id="(?:header|data)">(.*?)</script>', page, re.DOTALL)
     header = json.loads(texts[0])
     return header, unpack(header, texts[1])
+
+
+def unpack(header: dict[str, Any], data: str) -> dict[str, Any]:
+    """Return the arrays, flat, from the base64 text that the page holds: what its script does."""
+    raw, at, arrays = zlib.decompress(base64.b64decode(data)), 0, {}
+    for name, kind, size in header["arrays"]:
+        arrays[name] = np.frombuffer(raw, np.dtype(kind).newbyteorder("<"), size, at)
+        at += -(-arrays[name].nbytes // 4) * 4
+    return arrays
 
 
 def rebuilt(recording: Recording) -> tuple[np.ndarray, tuple[int, int]]:
@@ -153,9 +164,7 @@ def decoded_map(header: dict[str, Any], arrays: dict[str, Any]) -> np.ndarray:
     for count in arrays["map_count"].tolist():
         index = 0
         for _ in range(count):
-            while (gap := next(gaps)) == 0xFFFF:
-                index += gap
-            index += gap
+            index += next(gaps)
             classes[index] = next(cells)
     return classes.reshape(rows, cols) - 1
 

@@ -71,7 +71,7 @@ def test_entities_and_their_rows(path: Path, columns: Columns, episode: Recorded
     n = STEPS + 1
     landmark_notes = len(set(recording.landmarks.steps.tolist()))
     assert rows == {
-        "/world/map": len(list(maps(recording, least_s=1.0))),
+        "/world/map": len(list(maps(recording))),
         "/world/true": n, "/world/true_path": n - 1, "/world/believed": n, "/world/believed_path": n - 1,
         "/world/believed/lidar/scan": len(recording.scans.steps), "/world/plan": len(recording.goals.steps),
         "/world/landmarks": landmark_notes, "/world/landmarks/ellipses": landmark_notes,
@@ -98,7 +98,7 @@ def test_poses_are_those_recorded(columns: Columns, episode: Recorded) -> None:
 def test_maps_are_images_with_the_highest_row_first(columns: Columns, episode: Recorded) -> None:
     recording = episode.recording
     logged = columns["/world/map"]
-    for k, (step, classes) in enumerate(maps(recording, least_s=1.0)):
+    for k, (step, classes) in enumerate(maps(recording)):
         assert times_of(columns, "/world/map")[k] == pytest.approx(recording.times[step])
         (image,) = logged["GridMap:format"][k]
         assert (image["height"], image["width"]) == classes.shape

@@ -1,0 +1,121 @@
+"use strict";
+// What is replayed. Everything is in the start frame, in metres, y upwards; `k` is a row.
+async function openRecording(header, text) {
+  const data = await unpack(text);
+  const goalAt = offsets(data.goal_count), landmarkAt = offsets(data.landmark_count);
+  const landmarks = data.landmark.length / 5;
+
+  async function unpack(text) {
+    const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const buffer = await new Response(stream).arrayBuffer();
+    const kinds = {
+      float32: Float32Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
+    };
+    const arrays = {};
+    let at = 0;
+    for (const [name, kind, size] of header.arrays) {
+      arrays[name] = new kinds[kind](buffer, at, size);
+      at += Math.ceil(arrays[name].byteLength / 4) * 4;
+    }
+    return arrays;
+  }
+
+  // The last note at or before row k; -1 where there is none yet.
+  function noted(steps, k) {
+    let low = 0, high = steps.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (steps[middle] <= k) low = middle + 1; else high = middle;
+    }
+    return low - 1;
+  }
+
+  function offsets(counts) {
+    const out = new Uint32Array(counts.length + 1);
+    for (let i = 0; i < counts.length; i++) out[i + 1] = out[i] + counts[i];
+    return out;
+  }
+
+  // The way ahead, x and y in turns; empty where there is none.
+  function wayAt(k) {
+    const i = noted(data.goal_step, k);
+    return i < 0 ? [] : data.goal.subarray(2 * goalAt[i], 2 * goalAt[i + 1]);
+  }
+
+  // Of each landmark x, y and the semi-axes of its covariance in metres, the longer's direction in radians.
+  function landmarksAt(k) {
+    const i = noted(data.landmark_step, k), found = [];
+    for (let j = landmarkAt[i]; j < landmarkAt[i + 1]; j++) {
+      const [x, y, a, b, angle] = [0, 1, 2, 3, 4].map((row) => data.landmark[row * landmarks + j]);
+      found.push([x / 1e3, y / 1e3, a / 1e4, b / 1e4, (angle * Math.PI) / 180]);
+    }
+    return found;
+  }
+
+  // The pose's covariance: semi-axes of its position [m], and the longer's direction.
+  function poseEllipse(k) {
+    const [xx, xy, yy] = data.cov.subarray(4 * k, 4 * k + 3), middle = (xx + yy) / 2, half = Math.hypot((xx - yy) / 2, xy);
+    const axes = [middle + half, middle - half].map((v) => Math.sqrt(Math.max(v, 0)));
+    return [...axes, Math.atan2(2 * xy, xx - yy) / 2];
+  }
+
+  function scanAt(k) {
+    const i = noted(data.scan_step, k), ranges = new Float32Array(header.beams);
+    let code = 0;
+    for (let b = 0; b < header.beams; b++) {
+      code = (code + data.scan[i * header.beams + b]) & 255;
+      ranges[b] = code === 254 ? NaN : code === 253 ? Infinity : (code / 252) * header.range_max;
+    }
+    return { row: data.scan_step[i], ranges };
+  }
+
+  // The map as it is at row k, one pixel a cell, its first row the highest; changes are laid on one by one, and from
+  // the beginning where time has run backwards.
+  const map = (() => {
+    const { rows, cols } = header.map;
+    const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d");
+    const image = context.createImageData(cols, rows), pixels = new Uint32Array(image.data.buffer);
+    const classes = new Uint8Array(rows * cols); // 0 unknown, 1 free, 101 occupied
+    const shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 };
+    let done = 0, cell = 0, edge = null;
+    function clear() {
+      done = cell = 0;
+      classes.fill(0);
+      pixels.fill(shades[0]);
+    }
+    function show(k) {
+      const upTo = noted(data.map_step, k) + 1;
+      if (upTo === done && done > 0) return;
+      if (upTo < done || done === 0) clear();
+      for (; done < upTo; done++) {
+        let index = 0;
+        for (const end = cell + data.map_count[done]; cell < end; cell++) {
+          index += data.map_gap[cell];
+          classes[index] = data.map_class[cell];
+          const row = Math.floor(index / cols);
+          pixels[(rows - 1 - row) * cols + (index - row * cols)] = shades[classes[index]];
+        }
+      }
+      context.putImageData(image, 0, 0);
+      edge = null;
+    }
+    // Free cells beside unknown ones, as a path of squares on a canvas whose unit is the cell.
+    function frontiers() {
+      if (edge) return edge;
+      const path = edge = new Path2D();
+      for (let row = 1; row < rows - 1; row++) {
+        for (let i = row * cols + 1; i < (row + 1) * cols - 1; i++) {
+          if (classes[i] !== 1) continue;
+          if (classes[i - 1] && classes[i + 1] && classes[i - cols] && classes[i + cols]) continue;
+          path.rect(i - row * cols, rows - 1 - row, 1, 1);
+        }
+      }
+      return path;
+    }
+    clear();
+    return { canvas, show, frontiers, classes };
+  })();
+
+  return { data, scanAt, wayAt, landmarksAt, poseEllipse, map };
+}
