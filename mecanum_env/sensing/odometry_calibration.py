@@ -126,8 +126,6 @@ def open_floor() -> FloorPlan:
     return FloorPlan(
         name="open floor",
         walls=np.hstack([corners, np.roll(corners, -1, axis=0)]),
-        polygons=(),
-        circles=np.zeros((0, 3)),
         free=np.ones((cells, cells), np.bool_),
         resolution=resolution,
         origin=(-half, -half),

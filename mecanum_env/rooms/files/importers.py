@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES, read_bytes, read_grey
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.assembly import DRIVE_RADIUS_M, generator
+from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
 
 __all__ = ["from_raster", "load", "load_image", "load_ros_map"]
@@ -143,8 +143,6 @@ def from_raster(
     return FloorPlan(
         name=name,
         walls=walls,
-        polygons=(),
-        circles=np.zeros((0, 3)),
         free=free,
         resolution=resolution,
         origin=origin,
@@ -158,9 +156,8 @@ def _start(
     clearance = clearance_of(free, resolution)
     # Of a free cell's centre at the least, so that some radius fits.
     radius = next((r for r in _RADII_M if np.any(clearance >= r)), 0.0)
-    passable = ((clearance >= radius) & free).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(passable, connectivity=4)
-    area = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    area = largest_part((clearance >= radius) & free)
+    assert area is not None
     # Surfaces may lie half a cell before the cells' edges.
     wanted = min(_START_CLEARANCE_M + 0.5 * resolution, float(clearance[area].max()))
     places = np.flatnonzero(area & (clearance >= wanted))

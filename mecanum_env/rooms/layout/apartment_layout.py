@@ -14,7 +14,7 @@ import numpy as np
 
 from mecanum_env.rooms.layout.furniture import Box, cells
 from mecanum_env.rooms.layout.limits import interval
-from slam.settings import require
+from slam.settings import require, shares
 
 __all__ = ["ApartmentConfig", "Door", "Layout", "draw_layout"]
 
@@ -43,9 +43,7 @@ class ApartmentConfig:
         interval(self, "door_m", low=0.9, high=1.6)
         interval(self, "wall_m", low=0.1, high=0.5)
         require(all(isinstance(n, int) for n in self.rooms), "ApartmentConfig.rooms must be two whole numbers")
-        for name in ("links", "furniture"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"ApartmentConfig.{name} must be in [0, 1], got {value}")
+        shares(self, "links", "furniture")
 
 
 @dataclass(frozen=True, slots=True)

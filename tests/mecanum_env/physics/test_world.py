@@ -61,7 +61,9 @@ def room(
             for corner, side in zip(polygon, sides, strict=True)
         ]
         free &= ~np.all(inside, axis=0)
-    return FloorPlan("room", walls, polygons, circles, free, resolution, (0.0, 0.0), start)
+    return FloorPlan(
+        name="room", walls=walls, polygons=polygons, circles=circles, free=free, resolution=resolution, start=start
+    )
 
 
 def world(plan: FloorPlan, *, noise: NoiseConfig = EXACT, robot: RobotConfig = ROBOT, **kwargs: object) -> World:

@@ -284,7 +284,7 @@ def test_scans_are_fresh_arrays() -> None:
 def test_pressed_against_a_wall_the_lidar_reads_the_robots_half_width(name: str) -> None:
     robot = ROBOT_PRESETS[name]
     free = np.ones((80, 80), bool)
-    plan = FloorPlan("square", SQUARE, (), NO_CIRCLES, free, 0.05, (0.0, 0.0), (2.0, 3.4, 0.0))
+    plan = FloorPlan(name="square", walls=SQUARE, free=free, resolution=0.05, start=(2.0, 3.4, 0.0))
     world = World(plan, robot, EXACT, np.random.default_rng(0))
     for _ in range(30):
         world.step(twist_action_to_wheels(robot, (0.0, 0.5, 0.0)), 0.1, 0.02)
