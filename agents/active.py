@@ -21,13 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Goal
-from agents.driving.grip import GentleFollower, WheelWatch
+from agents.driving.grip import GentleFollower, WheelWatch, eased
 from agents.explorer import Candidates
 from agents.tour import Outlook, Tour, TourConfig
 from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
 from agents.view_points.sightings import expected_sightings
 from agents.ways import cost_map as cost_maps
-from agents.ways.planning import shortest_path
 from slam.belief import Belief
 from slam.settings import not_negative, positive, require
 
@@ -106,11 +105,9 @@ class ActiveSlam(Tour):
     def _forget(self) -> None:
         super()._forget()
         config = self.config
-        self._gentle = GentleFollower(
-            config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s,
-            gentle_m_s2=config.gentle_m_s2, gentle_speed_share=config.gentle_speed_share,
-        )  # fmt: skip
-        self._follower = self._gentle
+        self._follower = self._gentle = GentleFollower(
+            config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
         self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * config.firm_share)
         self._looked_s: float | None = 0.0  # at the start; None once it has driven off
         self._places: list[Array] = []  # (3,) x, y [m] and the pose's spread [m] there
@@ -149,17 +146,13 @@ class ActiveSlam(Tour):
         for k in np.union1d(places, kept).tolist():
             piece = int(views[k])
             row, column = candidates.cells[piece].tolist()
-            path = self._path(candidates, belief, (row, column))
+            path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
             delay_s = outlook.delay_m(k + 1, config.thought_tries) / config.foresight.speed_m_s
             spread = self._spread_after(foresight, marks, candidates, path)
             prices.append(config.delay * delay_s + config.worth_s_per_m * spread)
             paths.append(path)
             chosen.append(piece)
         return prices, paths, chosen
-
-    def _path(self, candidates: Candidates, belief: Belief, cell: tuple[int, int]) -> Array:
-        spacing = self.config.planner.path_spacing_m
-        return shortest_path(candidates.cost_map, candidates.travel, cell, start=belief.pose, spacing_m=spacing)
 
     def _foresight(self) -> Foresight:
         return Foresight(
@@ -185,7 +178,8 @@ class ActiveSlam(Tour):
         nearest = int(np.argmin(costs))
         if not np.isfinite(costs[nearest]):
             return
-        there = self._path(candidates, belief, (int(cells[nearest, 0]), int(cells[nearest, 1])))
+        row, column = cells[nearest].tolist()
+        there = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
         foresight, marks = self._foresight(), marks_of(belief)
         direct = self._spread_after(foresight, marks, candidates, path)
         around = self._spread_after(foresight, marks, candidates, np.vstack([there, there[-2::-1], path[1:]]))
@@ -220,9 +214,11 @@ class ActiveSlam(Tour):
                 return self._look(belief)
             self._looked_s = None
         config = self.config
-        self._gentle.go_gently(
-            float(np.interp(self._wheels.share, [config.firm_share, config.slippery_share], [0.0, 1.0]))
-        )
+        slippery = float(np.interp(self._wheels.share, [config.firm_share, config.slippery_share], [0.0, 1.0]))
+        self._gentle.config = eased(
+            config.control, slippery, speed_share=config.gentle_speed_share,
+            acceleration_m_s2=config.gentle_m_s2, deceleration_m_s2=config.gentle_m_s2,
+        )  # fmt: skip
         self._remember(belief)
         action = super().act(observation, belief)
         return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action

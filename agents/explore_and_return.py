@@ -17,7 +17,7 @@ from agents.base import Goal
 from agents.driving.control import PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from agents.ways import cost_map as cost_maps
-from agents.ways.planning import shortest_path, travel_costs
+from agents.ways.planning import travel_costs
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import positive
@@ -27,7 +27,6 @@ __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
 Array = NDArray[np.float64]
 
 _HOME = np.zeros(3)  # the belief's frame is that of the start pose
-_TURN_WITHIN_M = 0.5  # of the start: from there on it turns to the start's heading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,14 +126,13 @@ class ExploreAndReturn(NearestFrontier):
         reached = np.argwhere(np.isfinite(travel.cost))
         away = np.hypot(*(cost_map.to_points(reached) - _HOME[:2]).T)
         nearest = int(np.argmin(away))
-        cell = (int(reached[nearest, 0]), int(reached[nearest, 1]))
-        spacing = self.config.planner.path_spacing_m
-        path = shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
+        row, column = reached[nearest].tolist()
+        path = self._path(cost_map, travel, (row, column), belief)
         if away[nearest] <= max(self.config.homing.last_leg_m, cost_map.resolution):
             # The start itself for the centre of the cell. Where that cell is not the start's own, the robot has
             # stood there all the same, and the follower's safety check keeps it off the walls.
             path = np.vstack([path[: max(len(path) - 1, 1)], _HOME[:2]])
-        return path, float(travel.cost[cell])
+        return path, float(travel.cost[row, column])
 
     def _is_home(self, belief: Belief) -> bool:
         pose = np.asarray(belief.pose, dtype=np.float64)
@@ -159,7 +157,7 @@ class _HomeFollower(PathFollower):
     """Ends with the start's heading, also where the sensor sees all round and would not need to turn."""
 
     # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
-    _turn_within_m = _TURN_WITHIN_M
+    _turn_within_m = 0.5  # of the start
 
     def set_path(self, path: Array, heading: float | None) -> None:
         super().set_path(path, float(_HOME[2]))

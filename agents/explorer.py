@@ -121,14 +121,8 @@ class Explorer(Agent):
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]
-        cell = (int(candidates.cells[index, 0]), int(candidates.cells[index, 1]))
-        path = shortest_path(
-            candidates.cost_map,
-            candidates.travel,
-            cell,
-            start=belief.pose,
-            spacing_m=self.config.planner.path_spacing_m,
-        )
+        row, column = candidates.cells[index].tolist()
+        path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
@@ -141,6 +135,10 @@ class Explorer(Agent):
         self._target = target
         self._status = "driving"
         return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
+
+    def _path(self, cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], belief: Belief) -> Array:
+        spacing = self.config.planner.path_spacing_m
+        return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
 
     def _candidates(self, belief: Belief) -> Candidates:
         config = self.config

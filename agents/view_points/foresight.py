@@ -144,10 +144,6 @@ class Foresight:
         poses, times = self.legs(marks.x[:3], path)
         return self.through(marks, cost_map, poses, times)
 
-    def standing(self, marks: Marks, cost_map: CostMap, time_s: float) -> Foreseen:
-        """Return the same for looking on from here for so long."""
-        return self.through(marks, cost_map, marks.x[None, :3], np.array([time_s]))
-
     def legs(self, pose: Array, path: Array) -> tuple[Array, Array]:
         """Return the poses ``(k, 3)`` at the ends of a path's legs, the start's first, and the legs' times [s]."""
         config = self.config

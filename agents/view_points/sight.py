@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 
@@ -50,7 +50,8 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
     ``normals`` ``(n, 2)`` point from free to unknown; where one is zero, every direction is as good.
     """
     seen = np.zeros(len(cells), dtype=np.bool_)
-    poses = _in_cells(cost_map, np.asarray(watch.poses, dtype=np.float64).reshape(-1, 3))
+    poses = np.array(watch.poses, dtype=np.float64).reshape(-1, 3)
+    poses[:, :2] = cost_map.in_cells(poses[:, :2])
     # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
     poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
     reach = watch.range_m / cost_map.resolution
@@ -85,16 +86,9 @@ def first_in_good_sight(
         Diameter of the circle of good sight.
     """
     found = np.full(len(cells), -1, dtype=np.int64)
-    poses = _in_cells(cost_map, np.column_stack([places, np.zeros(len(places))]))
+    poses = np.column_stack([cost_map.in_cells(places), np.zeros(len(places))])
     _first_seen(cost_map.classes, cells, normals, poses, worth, least, range_m / cost_map.resolution, found)
     return found
-
-
-def _in_cells(cost_map: CostMap, poses: Array) -> Array:
-    """Return poses ``(k, 3)`` with their positions in cells from the grid's corner."""
-    poses = poses.copy()
-    poses[:, :2] = (poses[:, :2] - np.asarray(cost_map.origin)) / cost_map.resolution
-    return poses
 
 
 def view_points(
@@ -106,7 +100,7 @@ def view_points(
     that point, one near the frontier that sees the frontier itself will do: it is the last that can be tried.
     """
     reach = _NEARER * range_m / cost_map.resolution
-    start = (targets - np.asarray(cost_map.origin)) / cost_map.resolution
+    start = cost_map.in_cells(targets)
     cells = np.full((len(start), 2), -1, dtype=np.int64)
     costs = np.full(len(start), np.inf)
     _look(cost_map.classes, travel.cost, start, normals, reach, beyond_m / cost_map.resolution, cells, costs)
@@ -193,7 +187,7 @@ def _is_free_line(classes: NDArray[np.int8], x0: float, y0: float, x1: float, y1
     count = int(length / 0.7) + 1  # less than a cell: no wall is stepped over, diagonal ones included
     for i in range(count):
         share = i / count
-        if _at(classes, x0 + share * (x1 - x0), y0 + share * (y1 - y0)) != FREE:
+        if kind_at(classes, math.floor(y0 + share * (y1 - y0)), math.floor(x0 + share * (x1 - x0))) != FREE:
             return False
     return True
 
@@ -214,20 +208,12 @@ def _look(
         x, y = targets[i, 0], targets[i, 1]
         nx, ny = normals[i, 0], normals[i, 1]
         push = beyond
-        while push > 0.0 and _at(classes, x + push * nx, y + push * ny) == OCCUPIED:
+        while push > 0.0 and kind_at(classes, math.floor(y + push * ny), math.floor(x + push * nx)) == OCCUPIED:
             push -= 1.0
         push = max(push, 0.0)
         _sweep(classes, cost, x, y, nx, ny, reach, push, push + 2.0, i, cells, costs)
         if costs[i] == np.inf:
             _sweep(classes, cost, x, y, 0.0, 0.0, 0.4 * reach, 0.0, 1.0, i, cells, costs)
-
-
-@njit(cache=True, nogil=True)
-def _at(classes: NDArray[np.int8], x: float, y: float) -> int:
-    row, col = math.floor(y), math.floor(x)
-    if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
-        return UNKNOWN
-    return int(classes[row, col])
 
 
 @njit(cache=True, nogil=True)
@@ -258,12 +244,12 @@ def _sweep(
         while away <= reach + push:
             px, py = x + push * nx + away * dx, y + push * ny + away * dy
             away += 0.7  # less than a cell: no wall is stepped over, diagonal ones included
-            kind = _at(classes, px, py)
+            row, col = math.floor(py), math.floor(px)
+            kind = kind_at(classes, row, col)
             if kind == OCCUPIED or (kind == UNKNOWN and away > blind + 0.7):
                 break
             if kind != FREE:
                 continue
-            row, col = math.floor(py), math.floor(px)
             if cost[row, col] >= costs[index]:
                 continue
             ex, ey = x - (col + 0.5), y - (row + 0.5)

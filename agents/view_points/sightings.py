@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from mecanum_env.config import LidarConfig
-from slam.grids.occupancy import FREE, UNKNOWN
+from slam.grids.occupancy import FREE
 from slam.settings import positive
 from slam.types import LINE
 
@@ -168,14 +168,12 @@ def _sees(classes: NDArray[np.int8], frame: Array, sensor: Array, x: float, y: f
         off = math.atan2(dy, dx) - sensor[2]
         if abs(math.atan2(math.sin(off), math.cos(off))) > limits[2]:
             return False
-    rows, cols = classes.shape
     column, row = (sensor[0] - frame[0]) / frame[2], (sensor[1] - frame[1]) / frame[2]
     reach = rho / frame[2]
     dx, dy = dx / rho, dy / rho
     at = 0.0
     while at < reach:
-        r, c = math.floor(row + at * dy), math.floor(column + at * dx)
-        kind = classes[r, c] if 0 <= r < rows and 0 <= c < cols else UNKNOWN
+        kind = kind_at(classes, math.floor(row + at * dy), math.floor(column + at * dx))
         if kind != FREE and at < reach - _BLIND:
             return False
         at += _STEP

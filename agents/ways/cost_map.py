@@ -21,7 +21,7 @@ from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import not_negative, positive
 
-__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
+__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma"]
 
 Array = NDArray[np.float64]
 
@@ -71,9 +71,21 @@ class CostMap:
 
     def to_cells(self, points: Array) -> NDArray[np.int64]:
         """Return the cells ``(n, 2)`` (row, column) of points ``(n, 2)`` [m], held within the grid."""
-        index = np.floor((np.asarray(points) - np.asarray(self.origin)) / self.resolution).astype(np.int64)
+        index = np.floor(self.in_cells(np.asarray(points))).astype(np.int64)
         limit = np.array(self.classes.shape, dtype=np.int64) - 1
         return np.asarray(np.clip(index[:, ::-1], 0, limit))
+
+    def in_cells(self, points: Array) -> Array:
+        """Return points ``(n, 2)`` [m] as x, y in cells from the grid's corner."""
+        return np.asarray((points - np.asarray(self.origin)) / self.resolution)
+
+
+@njit(cache=True, nogil=True)
+def kind_at(classes: NDArray[np.int8], row: int, col: int) -> int:
+    """Return a cell's class; beyond the grid nothing is known."""
+    if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
+        return UNKNOWN
+    return int(classes[row, col])
 
 
 def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:

@@ -1,6 +1,6 @@
 """The world: static walls and obstacles, the robot's body, the floor under its wheels, and collisions.
 
-Wheels, motors and traction are integrated by :func:`mecanum_env.physics.robot.wheel_dynamics`; contacts are
+Wheels, motors and traction are integrated by :func:`mecanum_env.physics.robot.turn_wheels`; contacts are
 pymunk's. In each physics step the kernel advances the body's velocity, and pymunk moves the body at its mean
 velocity over that step, so that where nothing is touched the path is the kernel's own. For as long as nothing
 *can* be touched, which a distance field and then the exact geometry tell, pymunk is left out: the result is the
@@ -72,7 +72,7 @@ _FIXED_SIZE = 28
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
-    """Run :func:`wheel_dynamics` over a physics step with the μ that the wheels stand on at its start."""
+    """Run :func:`turn_wheels` over a physics step with the μ that the wheels stand on at its start."""
     state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
     wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
     c, s = math.cos(state[2]), math.sin(state[2])

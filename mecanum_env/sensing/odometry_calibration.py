@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
-from mecanum_env.physics.robot import twist_action_to_wheels
+from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.sensors import WheelEncoders
@@ -108,10 +108,10 @@ def drive(
         world = World(
             plan, robot, noise, world_rng, true_radii=encoders.true_radii, true_lever=encoders.true_lever
         )
-        driver = _Driver(robot, drive_rng, step_s)
+        driver, targets = _Driver(robot, drive_rng, step_s), WheelTargets(robot)
         for k in range(steps):
             before = world.pose
-            world.step(twist_action_to_wheels(robot, driver.action(before)), step_s, physics_step_s)
+            world.step(targets.of_twist(driver.action(before)), step_s, physics_step_s)
             odometry = encoders.odometry(world.wheel_increments, step_s, sensor_rng)
             measured[episode, k] = odometry.twist
             true[episode, k] = twist_between(before, world.pose, step_s)

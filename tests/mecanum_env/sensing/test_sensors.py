@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, NOISE_PRESETS, ROBOT_PRESETS, LidarConfig, NoiseConfig
-from mecanum_env.physics.robot import forward_kinematics, forward_matrix, twist_action_to_wheels
+from mecanum_env.physics.robot import WheelTargets, forward_kinematics, forward_matrix
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.noise import noise_stream
@@ -287,7 +287,7 @@ def test_pressed_against_a_wall_the_lidar_reads_the_robots_half_width(name: str)
     plan = FloorPlan(name="square", walls=SQUARE, free=free, resolution=0.05, start=(2.0, 3.4, 0.0))
     world = World(plan, robot, EXACT, np.random.default_rng(0))
     for _ in range(30):
-        world.step(twist_action_to_wheels(robot, (0.0, 0.5, 0.0)), 0.1, 0.02)
+        world.step(WheelTargets(robot).of_twist((0.0, 0.5, 0.0)), 0.1, 0.02)
     lidar = Lidar(LidarConfig(offset_m=0.0), EXACT)
     ranges = lidar.true_ranges(plan.segments, plan.circles, world.pose)
     assert world.collisions == 1
