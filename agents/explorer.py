@@ -148,15 +148,10 @@ class Explorer(Agent):
         frontiers = find(cost_map, self._frontier_config, watch)
         troubles = self._troubles.near(frontiers.targets)
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
-        views = view_points(
-            cost_map,
-            travel,
-            frontiers.targets,
-            frontiers.normals,
-            range_m=watch.range_m,
+        cells, costs = view_points(
+            cost_map, travel, frontiers.targets, frontiers.normals, range_m=watch.range_m,
             beyond_m=config.frontiers.beyond_m,
-        )
-        costs = views.costs.copy()
+        )  # fmt: skip
         # The farther the way, the more there must be to see.
         worth = frontiers.extents[frontiers.target_labels] >= self._frontier_config.wanted_extent(costs) - 1e-9
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
@@ -171,7 +166,7 @@ class Explorer(Agent):
         avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
         if np.isfinite(costs[~avoided]).any():
             costs[avoided] = np.inf
-        return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
+        return Candidates(cost_map, travel, frontiers, cells, costs, self._current(frontiers, costs))
 
     def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> NDArray[np.bool_]:
         """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""

@@ -127,7 +127,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.truth = Truth(ground, world, EpisodeRecord(), scan)
         self.scan = scan
         self._steps = 0
-        self._step_limit = self._find_step_limit()
+        self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
         self._odometry = Odometry((0.0, 0.0, 0.0), config.step_s)
         self._ready = True
         if self._knows_truth:
@@ -281,12 +281,6 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             twist=self._odometry.twist,
             time_used=self._steps / limit,
         )
-
-    def _find_step_limit(self) -> int | None:
-        limit = _time_limit_of_caller()
-        if limit is None and self.spec is not None:
-            limit = self.spec.max_episode_steps
-        return limit
 
 
 def _time_limit_of_caller() -> int | None:

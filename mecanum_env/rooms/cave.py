@@ -62,8 +62,7 @@ class CaveConfig:
                                              f"{self.area_m2}; widen it")  # fmt: skip
         interval(self, "chamber_m", low=1.0, high=4.0)
         interval(self, "passage_m", low=1.3, high=4.0)
-        interval(self, "pillars", low=0, high=10)
-        require(all(isinstance(n, int) for n in self.pillars), "CaveConfig.pillars must be two whole numbers")
+        interval(self, "pillars", low=0, high=10, whole=True)
         shares(self, "loops", "roughness")
 
 

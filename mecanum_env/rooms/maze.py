@@ -12,7 +12,7 @@ from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, 
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, cells
 from mecanum_env.rooms.layout.limits import interval
 from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
-from slam.settings import require, shares
+from slam.settings import shares
 
 __all__ = ["Grid", "MazeConfig", "draw_grid", "maze"]
 
@@ -32,9 +32,7 @@ class MazeConfig:
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):
-            interval(self, name, low=2, high=24)
-            whole = all(isinstance(n, int) for n in getattr(self, name))
-            require(whole, f"MazeConfig.{name} must be two whole numbers")
+            interval(self, name, low=2, high=24, whole=True)
         interval(self, "corridor_m", low=1.1, high=4.0)
         interval(self, "wall_m", low=0.05, high=1.0)
         shares(self, "loops")

@@ -20,7 +20,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.sensors import WheelEncoders
 from slam.motion import OdometryNoise, twist_between
 
-__all__ = ["Calibration", "Drives", "calibrate", "drift_ratios", "drive", "fit", "open_floor"]
+__all__ = ["Calibration", "Drives", "drift_ratios", "drive", "fit", "open_floor"]
 
 Array = NDArray[np.float64]
 
@@ -72,13 +72,6 @@ class Calibration:
 
 
 # ---- driving ---------------------------------------------------------------------------------------------------
-
-
-def calibrate(
-    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0
-) -> Calibration:
-    """Drive a robot, and return V as measured; see :func:`drive` for the parameters."""
-    return fit(drive(robot, noise, episodes=episodes, steps=steps, seed=seed), robot.lever_m)
 
 
 def drive(
