@@ -71,11 +71,6 @@ class Rrt(Explorer):
         self._tree = Tree(self.config.stride_m, self.config.capacity)
         self._found: Array = np.zeros((0, 2))  # frontier points [m], the latest last
 
-    @property
-    def tree(self) -> Tree:
-        """The global tree."""
-        return self._tree
-
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of the highest revenue, unless the present one earns hardly less."""
         self._grow(candidates.cost_map, np.asarray(belief.pose[:2], dtype=np.float64))

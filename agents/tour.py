@@ -133,7 +133,9 @@ class Tour(Explorer):
         sight = self._sight(found, places, near)
         sight[1 + np.arange(len(owner)), first] = True
         if found.current is not None:
-            self._hold(distance, np.asarray(sight[:, near == found.current].any(axis=1)))
+            # Shorter is the first leg towards the places that the robot is on the way to.
+            kept = np.asarray(sight[:, near == found.current].any(axis=1))
+            distance[0, kept] = np.maximum(distance[0, kept] - self.config.hold_m, 0.0)
         self._outlook = Outlook(owner, sight, distance, self._weights(found, places))
         self._order, _ = self._outlook.tour(self.config.tries)
         return int(owner[self._order[1] - 1])
@@ -158,10 +160,6 @@ class Tour(Explorer):
         )
         area[0] = 0.0
         return np.asarray(self.config.hurry * area / max(float(area.mean()), 1e-9))
-
-    def _hold(self, distance: Array, kept: NDArray[np.bool_]) -> None:
-        """Shorten the first leg towards the places that the robot is on the way to."""
-        distance[0, kept] = np.maximum(distance[0, kept] - self.config.hold_m, 0.0)
 
     # ---- hopping over stations -----------------------------------------------------------------------------
 

@@ -36,15 +36,6 @@ class Blocks:
     suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
 
 
-def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Return the box of what is known or was visited: first row and column, and those beyond the last.
-
-    Of an empty grid the first are beyond all.
-    """
-    row0, col0, row1, col1 = _box(log_odds, visited)
-    return int(row0), int(col0), int(row1), int(col1)
-
-
 def coarsen(
     log_odds: NDArray[np.int8],
     visited: NDArray[np.uint8],
@@ -75,8 +66,12 @@ def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True)
-def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Look at each row only outside the columns that are in the box already."""
+def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Return the box of what is known or was visited: first row and column, and those beyond the last.
+
+    Of an empty grid the first are beyond all. Each row is looked at only outside the columns that are in the box
+    already.
+    """
     rows, cols = log_odds.shape
     row0, row1 = 0, rows
     while row0 < rows and _is_blank(log_odds[row0], visited[row0]):

@@ -45,26 +45,6 @@ class Grid:
     east: NDArray[np.bool_]  # (rows, columns - 1): from (row, column) to (row, column + 1)
     north: NDArray[np.bool_]  # (rows - 1, columns): from (row, column) to (row + 1, column)
 
-    @property
-    def openings(self) -> int:
-        """Number of open pairs."""
-        return int(np.count_nonzero(self.east)) + int(np.count_nonzero(self.north))
-
-    @property
-    def loops(self) -> int:
-        """Number of independent ways round, where all cells are connected."""
-        rows, columns = self.east.shape[0], self.north.shape[1]
-        return int(self.openings - rows * columns + 1)
-
-    def degrees(self) -> NDArray[np.int64]:
-        """Return how many neighbours each cell ``(rows, columns)`` is open to."""
-        count = np.zeros((self.east.shape[0], self.north.shape[1]), np.int64)
-        count[:, :-1] += self.east
-        count[:, 1:] += self.east
-        count[:-1] += self.north
-        count[1:] += self.north
-        return count
-
 
 def maze(config: MazeConfig, *, seed: int) -> FloorPlan:
     """Return the maze of a seed: the same one every time."""
