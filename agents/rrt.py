@@ -68,7 +68,7 @@ class Rrt(Explorer):
 
     def _forget(self) -> None:
         super()._forget()
-        self._tree = Tree(self.config.stride_m, self.config.capacity)
+        self.tree = Tree(self.config.stride_m, self.config.capacity)  # the global one
         self._found: Array = np.zeros((0, 2))  # frontier points [m], the latest last
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
@@ -85,10 +85,10 @@ class Rrt(Explorer):
     def _grow(self, cost_map: CostMap, here: Array) -> None:
         """Grow both trees and remember the frontier points that they find."""
         config = self.config
-        self._tree.prune(cost_map)
-        if not len(self._tree.nodes):
-            self._tree.plant(here)
-            self._tree.prune(cost_map)  # a robot on a cell that is not free grows nothing yet
+        self.tree.prune(cost_map)
+        if not len(self.tree.nodes):
+            self.tree.plant(here)
+            self.tree.prune(cost_map)  # a robot on a cell that is not free grows nothing yet
         local = Tree(config.stride_m, config.draws + 1)
         local.plant(here)
         local.prune(cost_map)
@@ -96,7 +96,7 @@ class Rrt(Explorer):
         high = low + np.array(cost_map.classes.shape[::-1]) * cost_map.resolution
         # A stride beyond what is known: out there is what the edges at its rim are to be drawn towards.
         draws = self._rng.uniform(low - config.stride_m, high + config.stride_m, (2, config.draws, 2))
-        hits = [self._tree.grow(cost_map, draws[0]), local.grow(cost_map, draws[1], restart=True)]
+        hits = [self.tree.grow(cost_map, draws[0]), local.grow(cost_map, draws[1], restart=True)]
         self._found = np.vstack([self._found, *hits])[-_REMEMBERED:]
 
     def _frontier_points(self, cost_map: CostMap) -> tuple[Array, Array]:

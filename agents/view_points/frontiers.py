@@ -178,12 +178,9 @@ def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
 
 @njit(cache=True, nogil=True)
 def _bordering(
-    classes: NDArray[np.int8],
-    clearance: NDArray[np.float32],
-    suspect: NDArray[np.bool_],
-    near: NDArray[np.uint8],
+    classes: NDArray[np.int8], clearance: NDArray[np.float32], suspect: NDArray[np.bool_], near: NDArray[np.uint8],
     min_clearance: float,
-) -> NDArray[np.int64]:
+) -> NDArray[np.int64]:  # fmt: skip
     """Return the FREE, unsuspected cells ``(n, 2)`` near the unknown that are no gaps in a wall, row by row."""
     cells = np.empty((1024, 2), dtype=np.int64)
     count = 0
@@ -201,12 +198,9 @@ def _bordering(
 
 @njit(cache=True, nogil=True)
 def _join(
-    cells: NDArray[np.int64],
-    order: NDArray[np.int64],
-    index: NDArray[np.int32],
-    labels: NDArray[np.int64],
+    cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], labels: NDArray[np.int64],
     boxes: NDArray[np.int64],
-) -> int:
+) -> int:  # fmt: skip
     """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is −1 all over."""
     rows, cols = index.shape
     for i in range(len(cells)):

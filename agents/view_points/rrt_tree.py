@@ -126,15 +126,9 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
 
 @njit(cache=True, nogil=True)
 def _grow(
-    classes: NDArray[np.int8],
-    nodes: Array,
-    parents: NDArray[np.int64],
-    count: int,
-    goals: Array,
-    stride: float,
-    restart: bool,
-    hits: Array,
-) -> tuple[int, int]:
+    classes: NDArray[np.int8], nodes: Array, parents: NDArray[np.int64], count: int, goals: Array, stride: float,
+    restart: bool, hits: Array,
+) -> tuple[int, int]:  # fmt: skip
     """Fill ``nodes``, ``parents`` and ``hits``; return how many there are of the first and the last."""
     found = 0
     for k in range(goals.shape[0]):

@@ -121,17 +121,9 @@ def _first_seen(
 
 @njit(cache=True, nogil=True)
 def _is_good(
-    classes: NDArray[np.int8],
-    x: float,
-    y: float,
-    nx: float,
-    ny: float,
-    px: float,
-    py: float,
-    heading: float,
-    reach: float,
-    half_view: float,
-) -> bool:
+    classes: NDArray[np.int8], x: float, y: float, nx: float, ny: float, px: float, py: float, heading: float,
+    reach: float, half_view: float,
+) -> bool:  # fmt: skip
     """Tell whether a sensor at px, py has the point x, y with its normal in good sight; positions in cells."""
     dx, dy = x - px, y - py
     square = dx * dx + dy * dy
@@ -159,15 +151,9 @@ def _is_free_line(classes: NDArray[np.int8], x0: float, y0: float, x1: float, y1
 
 @njit(cache=True, nogil=True)
 def _look(
-    classes: NDArray[np.int8],
-    cost: NDArray[np.float32],
-    targets: Array,
-    normals: Array,
-    reach: float,
-    beyond: float,
-    cells: NDArray[np.int64],
-    costs: Array,
-) -> None:
+    classes: NDArray[np.int8], cost: NDArray[np.float32], targets: Array, normals: Array, reach: float,
+    beyond: float, cells: NDArray[np.int64], costs: Array,
+) -> None:  # fmt: skip
     """Find the cheapest cell in sight of each target; positions in cells, x first."""
     for i in range(targets.shape[0]):
         x, y = targets[i, 0], targets[i, 1]
@@ -183,19 +169,9 @@ def _look(
 
 @njit(cache=True, nogil=True)
 def _sweep(
-    classes: NDArray[np.int8],
-    cost: NDArray[np.float32],
-    x: float,
-    y: float,
-    nx: float,
-    ny: float,
-    reach: float,
-    push: float,
-    blind: float,
-    index: int,
-    cells: NDArray[np.int64],
-    costs: Array,
-) -> None:
+    classes: NDArray[np.int8], cost: NDArray[np.float32], x: float, y: float, nx: float, ny: float, reach: float,
+    push: float, blind: float, index: int, cells: NDArray[np.int64], costs: Array,
+) -> None:  # fmt: skip
     """Walk sight lines from ``push`` cells behind (x, y) and keep to the places that see it well.
 
     They go through anything but walls for ``blind`` cells, then through free ones.

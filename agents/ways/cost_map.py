@@ -214,14 +214,9 @@ def _classify(
 
 @njit(cache=True, nogil=True)
 def _weigh_cells(
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    near_unknown: NDArray[np.uint8],
-    levels: Array,
-    near_cost: float,
-    tight_cost: float,
-    weight: NDArray[np.float32],
-) -> None:
+    classes: NDArray[np.int8], wall: NDArray[np.float32], near_unknown: NDArray[np.uint8], levels: Array,
+    near_cost: float, tight_cost: float, weight: NDArray[np.float32],
+) -> None:  # fmt: skip
     tight, comfortable, preferred = levels
     for row in range(1, classes.shape[0] - 1):
         for col in range(1, classes.shape[1] - 1):
@@ -240,15 +235,9 @@ def _weigh_cells(
 
 @njit(cache=True, nogil=True)
 def _free_start(
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    row: int,
-    col: int,
-    reach: float,
-    body: float,
-    highest: float,
-) -> None:
+    classes: NDArray[np.int8], wall: NDArray[np.float32], weight: NDArray[np.float32], row: int, col: int,
+    reach: float, body: float, highest: float,
+) -> None:  # fmt: skip
     """Let the robot out of where it stands: cells around it, never occupied ones, at the highest price."""
     here = wall[row, col]
     span = math.ceil(reach)

@@ -88,13 +88,9 @@ def resample(path: Array, spacing_m: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def _dial(
-    weight: NDArray[np.float32],
-    start_row: int,
-    start_col: int,
-    buckets: int,
-    cost: NDArray[np.float32],
+    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, cost: NDArray[np.float32],
     step: NDArray[np.int8],
-) -> None:
+) -> None:  # fmt: skip
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
 
     Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
@@ -204,12 +200,7 @@ def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _segment(
-    a: Array,
-    b: Array,
-    weight: NDArray[np.float32],
-    wall: NDArray[np.float32],
-    resolution: float,
-    origin: Array,
+    a: Array, b: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
 ) -> tuple[float, float]:
     """Price of the straight line a–b (inf where it leaves passable cells) and its smallest clearance."""
     length = math.hypot(b[0] - a[0], b[1] - a[1])
@@ -229,11 +220,7 @@ def _segment(
 
 @njit(cache=True, nogil=True)
 def _cut_straight(
-    points: Array,
-    weight: NDArray[np.float32],
-    wall: NDArray[np.float32],
-    resolution: float,
-    origin: Array,
+    points: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
 ) -> NDArray[np.int64]:
     """Return the indices of the points to keep."""
     n = points.shape[0]

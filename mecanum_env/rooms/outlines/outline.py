@@ -235,15 +235,9 @@ def _straighten_stair(
 
 @njit(cache=True, nogil=True)
 def _relax(
-    path: Array,
-    role: NDArray[np.int64],
-    count: int,
-    station: NDArray[np.int64],
-    i: int,
-    j: int,
-    cost: Array,
+    path: Array, role: NDArray[np.int64], count: int, station: NDArray[np.int64], i: int, j: int, cost: Array,
     previous: NDArray[np.int64],
-) -> bool:
+) -> bool:  # fmt: skip
     """Offer every piece from station i to station j; return whether one is within the bound."""
     spanned = False
     middle, last = _PLACES // 2, station.shape[0] - 1
@@ -281,15 +275,7 @@ def _place(path: Array, count: int, station: int, place: int) -> tuple[float, fl
 
 @njit(cache=True, nogil=True)
 def _deviation(
-    path: Array,
-    role: NDArray[np.int64],
-    count: int,
-    at: int,
-    end: int,
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
+    path: Array, role: NDArray[np.int64], count: int, at: int, end: int, ax: float, ay: float, bx: float, by: float
 ) -> float:
     """Return the largest distance of a corner between two stations from the straight piece, 2 if out of bounds."""
     ux, uy = bx - ax, by - ay
