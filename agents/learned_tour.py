@@ -27,11 +27,9 @@ from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
 from slam.settings import from_mapping, require
 
-__all__ = ["FORMAT", "PRECISION", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
+__all__ = ["FORMAT", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
 
 FORMAT = "mecanum-slam station policy 2"
-PRECISION = np.float16
-"""Of the weights in the file."""
 SHIPPED = Path(__file__).parent / "policies" / "learned-tour.safetensors"
 
 _LUCK = draw_luck(6, 700)
@@ -60,18 +58,8 @@ class LearnedTourConfig(TourConfig):
 
 
 def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training; neither file can run code.
-
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format; the message names it.
-    """
-    weights, described = read_policy(path, FORMAT)
-    try:
-        return StationNetwork(weights), described
-    except ValueError as error:
-        raise ValueError(f"policy {path}: {error}") from error
+    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
+    return read_policy(path, FORMAT, lambda weights, _: StationNetwork(weights))
 
 
 class LearnedTour(Tour):

@@ -24,7 +24,7 @@ from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import from_mapping, require
 
-__all__ = ["Ppo", "PpoConfig", "load_drive_policy"]
+__all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
 
 Array = NDArray[np.float64]
 
@@ -45,20 +45,13 @@ class PpoConfig:
 
 
 def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training. Neither file can run code.
+    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
 
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format; the message names it.
-    """
-    weights, described = read_policy(path, FORMAT)
-    try:
+    def made(weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]) -> DriveNetwork:
         settings = PlanSettings(**{key: float(value) for key, value in described["planning"].items()})
-        network = DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"policy {path}: {error}") from error
-    return network, described
+        return DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
+
+    return read_policy(path, FORMAT, made)
 
 
 class Ppo(Agent):

@@ -57,9 +57,9 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         As there. Covariance and landmarks there are none of: their columns are 0.
     time_limit_s : float
         Of an episode.
-    time_1_s, covered_1 : float
-        Reward of a second, and of all there is to map, as far as 95 % of it. An episode that ends with nothing
-        left to choose before that is charged with the time until the limit.
+    time_1_s : float
+        Reward of a second. An episode that ends with nothing left to choose before 95 % are mapped is charged with
+        the time until the limit.
 
     Notes
     -----
@@ -73,11 +73,10 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         driver: ChooserConfig | Mapping[str, Any] | None = None,
         time_limit_s: float = 300.0,
         time_1_s: float = -1.0 / 30.0,
-        covered_1: float = 0.0,
     ) -> None:
         config = from_mapping(ChooserConfig, driver)
         self.driver = replace(config, choice=replace(config.choice, uncertainty=False))
-        self.time_limit_s, self._time_1_s, self._covered_1 = time_limit_s, time_1_s, covered_1
+        self.time_limit_s, self._time_1_s = time_limit_s, time_1_s
         self.action_space = spaces.Discrete(self.driver.choice.most)
         self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
         self.robot, self.lidar = RobotConfig(), LidarConfig()
@@ -127,7 +126,7 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Go to a view point until the next choice of more than one is due."""
-        k, before, began = int(action), self.covered, self.time_s
+        k, began = int(action), self.time_s
         while not self._over:
             if self._choice is not None:
                 self.agent.take(self._choice, k if k < len(self._choice.index) else 0)
@@ -138,7 +137,6 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
             if self._choice is not None and len(self._choice.index) > 1:
                 break
         reward = self._time_1_s * (self.time_s - began)
-        reward += self._covered_1 * (min(self.covered, COVERED) - min(before, COVERED))
         truncated = self.time_s >= self.time_limit_s and self.covered < COVERED
         terminated = not truncated and (self.covered >= COVERED or self._choice is None)
         if terminated and self.covered < COVERED:

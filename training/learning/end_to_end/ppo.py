@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -12,7 +11,6 @@ from gymnasium import spaces
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -37,15 +35,8 @@ class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
     env: ExploreEnv
 
     def __init__(self, world: DriveWorldConfig, network: DriveNetwork) -> None:
-        rewards = {
-            "area": world.area_1_m2, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": world.collision,
-            "effort": 0.0, "time": world.time_1_s,
-        }  # fmt: skip
-        super().__init__(
-            ExploreEnv(
-                slam=world.slam, noise=world.noise, reward=rewards, config={"time_limit_s": world.time_limit_s}
-            )
-        )
+        limit = {"time_limit_s": world.time_limit_s}
+        super().__init__(ExploreEnv(slam=world.slam, noise=world.noise, reward=world.reward, config=limit))
         self._world, self._network = world, network
         self._rng = np.random.default_rng(0)
         free = {"scan": (SECTORS,), "landmarks": (LANDMARKS, 5), "numbers": (NUMBERS,)}
@@ -116,15 +107,10 @@ class _Flat(nn.Module):
         return cast("Tensor", self.network(scan, landmarks.reshape(-1, LANDMARKS, 5), numbers))
 
 
-def make_model(config: DriveConfig, env: VecEnv, folder: Path, *, log_std: float = -2.0) -> PPO:
-    """Return PPO with :class:`DrivePolicy`, its log in a folder."""
-    ppo = config.ppo
+def make_model(config: DriveConfig, env: VecEnv) -> PPO:
+    """Return PPO with :class:`DrivePolicy`."""
     assert flatten_space(env.observation_space).shape == (LANDMARKS * 5 + NUMBERS + SECTORS,)
-    model = PPO(
-        DrivePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
-        learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
-        clip_range=ppo.clip_range, target_kl=ppo.target_kl, device="cpu", seed=config.seed,
-        policy_kwargs={"log_std_init": log_std},
+    return PPO(
+        DrivePolicy, env, **config.ppo.settings, device="cpu", seed=config.seed,
+        policy_kwargs={"log_std_init": -2.0},
     )  # fmt: skip
-    model.set_logger(configure(str(folder / "log"), ["tensorboard"]))
-    return model
