@@ -13,7 +13,7 @@ from agents.frontier_env import ExploreFrontierEnv
 from agents.learned.choice import SIDEWAYS
 from mecanum_env import rooms as room_registry
 from training.episodes.true_places import TruePlaces
-from training.learning.config import RehearsalConfig, WorldConfig
+from training.learning.config import RehearsalConfig, RoomsConfig, WorldConfig
 from training.learning.hindsight import Hindsight
 from training.learning.jump_world import JumpWorld
 from training.runs.campaign import start_worker
@@ -28,9 +28,9 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
     and other options are passed on.
     """
 
-    env: ExploreFrontierEnv | JumpWorld
+    env: Any
 
-    def __init__(self, env: ExploreFrontierEnv | JumpWorld, world: WorldConfig) -> None:
+    def __init__(self, env: gymnasium.Env[Any, Any], world: RoomsConfig) -> None:
         super().__init__(env)
         self._world = world
         self._rng = np.random.default_rng(0)
@@ -57,11 +57,13 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._room != (name, room_seed):
             self._plan = room_registry.make(name, seed=room_seed)
         self._room = (name, room_seed)
-        return self.env.reset(seed=episode_seed, options={"floor_plan": self._plan, **passed_on})
+        observation, info = self.env.reset(seed=episode_seed, options={"floor_plan": self._plan, **passed_on})
+        return observation, info
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return which actions stand for a candidate."""
-        return self.env.action_masks()
+        masks: NDArray[np.bool_] = self.env.action_masks()
+        return masks
 
 
 class Rehearsal(Families):

@@ -29,6 +29,7 @@ class RoomsConfig:
 
     rooms: tuple[str, ...] = ("apartment",)
     seeds: tuple[int, int] = (0, 999)  # of the rooms, both included
+    repeats: int = 1  # episodes, of other noise, in a room before the next is drawn: rooms take time to price
     slam: str = "invariant-ekf"
     time_limit_s: float = 300.0
     time_1_s: float = -1.0 / 30.0  # reward per second
@@ -40,6 +41,7 @@ class RoomsConfig:
         check_names("rooms", self.rooms, room_registry.names())
         low, high = self.seeds
         require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
+        require(self.repeats >= 1, f"[world] repeats must be at least 1, got {self.repeats}")
 
     @property
     def reward(self) -> dict[str, float]:
@@ -55,14 +57,12 @@ class WorldConfig(RoomsConfig):
     """Where view points are chosen: with one noise an environment in turn."""
 
     noises: tuple[str, ...] = ("nominal",)
-    repeats: int = 1  # episodes, of other noise, in a room before the next is drawn: rooms take time to price
     driver: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(len(self.noises) > 0, "[world] needs noises")
         check_names("noise preset", self.noises, NOISE_PRESETS)
-        require(self.repeats >= 1, f"[world] repeats must be at least 1, got {self.repeats}")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, SupportsInt, cast
+from typing import Any, SupportsInt
 
 import cv2
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from agents.frontier_env import Observation, as_observation, choice_space
+from agents.frontier_env import ChoiceEnv, Observation
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import Coverage, GroundTruth
@@ -48,7 +46,7 @@ _ROOM_M = 0.4  # around a place to begin at
 _POSE_COV = np.diag([2.5e-5, 2.5e-5, 1e-6])  # that the planner keeps off walls by; a filter's is about that
 
 
-class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
+class JumpWorld(ChoiceEnv):
     """The choices of ``ExploreFrontier-v0``, with jumps from look to look in between.
 
     Parameters
@@ -75,12 +73,10 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         time_1_s: float = -1.0 / 30.0,
     ) -> None:
         config = from_mapping(ChooserConfig, driver)
-        self.driver = replace(config, choice=replace(config.choice, uncertainty=False))
+        super().__init__(replace(config, choice=replace(config.choice, uncertainty=False)))
         self.time_limit_s, self._time_1_s = time_limit_s, time_1_s
-        self.action_space = spaces.Discrete(self.driver.choice.most)
-        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
         self.robot, self.lidar = RobotConfig(), LidarConfig()
-        self.agent = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
+        self.agent: _Passenger = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
         self._eye = _Eye(self.lidar, self.robot)
         self._place: _Place | None = None
 
@@ -97,12 +93,6 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         """The truth of the episode."""
         assert self._place is not None
         return self._place.truth
-
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
-        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
-        masks[0] = True
-        return masks
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -122,14 +112,13 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         self._look()
         self._look()
         self._choice = self.agent.survey(self.belief)
-        return as_observation(self._choice, self.driver), self._info(0.0)
+        return self._observed(), self._info(0.0)
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Go to a view point until the next choice of more than one is due."""
         k, began = int(action), self.time_s
         while not self._over:
-            if self._choice is not None:
-                self.agent.take(self._choice, k if k < len(self._choice.index) else 0)
+            self._take(k)
             self._choice, k = None, 0
             if not self._go() or self.covered >= COVERED:
                 break
@@ -141,10 +130,7 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         terminated = not truncated and (self.covered >= COVERED or self._choice is None)
         if terminated and self.covered < COVERED:
             reward += self._time_1_s * (self.time_limit_s - self.time_s)
-        return (
-            as_observation(self._choice, self.driver), reward, terminated, truncated,
-            self._info(self.time_s - began),
-        )  # fmt: skip
+        return self._observed(), reward, terminated, truncated, self._info(self.time_s - began)
 
     @property
     def _over(self) -> bool:

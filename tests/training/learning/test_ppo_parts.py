@@ -44,7 +44,7 @@ def network(seed: int = 0) -> ChoiceNetwork:
 
 def scores(made: ChoiceNetwork, choice: Choice) -> tuple[np.ndarray, float]:
     """Return the scores, and the value."""
-    observation = {k: torch.as_tensor(v)[None] for k, v in as_observation(choice, CONFIG).items()}
+    observation = {k: torch.as_tensor(v)[None] for k, v in as_observation(choice, choice_space(CONFIG)).items()}
     with torch.no_grad():
         tokens = made.tokens(observation)
         value = made.value(tokens, observation["present"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -16,29 +15,24 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, PlanSettings
-from mecanum_env import rooms as room_registry
+from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork
 from mecanum_env.env import ExploreEnv
+from training.learning.choice_world import Families
 from training.learning.end_to_end.config import DriveConfig, DriveWorldConfig
 from training.learning.end_to_end.networks import ControlNetwork
-from training.learning.networks import PassedOn
-from training.runs.campaign import start_worker
 
-__all__ = ["DrivePolicy", "DriveWorld", "make_drive_world", "make_model"]
+__all__ = ["DrivePolicy", "DriveWorld", "make_model"]
 
 LANDMARKS = 32
 
 
-class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """``Explore-v0`` over families of rooms, seen as the control network sees it."""
-
-    env: ExploreEnv
+class DriveWorld(Families):
+    """``Explore-v0`` over families of rooms, seen as the control network sees it; the time limit truncates."""
 
     def __init__(self, world: DriveWorldConfig, network: DriveNetwork) -> None:
         limit = {"time_limit_s": world.time_limit_s}
-        super().__init__(ExploreEnv(slam=world.slam, noise=world.noise, reward=world.reward, config=limit))
-        self._world, self._network = world, network
-        self._rng = np.random.default_rng(0)
+        super().__init__(ExploreEnv(slam=world.slam, noise=world.noise, reward=world.reward, config=limit), world)
+        self._network = network
         free = {"scan": (SECTORS,), "landmarks": (LANDMARKS, 5), "numbers": (NUMBERS,)}
         self.observation_space = spaces.Dict(
             {key: spaces.Box(-np.inf, np.inf, shape, np.float32) for key, shape in free.items()}
@@ -47,17 +41,12 @@ class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in rooms of the next draw; a seed is where the drawing starts."""
-        if seed is not None:
-            self._rng = np.random.default_rng(seed)
-        low, high = self._world.seeds
-        name = str(self._rng.choice(list(self._world.rooms)))
-        plan = room_registry.make(name, seed=int(self._rng.integers(low, high + 1)))
-        observation, info = self.env.reset(seed=int(self._rng.integers(2**31)), options={"floor_plan": plan})
+        """Start an episode in rooms of the next draw."""
+        observation, info = super().reset(seed=seed, options=options)
         return self._inputs(observation), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Drive for one step; the time limit truncates."""
+        """Drive for one step."""
         observation, reward, terminated, _, info = self.env.step(action)
         late = info["time_s"] >= self._world.time_limit_s - 1e-9
         return self._inputs(observation), reward, terminated, late and not terminated, info
@@ -66,19 +55,11 @@ class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._network.inputs(observation, self._network.plan(observation))._asdict()
 
 
-def make_drive_world(
-    config: DriveConfig, weights: dict[str, NDArray[np.float32]], settings: PlanSettings
-) -> DriveWorld:
-    """Make an environment in a process of its own."""
-    start_worker()
-    return DriveWorld(config.world, DriveNetwork(weights, settings, uncertainty=config.uncertainty))
-
-
 class DrivePolicy(MultiInputActorCriticPolicy):
     """:class:`ControlNetwork` as the mean of a Gaussian, and another for the value."""
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self.mlp_extractor = PassedOn(self.features_dim)  # type: ignore[assignment]
+        self._build_mlp_extractor()
         self.action_net, self.value_net = _Flat(3), _Flat(1)  # type: ignore[assignment]
         self.log_std = nn.Parameter(torch.full((3,), self.log_std_init))
         make: Any = self.optimizer_class
@@ -112,5 +93,5 @@ def make_model(config: DriveConfig, env: VecEnv) -> PPO:
     assert flatten_space(env.observation_space).shape == (LANDMARKS * 5 + NUMBERS + SECTORS,)
     return PPO(
         DrivePolicy, env, **config.ppo.settings, device="cpu", seed=config.seed,
-        policy_kwargs={"log_std_init": -2.0},
+        policy_kwargs={"log_std_init": -2.0, "net_arch": []},
     )  # fmt: skip

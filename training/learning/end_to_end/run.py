@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from agents.learned.drive_network import PlanSettings
+from agents.learned.drive_network import DriveNetwork, PlanSettings
 from slam.formats import atomic_write, replacing
 from training.learning.end_to_end.config import DriveConfig
 from training.learning.end_to_end.imitation import learn_control, learn_maps
 from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork
-from training.learning.end_to_end.ppo import DrivePolicy, make_drive_world, make_model
+from training.learning.end_to_end.ppo import DrivePolicy, DriveWorld, make_model
 from training.learning.end_to_end.rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
 from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, words
 
@@ -121,8 +121,8 @@ class DriveRun(FolderRun):
 
     def _practise(self, pool: ProcessPoolExecutor) -> None:
         config, ppo = self.config, self.config.ppo
-        makers = [partial(make_drive_world, config, self.weights, self._settings)] * ppo.environments
-        env = VecMonitor(DummyVecEnv(makers))  # type: ignore[arg-type]
+        network = DriveNetwork(self.weights, self._settings, uncertainty=config.uncertainty)
+        env = VecMonitor(DummyVecEnv([partial(DriveWorld, config.world, network)] * ppo.environments))
         try:
             model = make_model(config, env)
             policy = cast("DrivePolicy", model.policy)
