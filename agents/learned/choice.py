@@ -24,7 +24,7 @@ from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import require
 
-__all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe", "mirrored"]
+__all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -42,8 +42,7 @@ CANDIDATE = (
 SIDEWAYS = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
 """Of these, those that change their sign in a mirror."""
 
-TOUR_LOSS_M = 5.0
-"""One unit of the column ``tour_loss`` [weighted m]."""
+_TOUR_LOSS_M = 5.0  # one unit of the column tour_loss [weighted m]
 
 STATE = ("time", "known_m2", "candidates", "sigma_m", "sigma_rad", "share_visited", "area_m2", "nearest")
 """What there is to say about the choice as a whole."""
@@ -182,7 +181,7 @@ def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Ar
         if i is not None:
             losses[c] = plan.losses_m[i]
             when[c] = position.get(i, len(plan.order))
-    return (when == 0.0).astype(np.float64), when / 10.0, losses / TOUR_LOSS_M
+    return (when == 0.0).astype(np.float64), when / 10.0, losses / _TOUR_LOSS_M
 
 
 def _sigmas(cov: Array) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from agents.learned.station_network import SIDE, Picture, picture
 from slam.formats import replacing
 from slam.grids.occupancy import FREE, OCCUPIED
 from training.dungeons.plans import dungeon_plan
-from training.dungeons.walks import MOST, MOST_HOPS, Driver, LearnedDriver, Stop, TourDriver, Walk
+from training.dungeons.walks import MOST, MOST_HOPS, LearnedDriver, Stop, TourDriver, Walk
 from training.dungeons.world import CELL_M
 from training.runs.campaign import run_all
 
@@ -45,7 +45,7 @@ class Lessons:
     path_m: NDArray[np.float32]  # (n, MOST) to the end
 
 
-def lessons_of(seed: int, driver: Driver) -> Lessons | None:
+def lessons_of(seed: int, driver: TourDriver) -> Lessons | None:
     """Drive one episode on the plan of a seed, and return the lessons drawn on the way, if any were."""
     walk, rng = Walk(dungeon_plan(seed)), np.random.default_rng([driver.stream, seed])
     drawn: list[tuple[NDArray[Any], ...]] = []
@@ -137,7 +137,7 @@ def _file(folder: Path, seed: int) -> Path:
 
 
 @functools.lru_cache(maxsize=1)
-def _driver(policy: Path | None) -> Driver:
+def _driver(policy: Path | None) -> TourDriver:
     return TourDriver() if policy is None else LearnedDriver.read(policy)
 
 

@@ -97,28 +97,21 @@ def batch_of(lessons: Lessons, rows: NDArray[np.int64], told: NDArray[np.bool_] 
 
 def turned(batch: Batch, quarters: int, mirrored: bool) -> Batch:
     """Return the batch with its pictures turned by quarters of a circle, and mirrored after that."""
+
+    def change(x: NDArray[Any]) -> NDArray[Any]:
+        x = np.rot90(x, quarters, axes=(-2, -1))
+        return np.ascontiguousarray(x[..., ::-1] if mirrored else x)
+
     side = batch.planes.shape[-1]
-    planes, free = batch.planes, batch.free
-    targets, hops = batch.targets, batch.hops
-    for _ in range(quarters):
-        planes, free = (_each_quarter(x, lambda q: np.rot90(q, 1, axes=(1, 2))) for x in (planes, free))
-        planes, free = np.rot90(planes, 1, axes=(2, 3)), np.rot90(free, 1, axes=(2, 3))
-        targets, hops = (np.stack([side - 1 - at[..., 1], at[..., 0]], axis=-1) for at in (targets, hops))
-    if mirrored:
-        planes, free = (_each_quarter(x, lambda q: q[:, :, ::-1]) for x in (planes, free))
-        planes, free = planes[..., ::-1], free[..., ::-1]
-        targets, hops = (np.stack([at[..., 0], side - 1 - at[..., 1]], axis=-1) for at in (targets, hops))
-    planes, free = np.ascontiguousarray(planes), np.ascontiguousarray(free)
-    return replace(batch, planes=planes, free=free, targets=targets, hops=hops)
-
-
-def _each_quarter(x: Floats, change: Any) -> Floats:
-    """Change the order of the quarters of a pixel, ``(b, 2, 2, n, n)``, in the planes that show them."""
-    x = x.copy()
-    for begin in (0, 4) if x.shape[1] == PLANES else (0,):
-        quarters = x[:, begin : begin + 4].reshape(len(x), 2, 2, *x.shape[2:])
-        x[:, begin : begin + 4] = change(quarters).reshape(len(x), 4, *x.shape[2:])
-    return x
+    order = change(np.arange(4).reshape(2, 2)).ravel()  # of the quarters of a pixel
+    planes = np.concatenate([order, order + 4, np.arange(8, PLANES)])
+    place = np.argsort(change(np.arange(side * side).reshape(side, side)).ravel())  # where each pixel comes to lie
+    targets, hops = (
+        np.stack(np.divmod(place[at[..., 0] * side + at[..., 1]], side), axis=-1)
+        for at in (batch.targets, batch.hops)
+    )
+    moved = {"planes": change(batch.planes[:, planes]), "free": change(batch.free[:, order])}
+    return replace(batch, **moved, targets=targets, hops=hops)
 
 
 # ---- training --------------------------------------------------------------------------------------------------

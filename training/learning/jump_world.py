@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from agents.frontier_env import ChoiceEnv, Observation
 from agents.learned.chooser import Chooser, ChooserConfig
-from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from mecanum_env.sensing.sensors import Lidar
 from slam.belief import Belief
 from slam.features.extraction import FeatureExtractor
 from slam.geometry import inverse, transform_points
@@ -77,7 +77,7 @@ class JumpWorld(ChoiceEnv):
         self.time_limit_s, self._time_1_s = time_limit_s, time_1_s
         self.robot, self.lidar = RobotConfig(), LidarConfig()
         self.agent: _Passenger = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
-        self._eye = _Eye(self.lidar, self.robot)
+        self._eye, self._extractor = Lidar(self.lidar, NoiseConfig()), FeatureExtractor()
         self._place: _Place | None = None
 
     @property
@@ -143,16 +143,27 @@ class JumpWorld(ChoiceEnv):
         }  # fmt: skip
 
     def _look(self) -> None:
+        """Draw into the grid what is seen, without noise."""
         assert self._place is not None
-        self._eye.look(self._place, self._pose, self._grid)
+        lidar, (x, y, heading) = self.lidar, self._pose.tolist()
+        scan = Scan(
+            self._eye.true_ranges(self._place.segments, self._place.circles, self._pose),
+            angle_min=lidar.angle_min, angle_increment=lidar.angle_increment, range_max=lidar.range_max_m,
+        )  # fmt: skip
+        self._extractor.extract(scan)
+        eye = (x + lidar.offset_m * math.cos(heading), y + lidar.offset_m * math.sin(heading), heading)
+        self._grid.integrate(eye, scan, self._extractor.surface, body=(x, y, self.robot.inscribed_radius_m))
         self.covered = self._coverage.update(self._grid)
 
     def _go(self) -> bool:
         """Go until a choice is due; return whether there was anywhere to go."""
         began = self.time_s
-        path = self.agent.set_off(self.belief, self.time_s)
-        if path is None:
+        belief = self.belief
+        self.agent.pass_by(belief, self.time_s)
+        goal = self.agent.choose(belief)
+        if goal is None:
             return False
+        path = goal.path
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         self.time_s += _TURN_S * (1.0 - self._kept(path, along))
         gone, length = 0.0, float(along[-1])
@@ -191,13 +202,7 @@ def _at(path: Array, along: Array, s: float) -> Array:
 
 
 class _Passenger(Chooser):
-    """A chooser that is carried: it says where to, and is told when it is there."""
-
-    def set_off(self, belief: Belief, time_s: float) -> Array | None:
-        """Return the way ``(n, 2)`` to what was taken last; None where there is nothing to go to."""
-        self.pass_by(belief, time_s)
-        goal = self.choose(belief)
-        return None if goal is None else goal.path
+    """A chooser that is carried: it is told where it is."""
 
     def pass_by(self, belief: Belief, time_s: float) -> None:
         """Take note of the time, and of where the sensor is."""
@@ -246,27 +251,3 @@ class _Place:
             return np.zeros((1, 2))
         cells = np.argwhere(labels == labels[row, col])
         return np.asarray((cells + np.array(truth.lattice_origin) + 0.5)[:, ::-1] * truth.resolution)
-
-
-class _Eye:
-    """The lidar without noise, and its scans drawn."""
-
-    def __init__(self, lidar: LidarConfig, robot: RobotConfig) -> None:
-        self._lidar, self._body_m = lidar, robot.inscribed_radius_m
-        self._directions = beam_directions(lidar.beams, lidar.angle_min, lidar.angle_increment)
-        self._extractor = FeatureExtractor()
-
-    def look(self, place: _Place, pose: Array, grid: OccupancyGrid) -> None:
-        """Draw into the grid what is seen from a pose ``(3,)`` of the robot."""
-        lidar, (x, y, heading) = self._lidar, pose.tolist()
-        eye = (x + lidar.offset_m * math.cos(heading), y + lidar.offset_m * math.sin(heading), heading)
-        ranges = np.empty(lidar.beams)
-        cast_rays(
-            place.segments, place.circles, *eye, self._directions, lidar.angle_min, lidar.angle_increment,
-            lidar.range_max_m, ranges,
-        )  # fmt: skip
-        scan = Scan(
-            ranges, angle_min=lidar.angle_min, angle_increment=lidar.angle_increment, range_max=lidar.range_max_m
-        )
-        self._extractor.extract(scan)
-        grid.integrate(eye, scan, self._extractor.surface, body=(x, y, self._body_m))
