@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,9 @@ from agents.view_points.troubles import Troubles
 from agents.ways import cost_map as cost_maps
 from agents.ways.cost_map import CostMap, PlannerConfig
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import positive
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 
@@ -49,9 +48,7 @@ class PatienceConfig:
     same_m: float = 0.6  # frontier pieces nearer than this to one dealt with before are the same
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"PatienceConfig.{f.name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,20 +76,12 @@ class Candidates:
 class Explorer(Agent):
     """Drives from view point to view point until no frontier is left that it can reach."""
 
-    def __init__(
-        self,
-        config: ExplorerConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
-        self.config = from_mapping(ExplorerConfig, config)
+    config: ExplorerConfig
+    config_type = ExplorerConfig
+
+    def __init__(self, config: Any = None, **body: Any) -> None:
+        super().__init__(config, **body)
         self._frontier_config = self.config.frontiers.for_body(self._robot.width_m)
-        self._follower = PathFollower(
-            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
-        )
         self._forget()
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
@@ -101,7 +90,9 @@ class Explorer(Agent):
         self._forget()
 
     def _forget(self) -> None:
-        self._follower.reset()
+        self._follower = PathFollower(
+            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
         self._time = 0.0
         self._chosen_at = -math.inf
         self._target: Array | None = None  # the frontier point behind the goal

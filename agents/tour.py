@@ -8,9 +8,7 @@ the first leg is carried out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +20,9 @@ from agents.view_points.gain import expected_area
 from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, require
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 
@@ -47,9 +44,7 @@ class TourConfig(ExplorerConfig):
     depth_m: float = 3.0  # how far behind a frontier new area is expected
 
     def __post_init__(self) -> None:
-        for name in ("hold_m", "hurry", "depth_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"TourConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self, "hold_m", "hurry", "depth_m")
         for name in ("places", "tries"):
             require(getattr(self, name) >= 1, f"TourConfig.{name} must be at least 1, got {getattr(self, name)}")
 
@@ -94,17 +89,12 @@ class Tour(Explorer):
 
     config: TourConfig
 
-    def __init__(
-        self,
-        config: TourConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
+    config_type = TourConfig
+
+    def _forget(self) -> None:
+        super()._forget()
         self._index = 0
         self._start = np.zeros(2)  # [m], a station
-        super().__init__(from_mapping(TourConfig, config), robot=robot, lidar=lidar, step_s=step_s)
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Start an episode; where the robot is now is a station."""

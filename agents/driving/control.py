@@ -15,7 +15,7 @@ from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_po
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import require
+from slam.settings import positive, require
 
 __all__ = ["ControlConfig", "PathFollower"]
 
@@ -50,10 +50,7 @@ class ControlConfig:
     arrived_rad: float = 0.2
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            good = f.name == "any_side" or (math.isfinite(value) and value > 0)
-            require(good, f"ControlConfig.{f.name} must be > 0, got {value}")
+        positive(self, *(f.name for f in fields(self) if f.name != "any_side"))
         require(self.speed_share <= 1, f"ControlConfig.speed_share must be ≤ 1, got {self.speed_share}")
 
 

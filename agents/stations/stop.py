@@ -5,7 +5,6 @@ Shared by the agents that choose among stations with :mod:`agents.stations.surve
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from agents.base import Goal
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive, require
 
 __all__ = ["StationRound", "StationStop", "StationsConfig"]
 
@@ -32,9 +31,9 @@ class StationsConfig:
     reach_m: float = 12.0  # from which a piece of frontier is looked at
 
     def __post_init__(self) -> None:
-        require(math.isfinite(self.spacing_m) and self.spacing_m >= 0, "StationsConfig.spacing_m must be ≥ 0")
+        not_negative(self, "spacing_m")
         require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
-        require(math.isfinite(self.reach_m) and self.reach_m > 0, "StationsConfig.reach_m must be > 0")
+        positive(self, "reach_m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
 
@@ -36,20 +35,8 @@ class FrontierConfig:
     beyond_m: float = 0.3  # how far behind the frontier a view point must see
 
     def __post_init__(self) -> None:
-        for name in (
-            "min_extent_m",
-            "far_extent_m",
-            "opening_m2",
-            "min_unknown_m2",
-            "min_unknown_width_m",
-            "min_clearance_m",
-            "beyond_m",
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"FrontierConfig.{name} must be ≥ 0, got {value}")
-        for name in ("spacing_m", "view_range_m", "far_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"FrontierConfig.{name} must be > 0, got {value}")
+        not_negative(self)
+        positive(self, "spacing_m", "view_range_m", "far_m")
 
     def for_body(self, width_m: float) -> FrontierConfig:
         """Return the same for a body of this width [m]: where a small one could pass is worth a look."""

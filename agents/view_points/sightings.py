@@ -8,7 +8,7 @@ as the beams are dense there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import CostMap
 from mecanum_env.config import LidarConfig
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.settings import positive
 from slam.types import LINE
 
 __all__ = ["BEAM", "SensorModel", "expected_sightings"]
@@ -47,9 +47,7 @@ class SensorModel:
     wall_sigma_rad: float = 0.0002
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"SensorModel.{f.name} must be > 0, got {value}")
+        positive(self)
 
 
 def expected_sightings(

@@ -19,7 +19,7 @@ from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive
 
 __all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
 
@@ -48,19 +48,8 @@ class PlannerConfig:
     path_spacing_m: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("resolution_m", "preferred_m", "path_spacing_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"PlannerConfig.{name} must be > 0, got {value}")
-        for name in (
-            "margin_m",
-            "max_sigma_margin_m",
-            "tight_margin_m",
-            "unknown_margin_m",
-            "near_cost",
-            "tight_cost",
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"PlannerConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self)
+        positive(self, "resolution_m", "preferred_m", "path_spacing_m")
 
 
 @dataclass(frozen=True, eq=False)
