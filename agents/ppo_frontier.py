@@ -15,7 +15,6 @@ from agents.learned.choice import CANDIDATE, STATE
 from agents.learned.choice_network import ChoiceEnsemble
 from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.settings import from_mapping
 
@@ -62,19 +61,11 @@ class PpoFrontier(Chooser):
         What the policy's JSON file says of its training: command, configuration, steps, hours, curve.
     """
 
-    def __init__(
-        self,
-        config: PpoFrontierConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
+    def __init__(self, config: PpoFrontierConfig | Mapping[str, Any] | None = None, **body: Any) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
         self.policy_path = Path(settings.policy or SHIPPED)
         self._network, driver, self.about = load_choice_policy(self.policy_path)
-        driver = from_mapping(ChooserConfig, settings.driver, base=driver)
-        super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
+        super().__init__(from_mapping(ChooserConfig, settings.driver, base=driver), **body)
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""

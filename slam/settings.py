@@ -46,7 +46,8 @@ def shares(config: Any, *names: str) -> None:
 def _check(config: Any, names: Iterable[str], holds: Callable[[float], bool], what: str) -> None:
     for name in names or [f.name for f in dataclasses.fields(config)]:
         value = getattr(config, name)
-        require(math.isfinite(value) and holds(value), f"{type(config).__name__}.{name} must be {what}, got {value}")
+        good = math.isfinite(value) and holds(value)
+        require(good, f"{type(config).__name__}.{name} must be {what}, got {value}")
 
 
 def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T | None = None) -> T:

@@ -22,7 +22,7 @@ from agents.ways.travel import between
 from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
-from slam.settings import require
+from slam.settings import positive
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
@@ -63,10 +63,7 @@ class ChoiceConfig:
     uncertainty: bool = True  # covariance and landmarks are shown; else 0 stands in their columns
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            good = f.name == "uncertainty" or (math.isfinite(value) and value > 0)
-            require(good, f"ChoiceConfig.{f.name} must be > 0, got {value}")
+        positive(self, *(f.name for f in fields(self) if f.name != "uncertainty"))
 
 
 @dataclass(frozen=True, eq=False)

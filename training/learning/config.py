@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar
+from typing import Any
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import require, unknown_name
+from slam.settings import not_negative, positive, require, unknown_name
 
 __all__ = [
     "EvaluationConfig", "PpoConfig", "RehearsalConfig", "RoomsConfig", "TrainConfig", "WorldConfig", "check_names",
@@ -69,8 +68,6 @@ class WorldConfig(RoomsConfig):
 class PpoConfig:
     """Of stable-baselines3, but ``gamma``, which is per second."""
 
-    table: ClassVar[str] = "ppo"
-
     steps: int = 200_000  # decisions
     environments: int = 8
     n_steps: int = 128  # decisions an environment, in one rollout
@@ -85,11 +82,8 @@ class PpoConfig:
     chunk: int = 16  # rollouts between two checkpoints
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value >= 0, f"[{self.table}] {f.name} must be ≥ 0, got {value}")
-        for name in ("environments", "n_steps", "batch_size", "n_epochs", "chunk"):
-            require(getattr(self, name) >= 1, f"[{self.table}] {name} must be at least 1")
+        not_negative(self, *(f.name for f in fields(PpoConfig)))
+        positive(self, "environments", "n_steps", "batch_size", "n_epochs", "chunk")
 
     @property
     def size(self) -> int:
@@ -115,8 +109,6 @@ class PpoConfig:
 class RehearsalConfig(PpoConfig):
     """PPO in ``training/learning/jump_world.py``, before that in the whole environment."""
 
-    table: ClassVar[str] = "rehearsal"
-
     steps: int = 0  # 0: no rehearsal
     environments: int = 16
     n_steps: int = 256
@@ -134,7 +126,8 @@ class RehearsalConfig(PpoConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.every >= 1 and 1 <= self.episodes <= 50, "[rehearsal] needs every ≥ 1, episodes 1 … 50")
-        require(self.replan_s > 0, "[rehearsal] replan_s must be > 0")
+        not_negative(self, "shaping_s_m")
+        positive(self, "replan_s")
 
 
 @dataclass(frozen=True, kw_only=True)

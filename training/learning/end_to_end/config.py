@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import require
+from slam.settings import positive, require
 from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
 
 __all__ = ["DriveConfig", "DriveLearningConfig", "DriveLessonsConfig", "DriveWorldConfig"]
@@ -57,9 +56,7 @@ class DriveLearningConfig:
     control_rate: float = 2e-3
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"[learning] {f.name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
