@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.learned.policy_files import read_policy
 from agents.learned.station_network import StationNetwork, outside, picture, pixels, with_walls
-from agents.stations.stop import StationRound, StationStop
+from agents.stations.stop import StationStop
 from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
 from agents.ways.routing import draw_luck
@@ -77,7 +77,6 @@ class LearnedTour(Tour):
 
     config: LearnedTourConfig
     config_type = LearnedTourConfig
-    _round: StationRound | None = None
 
     def __init__(self, config: Any = None, **body: Any) -> None:
         super().__init__(config, **body)
@@ -89,21 +88,10 @@ class LearnedTour(Tour):
         self._known_cells = 0
         self._decided_at: set[tuple[int, int]] = set()  # stations, since anything new was seen
 
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station."""
-        super().reset(belief, seed)
-        self._round = StationRound(belief, self.config.stations)
-
-    def looked(self, belief: Belief) -> None:
-        """Take note that the sensor looked from the belief's pose."""
-        super().looked(belief)
-        if self._round is not None:
-            self._round.looked(belief)
-
     def choose(self, belief: Belief) -> Goal | None:
         """Return the station to go to next, or where the tour goes where there are no stations worth a visit."""
-        stop = None if self._round is None else self._round.stop(belief)
-        if stop is None or not stop.found.worth.any():
+        stop = self._stop(belief)
+        if stop is None:
             return super().choose(belief)
         openings = options(stop.found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
         best = 0

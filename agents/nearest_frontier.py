@@ -13,7 +13,7 @@ import numpy as np
 
 from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.stations.stop import StationRound, StationsConfig
+from agents.stations.stop import StationAgent, StationsConfig
 from slam.belief import Belief
 from slam.settings import not_negative
 
@@ -32,28 +32,16 @@ class NearestFrontierConfig(ExplorerConfig):
         not_negative(self, "switch_m", "switch_share")
 
 
-class NearestFrontier(Explorer):
+class NearestFrontier(StationAgent, Explorer):
     """Goes to the view point that is cheapest to reach, and on to the next as soon as it has seen."""
 
     config: NearestFrontierConfig
     config_type = NearestFrontierConfig
-    _round: StationRound | None = None
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station, if there are any."""
-        super().reset(belief, seed)
-        self._round = StationRound(belief, self.config.stations)
-
-    def looked(self, belief: Belief) -> None:
-        """Take note that the sensor looked from the belief's pose."""
-        super().looked(belief)
-        if self._round is not None:
-            self._round.looked(belief)
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return where to go next: a station, where the robot stands on one."""
-        stop = None if self._round is None else self._round.stop(belief)
-        if stop is None or not stop.found.worth.any():
+        stop = self._stop(belief)
+        if stop is None:
             return super().choose(belief)
         self._frontiers = stop.frontiers()
         self._status = "driving"

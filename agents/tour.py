@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.lattice import in_sight, join, ways
-from agents.stations.stop import StationsConfig
+from agents.stations.stop import StationAgent, StationsConfig
 from agents.view_points.gain import expected_area
 from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
@@ -84,22 +84,13 @@ class Outlook:
         return cost / (1.0 + float(self.weight.sum()))
 
 
-class Tour(Explorer):
+class Tour(StationAgent, Explorer):
     """Goes to the first place of the best tour over all that is left to look at."""
 
     config: TourConfig
 
     config_type = TourConfig
-
-    def _forget(self) -> None:
-        super()._forget()
-        self._index = 0
-        self._start = np.zeros(2)  # [m], a station
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station."""
-        super().reset(belief, seed)
-        self._start = np.array(belief.pose[:2], dtype=np.float64)
+    _index = 0  # of the piece that the tour begins with
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of frontier that the tour begins with."""
@@ -166,7 +157,7 @@ class Tour(Explorer):
     def _by_stations(self, found: Candidates, pieces: Cells) -> Candidates:
         """Return the candidates with the tour's first station as the view point of a piece seen from there."""
         config, cost_map = self.config.stations, found.cost_map
-        cells, joined, here = _stations(cost_map, config, self._start)
+        cells, joined, here = _stations(cost_map, config, self._began_at)
         if here < 0:
             return found
         targets = cost_map.to_cells(found.frontiers.targets[pieces])

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig
-from agents.driving.grip import WheelWatch
+from agents.driving.grip import WheelWatch, eased
 from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
@@ -36,15 +36,7 @@ class SlipConfig:
     def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
         """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
         slippery = float(np.interp(share, [self.firm_share, self.slippery_share], [0.0, 1.0]))
-
-        def between(value: float, gentle: float) -> float:
-            return value + slippery * (min(value, gentle) - value)
-
-        return replace(
-            usual,
-            acceleration_m_s2=between(usual.acceleration_m_s2, self.acceleration_m_s2),
-            lateral_m_s2=between(usual.lateral_m_s2, self.lateral_m_s2),
-        )
+        return eased(usual, slippery, acceleration_m_s2=self.acceleration_m_s2, lateral_m_s2=self.lateral_m_s2)
 
 
 @dataclass(frozen=True, kw_only=True)
