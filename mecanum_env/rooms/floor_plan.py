@@ -124,7 +124,7 @@ class FloorPlan:
 
     @cached_property
     def _corners_and_kinds(self) -> tuple[Array, NDArray[np.int8]]:
-        return find_corners(self.walls, self.polygons, self.free, self.resolution, self.origin)
+        return find_corners(self.walls, self.polygons, self.is_free, self.resolution)
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:

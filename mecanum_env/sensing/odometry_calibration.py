@@ -75,9 +75,8 @@ class Calibration:
 
 
 def drive(
-    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0,
-    step_s: float = 0.1, physics_step_s: float = 0.02,
-) -> Drives:  # fmt: skip
+    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0
+) -> Drives:
     """Drive a robot by smooth random twists, with stops, over an open floor.
 
     Parameters
@@ -88,9 +87,8 @@ def drive(
         How many, and the control steps of each.
     seed
         Of the first episode; the others follow.
-    step_s, physics_step_s
-        As the environments have them.
     """
+    step_s, physics_step_s = 0.1, 0.02  # as the environments have them
     measured, true = np.empty((episodes, steps, 3)), np.empty((episodes, steps, 3))
     plan = open_floor()
     for episode in range(episodes):
