@@ -90,10 +90,7 @@ class ActiveConfig(TourConfig):
             0 < self.gentle_speed_share <= 1,
             f"ActiveConfig.gentle_speed_share must be above 0 and at most 1, got {self.gentle_speed_share}",
         )
-        require(
-            0 < self.firm_share < self.slippery_share,
-            "ActiveConfig needs 0 < firm_share < slippery_share",
-        )
+        require(0 < self.firm_share < self.slippery_share, "ActiveConfig needs 0 < firm_share < slippery_share")
 
 
 class ActiveSlam(Tour):

@@ -188,10 +188,7 @@ def _point(path: Array, arc: Array, at: float) -> tuple[float, float]:
     if i >= len(arc) - 1:
         return path[-1, 0], path[-1, 1]
     share = (at - arc[i]) / (arc[i + 1] - arc[i])
-    return (
-        path[i, 0] + share * (path[i + 1, 0] - path[i, 0]),
-        path[i, 1] + share * (path[i + 1, 1] - path[i, 1]),
-    )
+    return (path[i, 0] + share * (path[i + 1, 0] - path[i, 0]), path[i, 1] + share * (path[i + 1, 1] - path[i, 1]))
 
 
 @njit(cache=True, nogil=True)

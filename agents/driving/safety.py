@@ -18,16 +18,7 @@ from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 
-__all__ = [
-    "Guard",
-    "LocalMap",
-    "body_gaps",
-    "clearance_at",
-    "footprint",
-    "local_map",
-    "safe_twist",
-    "scan_points",
-]
+__all__ = ["Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points"]
 
 Array = NDArray[np.float64]
 

@@ -129,7 +129,4 @@ def _is_free(known: NDArray[np.int8], cell: Cell) -> bool:
 
 
 def _cell_of(pose: NDArray[np.float64], resolution: float, corner: Cell) -> Cell:
-    return (
-        int(np.floor(pose[1] / resolution)) - corner[0],
-        int(np.floor(pose[0] / resolution)) - corner[1],
-    )
+    return (int(np.floor(pose[1] / resolution)) - corner[0], int(np.floor(pose[0] / resolution)) - corner[1])

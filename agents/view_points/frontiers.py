@@ -41,9 +41,7 @@ class FrontierConfig:
     def for_body(self, width_m: float) -> FrontierConfig:
         """Return the same for a body of this width [m]: where a small one could pass is worth a look."""
         return replace(
-            self,
-            min_extent_m=min(self.min_extent_m, width_m),
-            far_extent_m=min(self.far_extent_m, 2.0 * width_m),
+            self, min_extent_m=min(self.min_extent_m, width_m), far_extent_m=min(self.far_extent_m, 2.0 * width_m)
         )
 
     def wanted_extent(self, costs: Array) -> Array:

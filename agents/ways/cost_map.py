@@ -118,10 +118,7 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
         belief.grid.origin[1] + rows.start * fine_resolution,
     ]
     col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
-    origin = (
-        corner[0] - (col_pad + factor) * fine_resolution,
-        corner[1] - (row_pad + factor) * fine_resolution,
-    )
+    origin = (corner[0] - (col_pad + factor) * fine_resolution, corner[1] - (row_pad + factor) * fine_resolution)
     blocks = coarsen(
         belief.grid.log_odds[rows, cols],
         belief.grid.visited[rows, cols],

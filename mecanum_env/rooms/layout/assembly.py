@@ -41,12 +41,7 @@ def generator(seed: int) -> np.random.Generator:
 
 
 def assemble(
-    name: str,
-    floors: Sequence[Box],
-    pieces: Sequence[Piece],
-    *,
-    size: tuple[int, int],
-    rng: np.random.Generator,
+    name: str, floors: Sequence[Box], pieces: Sequence[Piece], *, size: tuple[int, int], rng: np.random.Generator
 ) -> FloorPlan:
     """Return the floor plan of free rectangles and furniture, after taking out what bars the way.
 
