@@ -21,16 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Goal
-from agents.driving.grip import GentleFollower, WheelWatch
+from agents.driving.grip import GentleFollower, WheelWatch, eased
 from agents.explorer import Candidates
 from agents.tour import Outlook, Tour, TourConfig
 from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
 from agents.view_points.sightings import expected_sightings
 from agents.ways import cost_map as cost_maps
-from agents.ways.planning import shortest_path
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, positive, require
 
 __all__ = ["ActiveConfig", "ActiveSlam", "LookConfig", "RevisitConfig"]
 
@@ -48,9 +46,7 @@ class LookConfig:
     worth: float = 4.0  # times what the spread is worth on the way: this error is that of everything seen later
 
     def __post_init__(self) -> None:
-        for name in ("at_most_s", "blind_s", "step_s", "most", "worth"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"LookConfig.{name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,9 +59,7 @@ class RevisitConfig:
     spacing_m: float = 1.0  # between the places that are remembered
 
     def __post_init__(self) -> None:
-        for name in ("above_m", "times", "again_s", "spacing_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"RevisitConfig.{name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,55 +82,40 @@ class ActiveConfig(TourConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("worth_s_per_m", "delay", "switch_s", "switch_share"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"ActiveConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self, "worth_s_per_m", "delay", "switch_s", "switch_share")
+        positive(self, "gentle_m_s2")
         for name in ("most", "thought_tries"):
             require(getattr(self, name) >= 1, f"ActiveConfig.{name} must be at least 1, got {getattr(self, name)}")
-        require(self.gentle_m_s2 > 0, f"ActiveConfig.gentle_m_s2 must be > 0, got {self.gentle_m_s2}")
         require(
             0 < self.gentle_speed_share <= 1,
             f"ActiveConfig.gentle_speed_share must be above 0 and at most 1, got {self.gentle_speed_share}",
         )
-        require(
-            0 < self.firm_share < self.slippery_share,
-            "ActiveConfig needs 0 < firm_share < slippery_share",
-        )
+        require(0 < self.firm_share < self.slippery_share, "ActiveConfig needs 0 < firm_share < slippery_share")
 
 
 class ActiveSlam(Tour):
     """Explores so that the map becomes good: every way is priced by the uncertainty that it would leave, too."""
 
-    def __init__(
-        self,
-        config: ActiveConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._config = from_mapping(ActiveConfig, config)
-        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
+    config: ActiveConfig
+    config_type = ActiveConfig
 
     def _forget(self) -> None:
-        config = self._config
-        self._gentle = GentleFollower(
-            config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s,
-            gentle_m_s2=config.gentle_m_s2, gentle_speed_share=config.gentle_speed_share,
-        )  # fmt: skip
-        self._follower = self._gentle
+        super()._forget()
+        config = self.config
+        self._follower = self._gentle = GentleFollower(
+            config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
         self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * config.firm_share)
         self._looked_s: float | None = 0.0  # at the start; None once it has driven off
         self._places: list[Array] = []  # (3,) x, y [m] and the pose's spread [m] there
         self._detour: Array | None = None  # (n, 2) [m] the way back to one of them, while it is taken
         self._back_before_s = self._no_detour_before_s = 0.0
-        super()._forget()
 
     # ---- choosing ------------------------------------------------------------------------------------------
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the frontier of the least price; note down a detour to make first, if one pays."""
-        config = self._config
+        config = self.config
         if self._outlook is None:  # on stations: noise-free sensing leaves nothing to weigh
             return super().pick(candidates, belief)
         prices, paths, chosen = self._price(candidates, self._outlook, belief)
@@ -155,7 +134,7 @@ class ActiveSlam(Tour):
         self, candidates: Candidates, outlook: Outlook, belief: Belief
     ) -> tuple[list[float], list[Array], list[int]]:
         """Return prices [s] and paths of the candidates that are thought through, and which they are."""
-        config = self._config
+        config = self.config
         views = outlook.pieces
         places = np.arange(min(config.most, len(views)))
         kept = np.flatnonzero((views == self._index) | (views == candidates.current))
@@ -164,7 +143,7 @@ class ActiveSlam(Tour):
         for k in np.union1d(places, kept).tolist():
             piece = int(views[k])
             row, column = candidates.cells[piece].tolist()
-            path = self._path(candidates, belief, (row, column))
+            path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
             delay_s = outlook.delay_m(k + 1, config.thought_tries) / config.foresight.speed_m_s
             spread = self._spread_after(foresight, marks, candidates, path)
             prices.append(config.delay * delay_s + config.worth_s_per_m * spread)
@@ -172,22 +151,18 @@ class ActiveSlam(Tour):
             chosen.append(piece)
         return prices, paths, chosen
 
-    def _path(self, candidates: Candidates, belief: Belief, cell: tuple[int, int]) -> Array:
-        spacing = self.config.planner.path_spacing_m
-        return shortest_path(candidates.cost_map, candidates.travel, cell, start=belief.pose, spacing_m=spacing)
-
     def _foresight(self) -> Foresight:
         return Foresight(
-            self._config.foresight, lidar=self._lidar, odometry=self._wheels.noise(), step_s=self._step_s
+            self.config.foresight, lidar=self._lidar, odometry=self._wheels.noise(), step_s=self._step_s
         )
 
     def _spread_after(self, foresight: Foresight, marks: Marks, candidates: Candidates, path: Array) -> float:
         foreseen = foresight.along(marks, candidates.cost_map, path)
-        return spread_m(foreseen.pose_cov, self._config.foresight.lever_m)
+        return spread_m(foreseen.pose_cov, self.config.foresight.lever_m)
 
     def _weigh_detour(self, candidates: Candidates, belief: Belief, path: Array, price: float) -> None:
         """Set the detour, if going back to where the pose was well known and then on to the goal costs less."""
-        config, revisit = self._config, self._config.revisit
+        config, revisit = self.config, self.config.revisit
         self._detour = None
         spread = self._spread(belief)
         if spread < revisit.above_m or self._time < self._no_detour_before_s:
@@ -200,7 +175,8 @@ class ActiveSlam(Tour):
         nearest = int(np.argmin(costs))
         if not np.isfinite(costs[nearest]):
             return
-        there = self._path(candidates, belief, (int(cells[nearest, 0]), int(cells[nearest, 1])))
+        row, column = cells[nearest].tolist()
+        there = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
         foresight, marks = self._foresight(), marks_of(belief)
         direct = self._spread_after(foresight, marks, candidates, path)
         around = self._spread_after(foresight, marks, candidates, np.vstack([there, there[-2::-1], path[1:]]))
@@ -219,7 +195,7 @@ class ActiveSlam(Tour):
         if self._detour is None or self._time > self._back_before_s:
             self._detour = None
             if going_back:
-                self._no_detour_before_s = self._time + self._config.revisit.again_s
+                self._no_detour_before_s = self._time + self.config.revisit.again_s
             return goal
         self._target = self._detour[-1].copy()
         self._status = "revisiting"
@@ -234,10 +210,12 @@ class ActiveSlam(Tour):
             if self._looks_on(belief):
                 return self._look(belief)
             self._looked_s = None
-        config = self._config
-        self._gentle.go_gently(
-            float(np.interp(self._wheels.share, [config.firm_share, config.slippery_share], [0.0, 1.0]))
-        )
+        config = self.config
+        slippery = float(np.interp(self._wheels.share, [config.firm_share, config.slippery_share], [0.0, 1.0]))
+        self._gentle.config = eased(
+            config.control, slippery, speed_share=config.gentle_speed_share,
+            acceleration_m_s2=config.gentle_m_s2, deceleration_m_s2=config.gentle_m_s2,
+        )  # fmt: skip
         self._remember(belief)
         action = super().act(observation, belief)
         return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action
@@ -259,7 +237,7 @@ class ActiveSlam(Tour):
 
         The landmarks' error relative to the start falls with the root of the number of looks.
         """
-        config, looked_s = self._config, self._looked_s
+        config, looked_s = self.config, self._looked_s
         assert looked_s is not None
         if looked_s < config.look.blind_s - 1e-9:
             return True
@@ -281,11 +259,11 @@ class ActiveSlam(Tour):
     def _remember(self, belief: Belief) -> None:
         """Note down every little way how well the pose is known there."""
         here, spread = np.asarray(belief.pose)[:2], self._spread(belief)
-        if not self._places or np.hypot(*(here - self._places[-1][:2])) >= self._config.revisit.spacing_m:
+        if not self._places or np.hypot(*(here - self._places[-1][:2])) >= self.config.revisit.spacing_m:
             self._places.append(np.array([*here, spread]))
 
     def _spread(self, belief: Belief) -> float:
-        return spread_m(np.asarray(belief.pose_cov), self._config.foresight.lever_m)
+        return spread_m(np.asarray(belief.pose_cov), self.config.foresight.lever_m)
 
     def _is_frontier(self, belief: Belief, point: Array) -> bool:
         return self._detour is not None or super()._is_frontier(belief, point)

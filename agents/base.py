@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, resolve
 from slam.belief import Belief
-from slam.settings import require
+from slam.settings import from_mapping, require
 
 __all__ = ["ENDINGS", "Agent", "Goal"]
 
@@ -42,12 +42,15 @@ class Agent(ABC):
     Parameters
     ----------
     config : dataclass or mapping, optional
-        The strategy's own configuration.
+        The strategy's own configuration, a ``config_type``.
     robot, lidar : config, mapping or preset name, optional
         The body it drives and the sensor it looks with; the youBot's by default.
     step_s : float
         Time between two calls of :meth:`act` [s].
     """
+
+    config_type: type[Any] | None = None
+    """The dataclass of ``config``; none of an agent that has no settings, or reads them itself."""
 
     def __init__(
         self,
@@ -61,6 +64,8 @@ class Agent(ABC):
         self._robot = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot preset")
         self._lidar = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar preset")
         self._step_s = float(step_s)
+        self.config = config if self.config_type is None else from_mapping(self.config_type, config)
+        self._rng = np.random.default_rng(0)
         self._goal: Goal | None = None
         self._frontiers: Array = np.zeros((0, 2))
         self._status = "idle"
@@ -90,6 +95,7 @@ class Agent(ABC):
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Forget everything and start an episode; the same seed and beliefs give the same actions."""
+        self._rng = np.random.default_rng(seed)
         self._goal = None
         self._frontiers = np.zeros((0, 2))
         self._status = "idle"

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from agents.driving.control import ControlConfig
 from agents.tour import Tour, TourConfig
-from mecanum_env.config import LidarConfig, RobotConfig
-from slam.settings import from_mapping
 
 __all__ = ["BRISK", "BriskTour", "BriskTourConfig"]
 
@@ -28,12 +24,4 @@ class BriskTourConfig(TourConfig):
 class BriskTour(Tour):
     """Goes to the first place of the best tour over all that is left to look at, and loses no time on the way."""
 
-    def __init__(
-        self,
-        config: BriskTourConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(from_mapping(BriskTourConfig, config), robot=robot, lidar=lidar, step_s=step_s)
+    config_type = BriskTourConfig

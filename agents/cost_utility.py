@@ -9,19 +9,15 @@ come into view, in square metres, and β says how many of those a metre of the w
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, positive
 
 __all__ = ["CostUtility", "CostUtilityConfig"]
 
@@ -39,26 +35,15 @@ class CostUtilityConfig(ExplorerConfig):
     switch_share: float = 0.2  # … and by this share of what the present one is worth, to be worth turning round
 
     def __post_init__(self) -> None:
-        own = {f.name for f in fields(CostUtilityConfig)} - {f.name for f in fields(ExplorerConfig)}
-        for name in sorted(own):
-            value, zero = getattr(self, name), name not in ("range_m", "depth_m")
-            good = math.isfinite(value) and (value >= 0 if zero else value > 0)
-            require(good, f"CostUtilityConfig.{name} must be {'≥' if zero else '>'} 0, got {value}")
+        positive(self, "range_m", "depth_m")
+        not_negative(self, "beta_m2_m", "switch_m2", "switch_share")
 
 
 class CostUtility(Explorer):
     """Goes where the expected new area, less the price of the way, is largest."""
 
-    def __init__(
-        self,
-        config: CostUtilityConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._config = from_mapping(CostUtilityConfig, config)
-        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
+    config: CostUtilityConfig
+    config_type = CostUtilityConfig
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the target with the best balance, unless the present one's is hardly worse."""
@@ -67,12 +52,12 @@ class CostUtility(Explorer):
         if candidates.current is None:
             return best
         present = balance[candidates.current]
-        worth = max(self._config.switch_m2, self._config.switch_share * abs(present))
+        worth = max(self.config.switch_m2, self.config.switch_share * abs(present))
         return best if balance[best] > present + worth else candidates.current
 
     def balance(self, candidates: Candidates) -> Array:
         """Return U − β V ``(m,)`` [m²] of each target; −inf where it is out of reach."""
-        config = self._config
+        config = self.config
         reached = np.isfinite(candidates.costs)
         utility = expected_area(
             candidates.cost_map,

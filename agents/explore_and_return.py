@@ -6,9 +6,8 @@ whole journey has cost it in certainty.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,18 +17,16 @@ from agents.base import Goal
 from agents.driving.control import PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from agents.ways import cost_map as cost_maps
-from agents.ways.planning import shortest_path, travel_costs
-from mecanum_env.config import LidarConfig, RobotConfig
+from agents.ways.planning import travel_costs
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import positive
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
 
 Array = NDArray[np.float64]
 
 _HOME = np.zeros(3)  # the belief's frame is that of the start pose
-_TURN_WITHIN_M = 0.5  # of the start: from there on it turns to the start's heading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,9 +39,7 @@ class HomingConfig:
     last_leg_m: float = 0.25  # so far it goes straight: the start may lie too near to a wall to be planned to
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"HomingConfig.{f.name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,23 +59,10 @@ class ExploreAndReturn(NearestFrontier):
     outlives_coverage = True
     """An episode ends when this agent has ended, not when all is mapped."""
 
-    def __init__(
-        self,
-        config: ExploreAndReturnConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        whole = from_mapping(ExploreAndReturnConfig, config)
-        self._homing = whole.homing
-        super().__init__(whole, robot=robot, lidar=lidar, step_s=step_s)
+    config: ExploreAndReturnConfig
+    config_type = ExploreAndReturnConfig
 
     def _forget(self) -> None:
-        # Looking at a frontier needs another follower than the way back.
-        self._follower = PathFollower(
-            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
-        )
         super()._forget()
         self._returning = False
         self._end = ""  # the status it has ended with
@@ -97,7 +79,7 @@ class ExploreAndReturn(NearestFrontier):
         return self._choose_home(belief)
 
     def _turn_back(self) -> None:
-        homing = self._homing
+        homing = self.config.homing
         self._returning = True
         self._troubles.clear()  # what could not be seen has no bearing on the way back
         self._target = None
@@ -144,19 +126,18 @@ class ExploreAndReturn(NearestFrontier):
         reached = np.argwhere(np.isfinite(travel.cost))
         away = np.hypot(*(cost_map.to_points(reached) - _HOME[:2]).T)
         nearest = int(np.argmin(away))
-        cell = (int(reached[nearest, 0]), int(reached[nearest, 1]))
-        spacing = self.config.planner.path_spacing_m
-        path = shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
-        if away[nearest] <= max(self._homing.last_leg_m, cost_map.resolution):
+        row, column = reached[nearest].tolist()
+        path = self._path(cost_map, travel, (row, column), belief)
+        if away[nearest] <= max(self.config.homing.last_leg_m, cost_map.resolution):
             # The start itself for the centre of the cell. Where that cell is not the start's own, the robot has
             # stood there all the same, and the follower's safety check keeps it off the walls.
             path = np.vstack([path[: max(len(path) - 1, 1)], _HOME[:2]])
-        return path, float(travel.cost[cell])
+        return path, float(travel.cost[row, column])
 
     def _is_home(self, belief: Belief) -> bool:
         pose = np.asarray(belief.pose, dtype=np.float64)
-        near = float(np.hypot(*(pose[:2] - _HOME[:2]))) <= self._homing.arrived_m
-        return near and abs(geometry.wrap_scalar(pose[2] - _HOME[2])) <= self._homing.arrived_rad
+        near = float(np.hypot(*(pose[:2] - _HOME[:2]))) <= self.config.homing.arrived_m
+        return near and abs(geometry.wrap_scalar(pose[2] - _HOME[2])) <= self.config.homing.arrived_rad
 
     # ---- driving -------------------------------------------------------------------------------------------
 
@@ -176,7 +157,7 @@ class _HomeFollower(PathFollower):
     """Ends with the start's heading, also where the sensor sees all round and would not need to turn."""
 
     # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
-    _turn_within_m = _TURN_WITHIN_M
+    _turn_within_m = 0.5  # of the start
 
     def set_path(self, path: Array, heading: float | None) -> None:
         super().set_path(path, float(_HOME[2]))

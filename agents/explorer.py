@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,9 @@ from agents.view_points.troubles import Troubles
 from agents.ways import cost_map as cost_maps
 from agents.ways.cost_map import CostMap, PlannerConfig
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import positive
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 
@@ -49,9 +48,7 @@ class PatienceConfig:
     same_m: float = 0.6  # frontier pieces nearer than this to one dealt with before are the same
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"PatienceConfig.{f.name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,20 +76,12 @@ class Candidates:
 class Explorer(Agent):
     """Drives from view point to view point until no frontier is left that it can reach."""
 
-    def __init__(
-        self,
-        config: ExplorerConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
-        self.config = from_mapping(ExplorerConfig, config)
+    config: ExplorerConfig
+    config_type = ExplorerConfig
+
+    def __init__(self, config: Any = None, **body: Any) -> None:
+        super().__init__(config, **body)
         self._frontier_config = self.config.frontiers.for_body(self._robot.width_m)
-        self._follower = PathFollower(
-            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
-        )
         self._forget()
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
@@ -101,7 +90,9 @@ class Explorer(Agent):
         self._forget()
 
     def _forget(self) -> None:
-        self._follower.reset()
+        self._follower = PathFollower(
+            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
         self._time = 0.0
         self._chosen_at = -math.inf
         self._target: Array | None = None  # the frontier point behind the goal
@@ -130,14 +121,8 @@ class Explorer(Agent):
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]
-        cell = (int(candidates.cells[index, 0]), int(candidates.cells[index, 1]))
-        path = shortest_path(
-            candidates.cost_map,
-            candidates.travel,
-            cell,
-            start=belief.pose,
-            spacing_m=self.config.planner.path_spacing_m,
-        )
+        row, column = candidates.cells[index].tolist()
+        path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
@@ -151,6 +136,10 @@ class Explorer(Agent):
         self._status = "driving"
         return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
 
+    def _path(self, cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], belief: Belief) -> Array:
+        spacing = self.config.planner.path_spacing_m
+        return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
+
     def _candidates(self, belief: Belief) -> Candidates:
         config = self.config
         cost_map = cost_maps.build(belief, config.planner, self._robot)
@@ -159,15 +148,10 @@ class Explorer(Agent):
         frontiers = find(cost_map, self._frontier_config, watch)
         troubles = self._troubles.near(frontiers.targets)
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
-        views = view_points(
-            cost_map,
-            travel,
-            frontiers.targets,
-            frontiers.normals,
-            range_m=watch.range_m,
+        cells, costs = view_points(
+            cost_map, travel, frontiers.targets, frontiers.normals, range_m=watch.range_m,
             beyond_m=config.frontiers.beyond_m,
-        )
-        costs = views.costs.copy()
+        )  # fmt: skip
         # The farther the way, the more there must be to see.
         worth = frontiers.extents[frontiers.target_labels] >= self._frontier_config.wanted_extent(costs) - 1e-9
         failures = np.array([t.failures if t else 0 for t in troubles], dtype=np.int64)
@@ -182,7 +166,7 @@ class Explorer(Agent):
         avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
         if np.isfinite(costs[~avoided]).any():
             costs[avoided] = np.inf
-        return Candidates(cost_map, travel, frontiers, views.cells, costs, self._current(frontiers, costs))
+        return Candidates(cost_map, travel, frontiers, cells, costs, self._current(frontiers, costs))
 
     def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> NDArray[np.bool_]:
         """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""

@@ -18,7 +18,7 @@ from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
 from slam.settings import from_mapping, require
 
-__all__ = ["ExploreFrontierEnv", "as_observation", "choice_space"]
+__all__ = ["ChoiceEnv", "ExploreFrontierEnv", "as_observation", "choice_space"]
 
 Observation = dict[str, NDArray[Any]]
 
@@ -41,16 +41,9 @@ def choice_space(config: ChooserConfig) -> spaces.Dict:
     })  # fmt: skip
 
 
-def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
+def as_observation(choice: Choice | None, space: spaces.Dict) -> Observation:
     """Return a choice with as many rows as the space has: those that stand for nothing are zero."""
-    k, side = config.choice.most, config.choice.patch_cells
-    padded: Observation = {
-        "candidates": np.zeros((k, len(CANDIDATE)), np.float32),
-        "distances": np.zeros((k, k), np.float32),
-        "patches": np.zeros((k, 4, side, side), np.uint8),
-        "present": np.zeros(k, np.float32),
-        "state": np.zeros(len(STATE), np.float32),
-    }
+    padded: Observation = {key: np.zeros(part.shape or (), part.dtype) for key, part in space.items()}
     if choice is not None:
         m = len(choice.index)
         padded["candidates"][:m] = choice.candidates
@@ -59,6 +52,40 @@ def as_observation(choice: Choice | None, config: ChooserConfig) -> Observation:
         padded["present"][:m] = 1.0
         padded["state"][:] = choice.state
     return padded
+
+
+class ChoiceEnv(gymnasium.Env[Observation, SupportsInt]):
+    """What ``ExploreFrontier-v0`` and its rehearsal share: their spaces, and the choice that is due.
+
+    Attributes
+    ----------
+    driver : ChooserConfig
+        How frontiers are found, driven to and described.
+    agent : Chooser
+        The driver.
+    """
+
+    agent: Chooser
+
+    def __init__(self, driver: ChooserConfig) -> None:
+        self.driver = driver
+        self.action_space = spaces.Discrete(driver.choice.most)
+        self.observation_space = cast("spaces.Space[Observation]", choice_space(driver))
+        self._choice: Choice | None = None
+
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
+        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
+        masks[0] = True
+        return masks
+
+    def _take(self, k: int) -> None:
+        """Choose, if there was a choice; what stands for no candidate is the first."""
+        if self._choice is not None:
+            self.agent.take(self._choice, k if k < len(self._choice.index) else 0)
+
+    def _observed(self) -> Observation:
+        return as_observation(self._choice, cast("spaces.Dict", self.observation_space))
 
 
 class _Beneath(ExploreEnv):
@@ -85,7 +112,7 @@ class _Beneath(ExploreEnv):
         )  # fmt: skip
 
 
-class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
+class ExploreFrontierEnv(ChoiceEnv):
     """Choose where to look next; the way there is planned on the belief's map and driven.
 
     Parameters
@@ -127,35 +154,21 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         **kwargs: Any,
     ) -> None:
         require(0 < discount <= 1, f"discount must be in (0, 1], got {discount}")
-        self.driver = from_mapping(ChooserConfig, driver)
+        super().__init__(from_mapping(ChooserConfig, driver))
         self.base = _Beneath(action="twist", render_mode=render_mode, **kwargs)
         self.config = self.base.config
         # A limit of its own, in its own steps: the one that may be around this environment counts decisions.
         limit = math.ceil(self.config.time_limit_s / self.config.step_s - 1e-9)
         self._limited = TimeLimit(self.base, max_episode_steps=limit)
         self.discount, self.render_mode = discount, render_mode
-        self.action_space = spaces.Discrete(self.driver.choice.most)
-        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
-        self._agent = Chooser(
+        self.agent = Chooser(
             self.driver, robot=self.config.robot, lidar=self.config.lidar, step_s=self.config.step_s
         )
-        self._choice: Choice | None = None
 
     @property
     def belief(self) -> Any:
         """What the robot knows; agents may use it."""
         return self.base.belief
-
-    @property
-    def agent(self) -> Chooser:
-        """The driver."""
-        return self._agent
-
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
-        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
-        masks[0] = True
-        return masks
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -164,19 +177,17 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
         super().reset(seed=seed)
         self.base.planned_path = None
         self._seen, info = self._limited.reset(seed=seed, options=options)
-        belief = self.base.outline
-        self._agent.reset(belief, 0 if seed is None else int(seed))
-        self._choice = self._agent.survey(self.base.belief)
-        return as_observation(self._choice, self.driver), info | {"duration_s": 0.0}
+        self.agent.reset(self.base.outline, 0 if seed is None else int(seed))
+        self._choice = self.agent.survey(self.base.belief)
+        return self._observed(), info | {"duration_s": 0.0}
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Drive to a view point until the next choice is due; see the class."""
         k = int(action)
         if not self.action_space.contains(np.int64(k)):
             raise ValueError(f"action must be 0 … {self.driver.choice.most - 1}, got {action}")
-        if self._choice is not None:
-            self._agent.take(self._choice, k if k < len(self._choice.index) else 0)
-        config, agent = self.config, self._agent
+        self._take(k)
+        config, agent = self.config, self.agent
         patience = math.ceil(_DONE_AFTER_S / config.step_s)
         total, weight, steps, idle = 0.0, 1.0, 0, 0
         belief = self.base.outline
@@ -199,8 +210,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
                 self._choice = agent.survey(self.base.belief)
                 if self._choice is not None and len(self._choice.index) > 1:
                     break
-                if self._choice is not None:
-                    agent.take(self._choice, 0)
+                self._take(0)
         info["duration_s"] = steps * config.step_s
         if terminated or truncated:
             covered = bool(info.get("is_success", False))
@@ -208,7 +218,7 @@ class ExploreFrontierEnv(gymnasium.Env[Observation, SupportsInt]):
             info["end"] = "covered" if covered else "time" if truncated else given_up
             info.setdefault("is_success", False)
             info.setdefault("episode_metrics", self.base.episode_metrics())
-        return as_observation(self._choice, self.driver), total, bool(terminated), bool(truncated), info
+        return self._observed(), total, bool(terminated), bool(truncated), info
 
     def render(self) -> Any:
         """Return truth beside belief as an RGB image ``(h, w, 3)``; with ``"human"`` None: it is shown already."""

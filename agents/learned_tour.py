@@ -7,7 +7,6 @@ to begin it (``training/dungeons/lessons.py``), and the tour is begun with the l
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,20 +17,17 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.learned.policy_files import read_policy
 from agents.learned.station_network import StationNetwork, outside, picture, pixels, with_walls
-from agents.stations.stop import StationRound, StationStop
+from agents.stations.stop import StationStop
 from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
 from agents.ways.routing import draw_luck
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, require
 
-__all__ = ["FORMAT", "PRECISION", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
+__all__ = ["FORMAT", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
 
 FORMAT = "mecanum-slam station policy 2"
-PRECISION = np.float16
-"""Of the weights in the file."""
 SHIPPED = Path(__file__).parent / "policies" / "learned-tour.safetensors"
 
 _LUCK = draw_luck(6, 700)
@@ -56,22 +52,12 @@ class LearnedTourConfig(TourConfig):
             f"LearnedTourConfig.extent must be x and y of the lower corner, then of the upper, got {self.extent}",
         )
         require(self.most >= 1, f"LearnedTourConfig.most must be at least 1, got {self.most}")
-        require(self.most_loss_m >= 0, f"LearnedTourConfig.most_loss_m must be ≥ 0, got {self.most_loss_m}")
+        not_negative(self, "most_loss_m")
 
 
 def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training; neither file can run code.
-
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format; the message names it.
-    """
-    weights, described = read_policy(path, FORMAT)
-    try:
-        return StationNetwork(weights), described
-    except ValueError as error:
-        raise ValueError(f"policy {path}: {error}") from error
+    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
+    return read_policy(path, FORMAT, lambda weights, _: StationNetwork(weights))
 
 
 class LearnedTour(Tour):
@@ -90,41 +76,22 @@ class LearnedTour(Tour):
     """
 
     config: LearnedTourConfig
+    config_type = LearnedTourConfig
 
-    def __init__(
-        self,
-        config: LearnedTourConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        settings = from_mapping(LearnedTourConfig, config)
-        self.policy_path = Path(settings.policy or SHIPPED)
+    def __init__(self, config: Any = None, **body: Any) -> None:
+        super().__init__(config, **body)
+        self.policy_path = Path(self.config.policy or SHIPPED)
         self._network, self.about = load_station_policy(self.policy_path)
-        self._round: StationRound | None = None
-        super().__init__(settings, robot=robot, lidar=lidar, step_s=step_s)
 
     def _forget(self) -> None:
         super()._forget()
         self._known_cells = 0
         self._decided_at: set[tuple[int, int]] = set()  # stations, since anything new was seen
 
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station."""
-        super().reset(belief, seed)
-        self._round = StationRound(belief, self.config.stations)
-
-    def looked(self, belief: Belief) -> None:
-        """Take note that the sensor looked from the belief's pose."""
-        super().looked(belief)
-        if self._round is not None:
-            self._round.looked(belief)
-
     def choose(self, belief: Belief) -> Goal | None:
         """Return the station to go to next, or where the tour goes where there are no stations worth a visit."""
-        stop = None if self._round is None else self._round.stop(belief)
-        if stop is None or not stop.found.worth.any():
+        stop = self._stop(belief)
+        if stop is None:
             return super().choose(belief)
         openings = options(stop.found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
         best = 0

@@ -8,18 +8,15 @@ name.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.stations.stop import StationRound, StationsConfig
-from mecanum_env.config import LidarConfig, RobotConfig
+from agents.stations.stop import StationAgent, StationsConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import not_negative
 
 __all__ = ["NearestFrontier", "NearestFrontierConfig"]
 
@@ -33,41 +30,19 @@ class NearestFrontierConfig(ExplorerConfig):
     switch_share: float = 0.15  # … and by this share of the present goal's cost, to be worth turning round
 
     def __post_init__(self) -> None:
-        for name in ("switch_m", "switch_share"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"NearestFrontierConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self, "switch_m", "switch_share")
 
 
-class NearestFrontier(Explorer):
+class NearestFrontier(StationAgent, Explorer):
     """Goes to the view point that is cheapest to reach, and on to the next as soon as it has seen."""
 
-    def __init__(
-        self,
-        config: NearestFrontierConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._config = from_mapping(NearestFrontierConfig, config)
-        self._round: StationRound | None = None
-        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station, if there are any."""
-        super().reset(belief, seed)
-        self._round = StationRound(belief, self._config.stations)
-
-    def looked(self, belief: Belief) -> None:
-        """Take note that the sensor looked from the belief's pose."""
-        super().looked(belief)
-        if self._round is not None:
-            self._round.looked(belief)
+    config: NearestFrontierConfig
+    config_type = NearestFrontierConfig
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return where to go next: a station, where the robot stands on one."""
-        stop = None if self._round is None else self._round.stop(belief)
-        if stop is None or not stop.found.worth.any():
+        stop = self._stop(belief)
+        if stop is None:
             return super().choose(belief)
         self._frontiers = stop.frontiers()
         self._status = "driving"
@@ -79,5 +54,5 @@ class NearestFrontier(Explorer):
         if candidates.current is None:
             return best
         cost = float(candidates.costs[candidates.current])
-        worth = max(self._config.switch_m, self._config.switch_share * cost)
+        worth = max(self.config.switch_m, self.config.switch_share * cost)
         return best if candidates.costs[best] < cost - worth else candidates.current

@@ -12,9 +12,7 @@ before, draws the robot nowhere. Where no sampled place does, the frontiers' own
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,9 +23,8 @@ from agents.view_points.gain import expected_area
 from agents.view_points.sight import first_in_good_sight
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, positive
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
 
@@ -50,53 +47,33 @@ class NextBestViewConfig(ExplorerConfig):
     switch_share: float = 0.2  # another place must be worth more by this share to be worth turning round
 
     def __post_init__(self) -> None:
-        for name in ("range_m", "depth_m", "spacing_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"NextBestViewConfig.{name} must be > 0, got {value}")
-        for name in ("decay_1_m", "switch_share"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"NextBestViewConfig.{name} must be ≥ 0, got {value}")
-        require(self.samples >= 0, f"NextBestViewConfig.samples must be ≥ 0, got {self.samples}")
+        positive(self, "range_m", "depth_m", "spacing_m")
+        not_negative(self, "decay_1_m", "samples", "switch_share")
 
 
 class NextBestView(Explorer):
     """Goes to where the most new area is in view, less what the way there costs."""
 
-    def __init__(
-        self,
-        config: NextBestViewConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._config = from_mapping(NextBestViewConfig, config)
-        self._rng = np.random.default_rng(0)
-        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
-        self._range_m = min(self._config.range_m, 0.8 * self._lidar.range_max_m)
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; ``seed`` draws the places where the lattice has more than are weighed."""
-        super().reset(belief, seed)
-        self._rng = np.random.default_rng(seed)
+    config: NextBestViewConfig
+    config_type = NextBestViewConfig
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the candidate of the highest worth, unless the present one is worth hardly less."""
         worth = self.worth(candidates.cost_map, candidates.cells, candidates.costs)
         best = int(np.argmax(worth))
         current = candidates.current
-        if current is None or worth[best] > (1.0 + self._config.switch_share) * worth[current]:
+        if current is None or worth[best] > (1.0 + self.config.switch_share) * worth[current]:
             return best
         return current
 
     def worth(self, cost_map: CostMap, cells: Cells, costs: Array, *, rays: int = 120) -> Array:
         """Return A · exp(−λ L) ``(m,)`` [m²] of places ``(m, 2)`` at travel costs ``(m,)``; −inf out of reach."""
         reached = np.isfinite(costs)
-        config = self._config
+        config = self.config
         area = expected_area(
             cost_map,
             np.where(reached[:, None], cells, -1),
-            range_m=self._range_m,
+            range_m=min(config.range_m, 0.8 * self._lidar.range_max_m),
             depth_m=config.depth_m,
             rays=rays,
         )
@@ -108,7 +85,7 @@ class NextBestView(Explorer):
         """Return the frontiers' candidates, each with the worthiest place that has it in good sight."""
         own = super()._candidates(belief)
         live = np.flatnonzero(np.isfinite(own.costs))
-        if not len(live) or self._config.samples == 0:
+        if not len(live) or self.config.samples == 0:
             return own
         targets = own.cost_map.to_cells(own.frontiers.targets)
         reach = _NEARER * self._watch_kept().range_m
@@ -116,7 +93,7 @@ class NextBestView(Explorer):
         cost = own.travel.cost[places[:, 0], places[:, 1]].astype(np.float64)
         worth = self.worth(own.cost_map, places, cost, rays=_SAMPLE_RAYS)
         if self._goal is not None and len(worth):
-            worth[0] *= 1.0 + self._config.switch_share  # the present goal: see _places
+            worth[0] *= 1.0 + self.config.switch_share  # the present goal: see _places
         least = self.worth(own.cost_map, own.cells, own.costs, rays=_SAMPLE_RAYS)
         order = np.argsort(-worth, kind="stable")
         found = first_in_good_sight(
@@ -134,7 +111,7 @@ class NextBestView(Explorer):
         They are points of a lattice of the belief's frame, so that a growing map does not shift it: within
         ``reach_m`` of one of the frontier cells ``targets`` ``(t, 2)``, and where the robot has room to turn.
         """
-        config, resolution = self._config, cost_map.resolution
+        config, resolution = self.config, cost_map.resolution
         step = max(1, round(config.spacing_m / resolution))
         first = [-round(cost_map.origin[axis] / resolution) % step for axis in (1, 0)]
         rows, cols = slice(first[0], None, step), slice(first[1], None, step)

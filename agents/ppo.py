@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from agents.base import Agent, Goal
 from agents.learned.drive_network import BEAMS, RANGE_M, DriveNetwork, Plan, PlanSettings
 from agents.learned.policy_files import read_policy
-from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.observation import draw_maps
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import from_mapping, require
+from slam.settings import positive
 
-__all__ = ["Ppo", "PpoConfig", "load_drive_policy"]
+__all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
 
 Array = NDArray[np.float64]
 
@@ -41,42 +40,28 @@ class PpoConfig:
     new_m2: float = 0.3  # what counts for new
 
     def __post_init__(self) -> None:
-        require(self.patience_s > 0 and self.new_m2 > 0, "PpoConfig.patience_s and new_m2 must be > 0")
+        positive(self, "patience_s", "new_m2")
 
 
 def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training. Neither file can run code.
+    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
 
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format; the message names it.
-    """
-    weights, described = read_policy(path, FORMAT)
-    try:
+    def made(weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]) -> DriveNetwork:
         settings = PlanSettings(**{key: float(value) for key, value in described["planning"].items()})
-        network = DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"policy {path}: {error}") from error
-    return network, described
+        return DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
+
+    return read_policy(path, FORMAT, made)
 
 
 class Ppo(Agent):
     """Sends what the policy's network says, until nothing new has come in sight for a while."""
 
-    def __init__(
-        self,
-        config: PpoConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
-        settings = from_mapping(PpoConfig, config)
-        self.policy_path = Path(settings.policy or SHIPPED)
+    config_type = PpoConfig
+
+    def __init__(self, config: PpoConfig | Mapping[str, Any] | None = None, **body: Any) -> None:
+        super().__init__(config, **body)
+        self.policy_path = Path(self.config.policy or SHIPPED)
         self._network, self.about = load_drive_policy(self.policy_path)
-        self._settings = settings
         self._forget()
 
     def _forget(self) -> None:
@@ -111,9 +96,9 @@ class Ppo(Agent):
         self._time += self._step_s
         if step % max(round(1.0 / self._step_s), 1) == 0:
             known = float(np.count_nonzero(belief.grid.classes() == FREE)) * belief.grid.resolution**2
-            if known >= self._known_m2 + self._settings.new_m2:
+            if known >= self._known_m2 + self.config.new_m2:
                 self._known_m2, self._news_at = known, self._time
-            self._status = "covered" if self._time - self._news_at > self._settings.patience_s else "driving"
+            self._status = "covered" if self._time - self._news_at > self.config.patience_s else "driving"
         return self.ended
 
     def _complete(self, observation: Mapping[str, Any] | None, belief: Belief) -> dict[str, Any]:

@@ -8,19 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.learned.choice import CANDIDATE, STATE
 from agents.learned.choice_network import ChoiceEnsemble
 from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.settings import from_mapping
 
-__all__ = ["SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy", "policy_description"]
+__all__ = ["FORMAT", "SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
 
-_FORMAT = "mecanum-slam choice policy 1"
+FORMAT = "mecanum-slam choice policy 1"
 SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"
 
 
@@ -35,23 +35,19 @@ class PpoFrontierConfig:
 def load_choice_policy(path: Path) -> tuple[ChoiceEnsemble, ChooserConfig, dict[str, Any]]:
     """Read a policy: its networks, the explorer it was trained with, and what the JSON file says of its training.
 
-    Neither file can run code.
-
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format; the message names it.
+    See :func:`read_policy`.
     """
-    weights, described = read_policy(path, _FORMAT)
-    columns = [list(CANDIDATE), list(STATE)]
-    if [described.get("candidate"), described.get("state")] != columns:
-        raise ValueError(f"policy {path} was trained on other columns than this version shows; train it anew")
-    try:
-        network = ChoiceEnsemble(weights, heads=int(described["heads"]))
-        driver = from_mapping(ChooserConfig, described["driver"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"policy {path}: {error}") from error
+    (network, driver), described = read_policy(path, FORMAT, _made)
     return network, driver, described
+
+
+def _made(
+    weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]
+) -> tuple[ChoiceEnsemble, ChooserConfig]:
+    if [described.get("candidate"), described.get("state")] != [list(CANDIDATE), list(STATE)]:
+        raise ValueError("it was trained on other columns than this version shows; train it anew")
+    network = ChoiceEnsemble(weights, heads=int(described["heads"]))
+    return network, from_mapping(ChooserConfig, described["driver"])
 
 
 class PpoFrontier(Chooser):
@@ -65,19 +61,11 @@ class PpoFrontier(Chooser):
         What the policy's JSON file says of its training: command, configuration, steps, hours, curve.
     """
 
-    def __init__(
-        self,
-        config: PpoFrontierConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
+    def __init__(self, config: PpoFrontierConfig | Mapping[str, Any] | None = None, **body: Any) -> None:
         settings = from_mapping(PpoFrontierConfig, config)
         self.policy_path = Path(settings.policy or SHIPPED)
         self._network, driver, self.about = load_choice_policy(self.policy_path)
-        driver = from_mapping(ChooserConfig, settings.driver, base=driver)
-        super().__init__(driver, robot=robot, lidar=lidar, step_s=step_s)
+        super().__init__(from_mapping(ChooserConfig, settings.driver, base=driver), **body)
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
@@ -85,11 +73,3 @@ class PpoFrontier(Chooser):
         if choice is not None:
             self.take(choice, int(np.argmax(self._network.scores(choice))))
         return super().choose(belief)
-
-
-def policy_description(network_heads: int, driver: Mapping[str, Any], **training: Any) -> dict[str, Any]:
-    """Return what the JSON file beside the weights must say."""
-    return {
-        "format": _FORMAT, "heads": network_heads, "candidate": list(CANDIDATE), "state": list(STATE),
-        "driver": dict(driver), **training,
-    }  # fmt: skip

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import positive
 
 __all__ = ["RandomAgent", "RandomConfig"]
 
@@ -28,31 +27,19 @@ class RandomConfig:
     preview_s: float = 1.0  # how far ahead the goal lies that it shows
 
     def __post_init__(self) -> None:
-        for name in ("correlation_s", "spread", "preview_s"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"RandomConfig.{name} must be > 0, got {value}")
+        positive(self)
 
 
 class RandomAgent(Agent):
     """Drives at random, smoothly, and never holds a place for explored."""
 
-    def __init__(
-        self,
-        config: RandomConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(robot=robot, lidar=lidar, step_s=step_s)
-        self.config = from_mapping(RandomConfig, config)
-        self._rng = np.random.default_rng(0)
-        self._action = np.zeros(3)
+    config: RandomConfig
+    config_type = RandomConfig
+    _action: NDArray[np.float64] = np.zeros(3)
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Start an episode with the walk that ``seed`` gives."""
         super().reset(belief, seed)
-        self._rng = np.random.default_rng(seed)
         self._action = self._rng.normal(0.0, self.config.spread, 3)
         self._status = "driving"
 

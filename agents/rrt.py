@@ -15,9 +15,7 @@ nothing is left, and would leave what lies behind a narrow door to chance.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +24,8 @@ from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
 from agents.view_points.rrt_tree import Tree, mean_shift
 from agents.ways.cost_map import CostMap
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, positive, require
 
 __all__ = ["Rrt", "RrtConfig"]
 
@@ -54,49 +51,25 @@ class RrtConfig(ExplorerConfig):
     switch_m: float = 1.0  # another piece must earn more by this [weighted m] to be worth turning round
 
     def __post_init__(self) -> None:
-        for name in ("stride_m", "bandwidth_m", "near_piece_m", "gain_radius_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"RrtConfig.{name} must be > 0, got {value}")
-        for name in ("min_gain_m2", "weight_m_m2", "near_m", "switch_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"RrtConfig.{name} must be ≥ 0, got {value}")
+        positive(self, "stride_m", "bandwidth_m", "near_piece_m", "gain_radius_m")
+        not_negative(self, "min_gain_m2", "weight_m_m2", "near_m", "switch_m", "draws")
         require(
             math.isfinite(self.near_gain) and self.near_gain >= 1,
             f"RrtConfig.near_gain must be ≥ 1, got {self.near_gain}",
         )
-        require(self.draws >= 0, f"RrtConfig.draws must be ≥ 0, got {self.draws}")
         require(self.capacity >= 1, f"RrtConfig.capacity must be ≥ 1, got {self.capacity}")
 
 
 class Rrt(Explorer):
     """Goes to the frontier point of the highest revenue among those that random trees have found."""
 
-    def __init__(
-        self,
-        config: RrtConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._config = from_mapping(RrtConfig, config)
-        self._rng = np.random.default_rng(0)
-        super().__init__(self._config, robot=robot, lidar=lidar, step_s=step_s)
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode with the trees that ``seed`` gives."""
-        super().reset(belief, seed)
-        self._rng = np.random.default_rng(seed)
+    config: RrtConfig
+    config_type = RrtConfig
 
     def _forget(self) -> None:
         super()._forget()
-        self._tree = Tree(self._config.stride_m, self._config.capacity)
+        self.tree = Tree(self.config.stride_m, self.config.capacity)  # the global one
         self._found: Array = np.zeros((0, 2))  # frontier points [m], the latest last
-
-    @property
-    def tree(self) -> Tree:
-        """The global tree."""
-        return self._tree
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of the highest revenue, unless the present one earns hardly less."""
@@ -105,17 +78,17 @@ class Rrt(Explorer):
         revenue = self._revenue(candidates, points, gains, belief)
         best = int(np.argmax(revenue))
         current = candidates.current
-        if current is None or revenue[best] > revenue[current] + self._config.switch_m:
+        if current is None or revenue[best] > revenue[current] + self.config.switch_m:
             return best
         return current
 
     def _grow(self, cost_map: CostMap, here: Array) -> None:
         """Grow both trees and remember the frontier points that they find."""
-        config = self._config
-        self._tree.prune(cost_map)
-        if not len(self._tree.nodes):
-            self._tree.plant(here)
-            self._tree.prune(cost_map)  # a robot on a cell that is not free grows nothing yet
+        config = self.config
+        self.tree.prune(cost_map)
+        if not len(self.tree.nodes):
+            self.tree.plant(here)
+            self.tree.prune(cost_map)  # a robot on a cell that is not free grows nothing yet
         local = Tree(config.stride_m, config.draws + 1)
         local.plant(here)
         local.prune(cost_map)
@@ -123,12 +96,12 @@ class Rrt(Explorer):
         high = low + np.array(cost_map.classes.shape[::-1]) * cost_map.resolution
         # A stride beyond what is known: out there is what the edges at its rim are to be drawn towards.
         draws = self._rng.uniform(low - config.stride_m, high + config.stride_m, (2, config.draws, 2))
-        hits = [self._tree.grow(cost_map, draws[0]), local.grow(cost_map, draws[1], restart=True)]
+        hits = [self.tree.grow(cost_map, draws[0]), local.grow(cost_map, draws[1], restart=True)]
         self._found = np.vstack([self._found, *hits])[-_REMEMBERED:]
 
     def _frontier_points(self, cost_map: CostMap) -> tuple[Array, Array]:
         """Return one point ``(k, 2)`` [m] per cluster of those found, and its information gain ``(k,)`` [m²]."""
-        config = self._config
+        config = self.config
         cells = cost_map.to_cells(self._found)
         _, first = np.unique(cells, axis=0, return_index=True)
         self._found = self._found[np.sort(first)]
@@ -140,12 +113,12 @@ class Rrt(Explorer):
 
     def _gain(self, cost_map: CostMap, points: Array) -> Array:
         """Return the unknown area ``(k,)`` [m²] around points ``(k, 2)`` [m]: in view, not behind walls."""
-        radius = self._config.gain_radius_m
+        radius = self.config.gain_radius_m
         return expected_area(cost_map, cost_map.to_cells(points), range_m=radius, rays=60)
 
     def _revenue(self, candidates: Candidates, points: Array, gains: Array, belief: Belief) -> Array:
         """Return λ h I − N ``(m,)`` [weighted m] of each piece of frontier; −inf where it is not to be had."""
-        config, targets = self._config, candidates.frontiers.targets
+        config, targets = self.config, candidates.frontiers.targets
         live = np.isfinite(candidates.costs)
         gain = np.zeros(len(targets))
         found = np.zeros(len(targets), dtype=np.bool_)

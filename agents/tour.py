@@ -8,24 +8,21 @@ the first leg is carried out.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.lattice import in_sight, join, ways
-from agents.stations.stop import StationsConfig
+from agents.stations.stop import StationAgent, StationsConfig
 from agents.view_points.gain import expected_area
 from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import from_mapping, require
+from slam.settings import not_negative, require
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 
@@ -47,9 +44,7 @@ class TourConfig(ExplorerConfig):
     depth_m: float = 3.0  # how far behind a frontier new area is expected
 
     def __post_init__(self) -> None:
-        for name in ("hold_m", "hurry", "depth_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"TourConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self, "hold_m", "hurry", "depth_m")
         for name in ("places", "tries"):
             require(getattr(self, name) >= 1, f"TourConfig.{name} must be at least 1, got {getattr(self, name)}")
 
@@ -89,27 +84,13 @@ class Outlook:
         return cost / (1.0 + float(self.weight.sum()))
 
 
-class Tour(Explorer):
+class Tour(StationAgent, Explorer):
     """Goes to the first place of the best tour over all that is left to look at."""
 
     config: TourConfig
 
-    def __init__(
-        self,
-        config: TourConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        self._index = 0
-        self._start = np.zeros(2)  # [m], a station
-        super().__init__(from_mapping(TourConfig, config), robot=robot, lidar=lidar, step_s=step_s)
-
-    def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; where the robot is now is a station."""
-        super().reset(belief, seed)
-        self._start = np.array(belief.pose[:2], dtype=np.float64)
+    config_type = TourConfig
+    _index = 0  # of the piece that the tour begins with
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of frontier that the tour begins with."""
@@ -143,7 +124,9 @@ class Tour(Explorer):
         sight = self._sight(found, places, near)
         sight[1 + np.arange(len(owner)), first] = True
         if found.current is not None:
-            self._hold(distance, np.asarray(sight[:, near == found.current].any(axis=1)))
+            # Shorter is the first leg towards the places that the robot is on the way to.
+            kept = np.asarray(sight[:, near == found.current].any(axis=1))
+            distance[0, kept] = np.maximum(distance[0, kept] - self.config.hold_m, 0.0)
         self._outlook = Outlook(owner, sight, distance, self._weights(found, places))
         self._order, _ = self._outlook.tour(self.config.tries)
         return int(owner[self._order[1] - 1])
@@ -169,16 +152,12 @@ class Tour(Explorer):
         area[0] = 0.0
         return np.asarray(self.config.hurry * area / max(float(area.mean()), 1e-9))
 
-    def _hold(self, distance: Array, kept: NDArray[np.bool_]) -> None:
-        """Shorten the first leg towards the places that the robot is on the way to."""
-        distance[0, kept] = np.maximum(distance[0, kept] - self.config.hold_m, 0.0)
-
     # ---- hopping over stations -----------------------------------------------------------------------------
 
     def _by_stations(self, found: Candidates, pieces: Cells) -> Candidates:
         """Return the candidates with the tour's first station as the view point of a piece seen from there."""
         config, cost_map = self.config.stations, found.cost_map
-        cells, joined, here = _stations(cost_map, config, self._start)
+        cells, joined, here = _stations(cost_map, config, self._began_at)
         if here < 0:
             return found
         targets = cost_map.to_cells(found.frontiers.targets[pieces])

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import tomli_w
 
-from slam.settings import from_mapping, require, to_mapping, unknown_name
+from slam.settings import from_mapping, not_negative, positive, require, to_mapping, unknown_name
 
 __all__ = [
     "LIDAR_PRESETS",
@@ -56,11 +56,9 @@ class RobotConfig:
     slip_speed_m_s: float = 0.015  # width of the regularised Coulomb law, s₀
 
     def __post_init__(self) -> None:
-        for f in dataclasses.fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value >= 0, f"RobotConfig.{f.name} must be ≥ 0, got {value}")
-            if f.name not in ("wheel_friction", "motor_lag_s"):
-                require(value > 0, f"RobotConfig.{f.name} must be > 0, got {value}")
+        may_be_zero = ("motor_lag_s", "wheel_friction")
+        not_negative(self, *may_be_zero)
+        positive(self, *(f.name for f in dataclasses.fields(self) if f.name not in may_be_zero))
 
     @cached_property
     def lever_m(self) -> float:
@@ -137,15 +135,7 @@ class NoiseConfig:
     patch_share: float = 0.0  # share of the floor that slippery patches cover
 
     def __post_init__(self) -> None:
-        for name in (
-            "range_sigma_m",
-            "dropout",
-            "encoder",
-            "radius_error",
-            "base_error",
-            "slip",
-            "patch_share",
-        ):
+        for name in (f.name for f in dataclasses.fields(self) if "friction" not in f.name):
             value = getattr(self, name)
             require(math.isfinite(value) and 0 <= value < 1, f"NoiseConfig.{name} must be in [0, 1), got {value}")
         require(0 < self.friction <= 2, f"NoiseConfig.friction must be in (0, 2], got {self.friction}")

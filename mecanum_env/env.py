@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,14 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env import rooms as room_registry
-from mecanum_env.arguments import Settings, make_backend, make_config
-from mecanum_env.config import (
-    EnvConfig,
-    LidarConfig,
-    NoiseConfig,
-    RewardConfig,
-    RobotConfig,
-)
+from mecanum_env.arguments import make_backend, make_config
 from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
@@ -55,10 +47,12 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ----------
     action : str
         ``"twist"``: body twist as fractions of the limits; ``"wheels"``: wheel speeds FL, FR, RL, RR.
-    config, rooms, slam, robot, lidar, noise, reward, floor_plan, odometry_filter
-        See :func:`mecanum_env.arguments.make_config`.
     render_mode : str, optional
         ``"rgb_array"``: truth beside belief. ``"human"``: the same in a window, shown by ``reset`` and ``step``.
+    floor_plan : FloorPlan or path, optional
+        Where to explore, instead of rooms that are drawn.
+    config, rooms, slam, robot, lidar, noise, reward, odometry_filter
+        See :func:`mecanum_env.arguments.make_config`.
 
     Notes
     -----
@@ -77,25 +71,15 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         *,
         action: str = "twist",
         render_mode: str | None = None,
-        config: EnvConfig | str | Path | Mapping[str, Any] | None = None,
-        rooms: Settings | None = None,
-        slam: Settings | None = None,
-        robot: Settings | RobotConfig | None = None,
-        lidar: Settings | LidarConfig | None = None,
-        noise: Settings | NoiseConfig | None = None,
-        reward: Mapping[str, Any] | RewardConfig | None = None,
         floor_plan: str | Path | FloorPlan | None = None,
-        odometry_filter: Settings | None = None,
+        **settings: Any,
     ) -> None:
         if action not in ACTIONS:
             raise unknown_name("action", action, ACTIONS)
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
-        self.config = make_config(
-            config=config, rooms=rooms, slam=slam, robot=robot, lidar=lidar, noise=noise, reward=reward,
-            floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, odometry_filter=odometry_filter,
-        )  # fmt: skip
+        self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
         self.render_mode = render_mode
         targets = WheelTargets(self.config.robot)
         self._to_wheels = targets.of_wheels if action == "wheels" else targets.of_twist
@@ -115,7 +99,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
-        options = dict(options or {})
+        options = options or {}
         for key in options:
             if key not in ("floor_plan", "start_pose", "room_seed"):
                 raise unknown_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
@@ -143,7 +127,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.truth = Truth(ground, world, EpisodeRecord(), scan)
         self.scan = scan
         self._steps = 0
-        self._step_limit = self._find_step_limit()
+        self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
         self._odometry = Odometry((0.0, 0.0, 0.0), config.step_s)
         self._ready = True
         if self._knows_truth:
@@ -162,7 +146,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         config, truth, backend = self.config, self.truth, self.backend
         world, ground, plan = truth.world, truth.ground, truth.ground.plan
         collisions = world.collisions
-        world.step(self._wheel_targets(action), config.step_s, config.physics_step_s)
+        world.step(self._to_wheels(action), config.step_s, config.physics_step_s)
         odometry = self._odometer.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
         world_pose = world.pose
         scan = self.lidar.scan(plan.segments, plan.circles, world_pose, self._sensor_rng)
@@ -242,9 +226,6 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             plan = plan.with_start(start, clearance_m=self.config.robot.inscribed_radius_m)
         return plan
 
-    def _wheel_targets(self, action: NDArray[np.float32]) -> Array:
-        return self._to_wheels(action)
-
     def _remember(self) -> None:
         """Keep what the next step's reward compares with."""
         grid = self.backend.grid
@@ -300,12 +281,6 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             twist=self._odometry.twist,
             time_used=self._steps / limit,
         )
-
-    def _find_step_limit(self) -> int | None:
-        limit = _time_limit_of_caller()
-        if limit is None and self.spec is not None:
-            limit = self.spec.max_episode_steps
-        return limit
 
 
 def _time_limit_of_caller() -> int | None:

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.ground_truth import GroundTruth, occupied, on_lattice
+from mecanum_env.ground_truth import GroundTruth, on_lattice
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.belief import Belief
+from slam.grids.occupancy import OCCUPIED
 from slam.metrics import measures as metrics
 from slam.types import Scan
 
@@ -138,9 +139,8 @@ def score_map(truth: GroundTruth, belief: Belief) -> metrics.MapScore:
     """
     margin = round(10.0 / truth.resolution)
     true_walls = on_lattice(truth.walls, truth.lattice_origin, truth, margin)
-    return metrics.compare_walls(
-        occupied(belief.grid, truth, margin), true_walls, tolerance_cells=WALL_TOLERANCE_M / truth.resolution
-    )
+    walls = on_lattice(belief.grid.classes() == OCCUPIED, belief.grid.lattice_origin, truth, margin)
+    return metrics.compare_walls(walls, true_walls, tolerance_cells=WALL_TOLERANCE_M / truth.resolution)
 
 
 def _number(value: float) -> float | None:

@@ -9,11 +9,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from mecanum_env.sensing.sensors import Lidar
 from slam.geometry import compose, inverse, transform_points, wrap_scalar
-from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.grids.occupancy import FREE, OccupancyGrid
 from slam.types import Scan
 
 __all__ = ["Coverage", "GroundTruth"]
@@ -92,25 +92,13 @@ class GroundTruth:
         views = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
         views = np.vstack([views, self.start[:2]])
         grid = OccupancyGrid(self.resolution)
-        increment = 2.0 * math.pi / _VIEW_BEAMS
         to_start = inverse(self.start)
-        directions = beam_directions(_VIEW_BEAMS, -math.pi, increment)
-        ranges = np.empty(_VIEW_BEAMS)
+        all_round = LidarConfig(beams=_VIEW_BEAMS, range_max_m=lidar.range_max_m, offset_m=0.0)
+        eye = Lidar(all_round, NoiseConfig())
         for x, y in views:
             pose = np.array([x, y, self.start[2]])
-            cast_rays(
-                plan.segments,
-                plan.circles,
-                x,
-                y,
-                pose[2],
-                directions,
-                -math.pi,
-                increment,
-                lidar.range_max_m,
-                ranges,
-            )
-            scan = Scan(ranges, angle_min=-math.pi, angle_increment=increment, range_max=lidar.range_max_m)
+            ranges = eye.true_ranges(plan.segments, plan.circles, pose)
+            scan = Scan(ranges, all_round.angle_min, all_round.angle_increment, all_round.range_max_m)
             grid.integrate(compose(to_start, pose), scan)
             grid.take_changes()
         return grid
@@ -120,14 +108,12 @@ class GroundTruth:
         raster = np.zeros(grid.shape, np.uint8)
         to_start = inverse(self.start)
         ends = transform_points(to_start, self.plan.segments.reshape(-1, 2))
-        scale = 16.0
-        pixels = (
-            ends / self.resolution - np.array([self.lattice_origin[1], self.lattice_origin[0]]) - 0.5
-        ) * scale
+        scale, corner = 16.0, np.array(self.lattice_origin[::-1])
+        pixels = (ends / self.resolution - corner - 0.5) * scale
         for a, b in np.round(pixels).astype(np.int32).reshape(-1, 2, 2):
             cv2.line(raster, a.tolist(), b.tolist(), 1, 1, cv2.LINE_8, 4)
         centres = transform_points(to_start, self.plan.circles[:, :2]) / self.resolution
-        centres = (centres - np.array([self.lattice_origin[1], self.lattice_origin[0]]) - 0.5) * scale
+        centres = (centres - corner - 0.5) * scale
         for (x, y), radius in zip(np.round(centres).astype(int).tolist(), self.plan.circles[:, 2], strict=True):
             cv2.circle(raster, (x, y), round(radius / self.resolution * scale), 1, 1, cv2.LINE_8, 4)
         return raster > 0
@@ -156,14 +142,11 @@ class Coverage:
         self.changes = changes
         if grid.revision != self._revision:
             self._revision, self.changes = grid.revision, None
-            self._right = int(np.count_nonzero(self._overlap(grid)))
+            free = on_lattice(grid.classes() == FREE, grid.lattice_origin, self._truth)
+            self._right = int(np.count_nonzero(free & self._truth.mappable))
         else:
             self._right += _count_right(changes, self._truth.mappable, row0, col0)
         return self._right / self._truth.mappable_cells
-
-    def _overlap(self, grid: OccupancyGrid) -> NDArray[np.bool_]:
-        free = on_lattice(grid.classes() == FREE, grid.lattice_origin, self._truth)
-        return np.asarray(free & self._truth.mappable)
 
 
 def on_lattice(
@@ -179,11 +162,6 @@ def on_lattice(
     if r0 < r1 and c0 < c1:
         out[r0:r1, c0:c1] = raster[r0 - r : r1 - r, c0 - c : c1 - c]
     return out
-
-
-def occupied(grid: OccupancyGrid, truth: GroundTruth, margin: int) -> NDArray[np.bool_]:
-    """Return the belief's occupied cells on the truth's lattice with a margin."""
-    return on_lattice(grid.classes() == OCCUPIED, grid.lattice_origin, truth, margin)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

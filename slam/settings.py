@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["from_mapping", "require", "to_mapping", "unknown_name"]
+__all__ = ["from_mapping", "not_negative", "positive", "require", "shares", "to_mapping", "unknown_name"]
 
 T = TypeVar("T")
 
@@ -25,6 +26,28 @@ def require(condition: bool, message: str) -> None:
     """Raise ``ValueError(message)`` unless the condition holds; for ``__post_init__``."""
     if not condition:
         raise ValueError(message)
+
+
+def positive(config: Any, *names: str) -> None:
+    """Raise ``ValueError`` unless these fields of a config, all where none is named, are finite and > 0."""
+    _check(config, names, lambda value: value > 0, "> 0")
+
+
+def not_negative(config: Any, *names: str) -> None:
+    """Raise ``ValueError`` unless these fields of a config, all where none is named, are finite and ≥ 0."""
+    _check(config, names, lambda value: value >= 0, "≥ 0")
+
+
+def shares(config: Any, *names: str) -> None:
+    """Raise ``ValueError`` unless these fields of a config, all where none is named, are in [0, 1]."""
+    _check(config, names, lambda value: 0 <= value <= 1, "in [0, 1]")
+
+
+def _check(config: Any, names: Iterable[str], holds: Callable[[float], bool], what: str) -> None:
+    for name in names or [f.name for f in dataclasses.fields(config)]:
+        value = getattr(config, name)
+        good = math.isfinite(value) and holds(value)
+        require(good, f"{type(config).__name__}.{name} must be {what}, got {value}")
 
 
 def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T | None = None) -> T:

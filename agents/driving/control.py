@@ -15,7 +15,7 @@ from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_po
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import require
+from slam.settings import positive, require
 
 __all__ = ["ControlConfig", "PathFollower"]
 
@@ -50,10 +50,7 @@ class ControlConfig:
     arrived_rad: float = 0.2
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            good = f.name == "any_side" or (math.isfinite(value) and value > 0)
-            require(good, f"ControlConfig.{f.name} must be > 0, got {value}")
+        positive(self, *(f.name for f in fields(self) if f.name != "any_side"))
         require(self.speed_share <= 1, f"ControlConfig.speed_share must be ≤ 1, got {self.speed_share}")
 
 
@@ -81,31 +78,19 @@ class PathFollower:
     @config.setter
     def config(self, config: ControlConfig) -> None:
         self._config = config
-        robot = self._robot
-        self._pace = Pace(
-            max_speed_m_s=config.speed_share * robot.max_speed_m_s,
-            near_wall_m_s=config.near_wall_m_s,
-            open_m=config.open_m,
-            deceleration_m_s2=config.deceleration_m_s2,
-            lag_s=config.lag_s,
-            look_ahead_s=config.look_ahead_s,
-            min_look_ahead_m=config.min_look_ahead_m,
-            max_look_ahead_m=config.max_look_ahead_m,
-            lateral_m_s2=config.lateral_m_s2,
-            turn_gain=config.turn_gain,
-            max_turn_rad_s=min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s),
-            align_rad=config.align_rad,
-            arrival_m_s=config.arrival_m_s,
-            arrived_m=config.arrived_m,
-            arrived_rad=config.arrived_rad,
-            half_length_m=0.5 * robot.length_m,
+        robot, view_deg = self._robot, self._lidar.field_of_view_deg
+        as_they_are = {name: getattr(config, name) for name in Pace._fields if hasattr(config, name)}
+        self._pace = Pace(**as_they_are | {
+            "max_speed_m_s": config.speed_share * robot.max_speed_m_s,
+            "max_turn_rad_s": min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s),
+            "half_length_m": 0.5 * robot.length_m,
             # A sensor that sees all round can as well be driven backwards out of a narrow place.
-            reversible=self._lidar.field_of_view_deg >= 270.0,
-            turn_within_m=self._turn_within_m,
-            any_side=config.any_side and self._lidar.field_of_view_deg >= 360.0,
-            lever_m=robot.lever_m,
-            spare_m=robot.circumscribed_radius_m - self._half_across(),
-        )
+            "reversible": view_deg >= 270.0,
+            "turn_within_m": self._turn_within_m,
+            "any_side": config.any_side and view_deg >= 360.0,
+            "lever_m": robot.lever_m,
+            "spare_m": robot.circumscribed_radius_m - self._half_across(),
+        })  # fmt: skip
         self._motors = Motors(
             step_s=self._step_s,
             acceleration_m_s2=config.acceleration_m_s2,

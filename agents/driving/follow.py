@@ -76,16 +76,9 @@ class _Spot(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def aim(
-    pose: Array,
-    speed_now: float,
-    path: Array,
-    arc: Array,
-    index: int,
-    goal_heading: float,
-    near: LocalMap,
-    turning_room: float,
-    pace: Pace,
-) -> tuple[Array, float, int, float, bool]:
+    pose: Array, speed_now: float, path: Array, arc: Array, index: int, goal_heading: float, near: LocalMap,
+    turning_room: float, pace: Pace,
+) -> tuple[Array, float, int, float, bool]:  # fmt: skip
     """Return the velocity and the turn rate wanted next on a path, and how far along it the robot is.
 
     Parameters
@@ -130,17 +123,9 @@ def aim(
 
 @njit(cache=True, nogil=True)
 def send(
-    velocity: Array,
-    turn: float,
-    last_velocity: Array,
-    last_turn: float,
-    pose: Array,
-    near: LocalMap,
-    map_gap: float,
-    hits: Array,
-    motors: Motors,
-    guard: Guard,
-) -> tuple[Array, Array, bool]:
+    velocity: Array, turn: float, last_velocity: Array, last_turn: float, pose: Array, near: LocalMap,
+    map_gap: float, hits: Array, motors: Motors, guard: Guard,
+) -> tuple[Array, Array, bool]:  # fmt: skip
     """Smooth, bound and check a wanted velocity ``(2,)`` [m/s] and turn rate [rad/s].
 
     ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] what the scan shows.
@@ -203,10 +188,7 @@ def _point(path: Array, arc: Array, at: float) -> tuple[float, float]:
     if i >= len(arc) - 1:
         return path[-1, 0], path[-1, 1]
     share = (at - arc[i]) / (arc[i + 1] - arc[i])
-    return (
-        path[i, 0] + share * (path[i + 1, 0] - path[i, 0]),
-        path[i, 1] + share * (path[i + 1, 1] - path[i, 1]),
-    )
+    return (path[i, 0] + share * (path[i + 1, 0] - path[i, 0]), path[i, 1] + share * (path[i + 1, 1] - path[i, 1]))
 
 
 @njit(cache=True, nogil=True)

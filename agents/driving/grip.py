@@ -1,4 +1,4 @@
-"""How well the wheels tell the motion, learnt on the way; and a follower that drives as gently as they slip.
+"""How well the wheels tell the motion, learnt on the way; and how to drive as gently as they slip.
 
 Nobody tells the agent on what floor it drives. What the wheels claim and what the filter makes of it, with the
 landmarks' help, differ by the odometry's error: V's share of the wheels' speed (:mod:`slam.motion`), and what a
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig, PathFollower
-from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.motion import OdometryNoise, twist_between
 
-__all__ = ["GentleFollower", "WheelWatch"]
+__all__ = ["GentleFollower", "WheelWatch", "eased"]
 
 Array = NDArray[np.float64]
 
@@ -78,35 +78,21 @@ class WheelWatch:
         self._missed = _FORGET * self._missed + min(error, 0.25)
 
 
-class GentleFollower(PathFollower):
-    """Drives, speeds up and brakes as gently as a slippery floor asks for, once the wheels have told of it."""
+def eased(usual: ControlConfig, share: float, **gentle: float) -> ControlConfig:
+    """Return how to drive a share (0 … 1) of the way from as usual to these gentle values, where they are less."""
+    before = {name: getattr(usual, name) for name in gentle}
+    return replace(usual, **{k: v + share * (min(v, gentle[k]) - v) for k, v in before.items()})
 
-    def __init__(
-        self, config: ControlConfig, *, robot: RobotConfig, lidar: LidarConfig, step_s: float, gentle_m_s2: float,
-        gentle_speed_share: float = 1.0,
-    ) -> None:  # fmt: skip
-        self._usual, self._gentle, self._gentle_share = config, gentle_m_s2, gentle_speed_share
-        self._sent = (np.zeros(2), 0.0)
-        super().__init__(config, robot=robot, lidar=lidar, step_s=step_s)
+
+class GentleFollower(PathFollower):
+    """Brakes to a stand where others drop their path."""
+
+    _sent = (np.zeros(2), 0.0)
 
     def stand(self) -> None:
         """Take it that the robot stands still."""
         self.reset()
         self._sent = (np.zeros(2), 0.0)
-
-    def go_gently(self, share: float) -> None:
-        """Take this much (0 … 1) of the way from the usual speed and acceleration to the gentle ones."""
-        usual = self._usual
-
-        def between(value: float, gentle: float) -> float:
-            return value + share * (min(value, gentle) - value)
-
-        self.config = replace(
-            usual,
-            speed_share=between(usual.speed_share, self._gentle_share),
-            acceleration_m_s2=between(usual.acceleration_m_s2, self._gentle),
-            deceleration_m_s2=between(usual.deceleration_m_s2, self._gentle),
-        )
 
     def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the next twist ``(3,)`` on the way to a stand: wheels stopped at once slide, and tell nothing."""

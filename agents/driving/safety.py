@@ -18,20 +18,12 @@ from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 
-__all__ = [
-    "Guard",
-    "LocalMap",
-    "body_gaps",
-    "clearance_at",
-    "footprint",
-    "local_map",
-    "safe_twist",
-    "scan_points",
-]
+__all__ = ["Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points"]
 
 Array = NDArray[np.float64]
 
-POSES = 8  # of a predicted motion, the present one included
+_SCAN_WITHIN_M = 2.0
+_POSES = 8  # of a predicted motion, the present one included
 _SPEEDS = (1.0, 0.7, 0.45, 0.25, 0.1)  # shares of the wanted twist that are tried
 _SIDESTEPS = (0.6, -0.6, 1.2, -1.2)  # [rad] off the wanted direction, tried after that
 _SIDESTEP_M_S = 0.12
@@ -47,7 +39,7 @@ class LocalMap(NamedTuple):
 
     def at(self, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)``; beyond the window that of its rim."""
-        return _clearances(self, np.atleast_2d(np.asarray(points, dtype=np.float64)))
+        return np.array([clearance_at(self, x, y) for x, y in np.atleast_2d(points).tolist()])
 
 
 class Guard(NamedTuple):
@@ -87,8 +79,8 @@ def footprint(robot: RobotConfig, spacing_m: float = 0.05) -> Array:
     return np.ascontiguousarray(np.vstack(sides + ends))
 
 
-def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig, *, within_m: float = 2.0) -> Array:
-    """Return what the scan in an observation hit ``(n, 2)`` [m], in the body frame; empty where there is none.
+def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig) -> Array:
+    """Return what the scan in an observation hit within 2 m ``(n, 2)`` [m], in the body frame; empty without one.
 
     Raises
     ------
@@ -103,7 +95,7 @@ def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig, *, wi
             f"the scan has shape {share.shape}, the agent's lidar {lidar.beams} beams: "
             "give agents.make the environment's lidar"
         )
-    return _hits(share, _directions(lidar), lidar.offset_m, lidar.range_min_m, lidar.range_max_m, within_m)
+    return _hits(share, _directions(lidar), lidar.offset_m, lidar.range_min_m, lidar.range_max_m)
 
 
 @lru_cache(maxsize=16)
@@ -114,15 +106,13 @@ def _directions(lidar: LidarConfig) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _hits(
-    share: Array, directions: Array, offset_m: float, range_min_m: float, range_max_m: float, within_m: float
-) -> Array:
+def _hits(share: Array, directions: Array, offset_m: float, range_min_m: float, range_max_m: float) -> Array:
     points = np.empty((len(share), 2))
     count = 0
     for i in range(len(share)):
         reach = share[i] * range_max_m
         # Nothing returned at 1; a return below the least range is no return (NaN compares false).
-        if share[i] < 1.0 and reach > range_min_m and reach < within_m:
+        if share[i] < 1.0 and reach > range_min_m and reach < _SCAN_WITHIN_M:
             points[count, 0] = offset_m + reach * directions[i, 0]
             points[count, 1] = reach * directions[i, 1]
             count += 1
@@ -186,8 +176,8 @@ def body_gaps(
     last = 0.0
     heading = pose[2]
     cos_b, sin_b = math.cos(heading), math.sin(heading)
-    for k in range(POSES):
-        t = total * k / (POSES - 1)
+    for k in range(_POSES):
+        t = total * k / (_POSES - 1)
         # Distance covered so far, as seconds at the full twist: uniform braking after the hold.
         late = max(t - lag, 0.0)
         held = min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0)
@@ -230,11 +220,3 @@ def clearance_at(near: LocalMap, x: float, y: float) -> float:
     low = field[row, col] * (1.0 - fu) + field[row, next_c] * fu
     high = field[next_r, col] * (1.0 - fu) + field[next_r, next_c] * fu
     return float(low * (1.0 - fv) + high * fv)
-
-
-@njit(cache=True, nogil=True)
-def _clearances(near: LocalMap, points: Array) -> Array:
-    out = np.empty(len(points))
-    for i in range(len(points)):
-        out[i] = clearance_at(near, points[i, 0], points[i, 1])
-    return out

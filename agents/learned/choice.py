@@ -22,9 +22,9 @@ from agents.ways.travel import between
 from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
-from slam.settings import require
+from slam.settings import positive
 
-__all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "TOUR_LOSS_M", "Choice", "ChoiceConfig", "describe", "mirrored"]
+__all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -42,8 +42,7 @@ CANDIDATE = (
 SIDEWAYS = [CANDIDATE.index(name) for name in ("left", "target_left", "normal_left")]
 """Of these, those that change their sign in a mirror."""
 
-TOUR_LOSS_M = 5.0
-"""One unit of the column ``tour_loss`` [weighted m]."""
+_TOUR_LOSS_M = 5.0  # one unit of the column tour_loss [weighted m]
 
 STATE = ("time", "known_m2", "candidates", "sigma_m", "sigma_rad", "share_visited", "area_m2", "nearest")
 """What there is to say about the choice as a whole."""
@@ -64,10 +63,7 @@ class ChoiceConfig:
     uncertainty: bool = True  # covariance and landmarks are shown; else 0 stands in their columns
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            good = f.name == "uncertainty" or (math.isfinite(value) and value > 0)
-            require(good, f"ChoiceConfig.{f.name} must be > 0, got {value}")
+        positive(self, *(f.name for f in fields(self) if f.name != "uncertainty"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +178,7 @@ def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Ar
         if i is not None:
             losses[c] = plan.losses_m[i]
             when[c] = position.get(i, len(plan.order))
-    return (when == 0.0).astype(np.float64), when / 10.0, losses / TOUR_LOSS_M
+    return (when == 0.0).astype(np.float64), when / 10.0, losses / _TOUR_LOSS_M
 
 
 def _sigmas(cov: Array) -> tuple[float, float]:

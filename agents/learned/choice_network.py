@@ -9,52 +9,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.learned.choice import Choice, mirrored
+from agents.learned.layers import Layers
 
 __all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
 
 Floats = NDArray[np.float32]
 
 
-class ChoiceNetwork:
-    """``training.learning.networks.ChoiceNetwork``, forward only.
+class ChoiceNetwork(Layers):
+    """``training.learning.networks.ChoiceNetwork``, what it scores only.
 
     Parameters
     ----------
     weights : mapping
-        Name to array, as PyTorch names them.
+        As for :class:`agents.learned.layers.Layers`.
     heads : int
         Of the attention.
-
-    Raises
-    ------
-    ValueError
-        Where a weight is missing or has another shape than the others ask for.
     """
 
     def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
-        self._weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
         self._heads = heads
         self._layers = len({name.split(".")[1] for name in weights if name.startswith("layers.")})
-        self._check()
+        super().__init__(weights)
 
     def scores(self, choice: Choice) -> Floats:
         """Return the score of each candidate ``(m,)``; the policy takes the highest."""
-        tokens = self._tokens(choice)
-        return np.asarray(self._linear("score", tokens)[:, 0])
-
-    def value(self, choice: Choice) -> float:
-        """Return what the choice as a whole is worth."""
-        tokens = self._tokens(choice)
-        summary = np.concatenate([tokens.mean(axis=0), tokens.max(axis=0)])
-        return float(self._linear("value_2", np.maximum(self._linear("value_1", summary), 0.0))[0])
-
-    def _tokens(self, choice: Choice) -> Floats:
         patches = choice.patches.reshape(len(choice.patches), -1).astype(np.float32) / np.float32(255.0)
         x = (
             self._linear("row", choice.candidates)
@@ -64,7 +48,7 @@ class ChoiceNetwork:
         x = self._linear("token", np.maximum(x, 0.0))
         for k in range(self._layers):
             x = self._attend(f"layers.{k}.", x, choice.distances)
-        return self._normal("norm", x)
+        return np.asarray(self._linear("score", self._normal("norm", x))[:, 0])
 
     def _attend(self, layer: str, x: Floats, distances: Floats) -> Floats:
         m, width = x.shape
@@ -79,34 +63,23 @@ class ChoiceNetwork:
         up = np.maximum(self._linear(layer + "up", self._normal(layer + "norm_2", x)), 0.0)
         return np.asarray(x + self._linear(layer + "down", up))
 
-    def _linear(self, name: str, x: Floats) -> Floats:
-        return np.asarray(x @ self._weights[name + ".weight"].T + self._weights[name + ".bias"])
-
     def _normal(self, name: str, x: Floats) -> Floats:
         centred = x - x.mean(axis=-1, keepdims=True)
         scale = np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(1e-5))
         return np.asarray(centred / scale * self._weights[name + ".weight"] + self._weights[name + ".bias"])
 
     def _check(self) -> None:
-        try:
-            width = len(self._weights["norm.bias"])
-            wanted: dict[str, tuple[int, ...]] = {
-                "patch_2.weight": (width, 2 * width), "token.weight": (width, width), "norm.weight": (width,),
-                "score.weight": (1, width),
-                "score.bias": (1,), "value_1.weight": (width, 2 * width), "value_2.weight": (1, width),
-            }  # fmt: skip
-            for k in range(self._layers):
-                wanted |= {
-                    f"layers.{k}.qkv.weight": (3 * width, width), f"layers.{k}.out.weight": (width, width),
-                    f"layers.{k}.up.weight": (2 * width, width), f"layers.{k}.down.weight": (width, 2 * width),
-                    f"layers.{k}.reach": (self._heads,),
-                }  # fmt: skip
-            for name, shape in wanted.items():
-                found: Any = self._weights[name].shape
-                if found != shape:
-                    raise ValueError(f"weight {name} has the shape {found}, expected {shape}")
-        except KeyError as error:
-            raise ValueError(f"weight {error.args[0]} is missing") from error
+        width = len(self._weights["norm.bias"])
+        self._expect({
+            "patch_2.weight": (width, 2 * width), "token.weight": (width, width), "norm.weight": (width,),
+            "score.weight": (1, width), "score.bias": (1,),
+        })  # fmt: skip
+        for k in range(self._layers):
+            self._expect({
+                f"layers.{k}.qkv.weight": (3 * width, width), f"layers.{k}.out.weight": (width, width),
+                f"layers.{k}.up.weight": (2 * width, width), f"layers.{k}.down.weight": (width, 2 * width),
+                f"layers.{k}.reach": (self._heads,),
+            })  # fmt: skip
 
 
 class ChoiceEnsemble:
@@ -121,11 +94,6 @@ class ChoiceEnsemble:
         ``members.0.`` and so on before the names of each network's own; or those of a single one.
     heads : int
         Of the attention.
-
-    Raises
-    ------
-    ValueError
-        As for :class:`ChoiceNetwork`.
     """
 
     def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig
-from agents.driving.grip import WheelWatch
+from agents.driving.grip import WheelWatch, eased
 from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
-from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import positive, require
 
 __all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
 
@@ -32,23 +30,13 @@ class SlipConfig:
     slippery_share: float = 0.02  # … from here on it is driven as gently as it can be
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"SlipConfig.{f.name} must be > 0, got {value}")
+        positive(self)
         require(self.firm_share < self.slippery_share, "SlipConfig needs firm_share < slippery_share")
 
     def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
         """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
         slippery = float(np.interp(share, [self.firm_share, self.slippery_share], [0.0, 1.0]))
-
-        def between(value: float, gentle: float) -> float:
-            return value + slippery * (min(value, gentle) - value)
-
-        return replace(
-            usual,
-            acceleration_m_s2=between(usual.acceleration_m_s2, self.acceleration_m_s2),
-            lateral_m_s2=between(usual.lateral_m_s2, self.lateral_m_s2),
-        )
+        return eased(usual, slippery, acceleration_m_s2=self.acceleration_m_s2, lateral_m_s2=self.lateral_m_s2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +58,7 @@ class Chooser(Tour):
     """
 
     config: ChooserConfig
-
-    def __init__(
-        self,
-        config: ChooserConfig | Mapping[str, Any] | None = None,
-        *,
-        robot: RobotConfig | Mapping[str, Any] | str | None = None,
-        lidar: LidarConfig | Mapping[str, Any] | str | None = None,
-        step_s: float = 0.1,
-    ) -> None:
-        super().__init__(from_mapping(ChooserConfig, config), robot=robot, lidar=lidar, step_s=step_s)
+    config_type = ChooserConfig
 
     def _forget(self) -> None:
         super()._forget()

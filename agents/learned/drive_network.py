@@ -15,25 +15,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.learned.convolution import convolve
 from agents.learned.drive_plan import descend, distances, node_prices
+from agents.learned.layers import Layers
 
 __all__ = [
-    "BEAMS",
-    "NUMBERS",
-    "PATH_POINTS",
-    "RANGE_M",
-    "SECTORS",
-    "DriveNetwork",
-    "Inputs",
-    "Plan",
-    "PlanSettings",
-    "control",
-    "landmark_rows",
-    "numbers",
-    "pixel_size",
-    "plan",
-    "sectors",
+    "BEAMS", "LOG_PRICES", "NUMBERS", "RANGE_M", "SECTORS", "STEP_LENGTHS", "DriveNetwork", "Inputs", "Plan",
+    "PlanSettings", "pixel_size", "sectors",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -59,7 +46,6 @@ class PlanSettings(NamedTuple):
     """Numbers of the planning layer that are learned, or set, with the network."""
 
     goal_m: float = 3.0  # what a goal costs per nat of doubt [m]
-    goal_bias: float = 0.0  # log odds at which doubt begins
     turn_m: float = 0.4  # what lies behind costs more by up to twice this [m]: no dithering between two ways
 
 
@@ -71,15 +57,6 @@ class Plan(NamedTuple):
     prices: Floats  # (PATH_POINTS,) log price of a metre at each of the resampled points
     points: Floats  # (PATH_POINTS, 2) the path resampled [m]
     length: float  # of the path within the local map [m]
-
-
-def stack(weights: Mapping[str, Floats], name: str, maps: Bytes) -> Floats:
-    """Return what a stack of convolutions makes of a map ``(3, n, m)``."""
-    x = maps.astype(np.float32) / np.float32(128.0) - np.float32(1.0)
-    for layer, dilation in ((0, 1), (2, 1), (4, 2)):
-        x = convolve(x, weights[f"{name}.{layer}.weight"], weights[f"{name}.{layer}.bias"], dilation)
-        np.maximum(x, 0.0, out=x)
-    return convolve(x, weights[f"{name}.6.weight"], weights[f"{name}.6.bias"])
 
 
 @njit(cache=True, nogil=True)
@@ -127,30 +104,6 @@ def _ends(goal: Floats, far: Floats, pose: Floats, pixel: float, turn_m: float) 
     return out
 
 
-def plan(weights: Mapping[str, Floats], observation: Mapping[str, Any], settings: PlanSettings) -> Plan:
-    """Return the way that the planning layer finds on what the convolutions make of the maps."""
-    near, far = stack(weights, "local", observation["map_local"]), observation["map_global"]
-    pose = observation["pose"]
-    pixel = pixel_size(observation["map_local"], far, pose)
-    used = _used(far[1])
-    said = stack(weights, "overview", far[:, used[0], used[1]])
-    prices = np.float32(pixel) * STEP_LENGTHS * np.exp(np.clip(said[:4], *LOG_PRICES))
-    onwards = np.full((SIZE, SIZE), _FAR)
-    onwards[used] = distances(prices, _doubt(said[4], settings))[0]
-    ends = _ends(_doubt(near[1], settings), onwards, pose, pixel, settings.turn_m)
-    price = np.clip(near[0], 0.0, 3.5)
-    best, parent = distances(node_prices(np.exp(price), CELL_M), ends)
-    start = min(((i, j) for i in (31, 32) for j in (31, 32)), key=lambda p: best[p])
-    way = descend(parent, *start)
-    path = _smooth(np.asarray((0.5 * SIZE - 0.5 - way) * CELL_M, dtype=np.float64))
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    at = np.minimum(np.arange(1, PATH_POINTS + 1) * PATH_STEP_M, arc[-1])
-    points = np.stack([np.interp(at, arc, path[:, k]) for k in (0, 1)], axis=1)
-    cells = np.clip(np.round(0.5 * SIZE - 0.5 - points / CELL_M).astype(np.int64), 0, SIZE - 1)
-    along = price[cells[:, 0], cells[:, 1]]
-    return Plan(path, float(best[start]), along, points.astype(np.float32), float(arc[-1]))
-
-
 def _used(known: Bytes) -> tuple[slice, slice]:
     """Return the rows and columns of a map that anything is known in, and a margin that convolutions look into."""
     rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
@@ -159,12 +112,6 @@ def _used(known: Bytes) -> tuple[slice, slice]:
     return (
         slice(max(int(rows[0]) - _MARGIN, 0), int(rows[-1]) + _MARGIN + 1),
         slice(max(int(cols[0]) - _MARGIN, 0), int(cols[-1]) + _MARGIN + 1),
-    )
-
-
-def _doubt(logit: Floats, settings: PlanSettings) -> Floats:
-    return np.asarray(
-        np.float32(settings.goal_m) * np.logaddexp(np.float32(0.0), np.float32(settings.goal_bias) - logit)
     )
 
 
@@ -189,131 +136,126 @@ _NEAR_SHARE = 0.08  # of the scan's range: what is nearer than this matters
 _LEAST = 1e-12  # below any variance that a belief has
 
 
-def numbers(observation: Mapping[str, Any], way: Plan, *, uncertainty: bool = True) -> Floats:
-    """Return the way and the other numbers of an observation ``(NUMBERS,)``, scaled to about 1."""
-    out = np.empty(NUMBERS, np.float32)
-    k = 2 * PATH_POINTS
-    out[:k] = 0.5 * way.points.ravel()
-    out[k : k + PATH_POINTS] = way.prices / 3.5
-    k += PATH_POINTS
-    out[k : k + 2] = min(way.length, 3.0) / 3.0, min(way.cost, 20.0) / 20.0
-    out[k + 2 : k + 5] = observation["twist"]
-    out[k + 5 : k + 7] = observation["progress"]
-    variances = np.log10(np.maximum(observation["pose_cov"][[0, 3, 5]], _LEAST))
-    out[k + 7 : k + 10] = variances / 4.0 + 1.0 if uncertainty else 0.0
-    return out
-
-
 def sectors(scan: Floats) -> Floats:
     """Return how near the nearest return in each direction is ``(…, SECTORS)``: 1 at the sensor, 0 far away."""
     nearest = np.asarray(scan, np.float32).reshape(*scan.shape[:-1], SECTORS, -1).min(axis=-1)
     return np.asarray(np.exp(nearest / np.float32(-_NEAR_SHARE)))
 
 
-def landmark_rows(rows: Floats, *, uncertainty: bool = True) -> Floats:
-    """Return the landmarks scaled ``(…, n, 5)``: x, y, two variances' logarithms, whether there is one."""
-    out = np.empty((*rows.shape[:-1], 5), np.float32)
-    out[..., :2] = rows[..., :2] / 8.0
-    out[..., 2:4] = np.log10(np.maximum(rows[..., [2, 4]], _LEAST)) / 4.0 + 1.0
-    out[..., 4] = rows[..., 5]
-    out *= rows[..., 5:] if uncertainty else 0.0
-    return out
-
-
-def control(weights: Mapping[str, Floats], scan: Floats, landmarks: Floats, rest: Floats) -> Floats:
-    """Return the twist ``(3,)`` as fractions of the limits, before it is cut off at ±1."""
-    x = scan[None]
-    for layer in (0, 2):
-        x = np.maximum(_around(x, weights[f"scan.{layer}.weight"], weights[f"scan.{layer}.bias"]), 0.0)
-    each = np.maximum(_linear(weights, "landmark.0", landmarks), 0.0)
-    each = _linear(weights, "landmark.2", each) * landmarks[:, 4:] + (landmarks[:, 4:] - 1.0) * 1e3
-    x = np.concatenate([x.ravel(), np.maximum(each.max(axis=0), 0.0), rest])
-    for layer in (0, 2):
-        x = np.maximum(_linear(weights, f"head.{layer}", x), 0.0)
-    return _linear(weights, "head.4", x)
-
-
-def _around(x: Floats, weight: Floats, bias: Floats) -> Floats:
-    """Return the convolution around the circle with stride 2 ``(out, n / 2)`` of ``(in, n)``."""
-    out, channels, k = weight.shape
-    n = x.shape[1]
-    index = (np.arange(0, n, 2)[None] + np.arange(k)[:, None] - k // 2) % n
-    view = x[:, index].reshape(channels * k, -1)
-    return np.asarray(weight.reshape(out, -1) @ view + bias[:, None])
-
-
-def _linear(weights: Mapping[str, Floats], name: str, x: Floats) -> Floats:
-    return np.asarray(x @ weights[name + ".weight"].T + weights[name + ".bias"])
-
-
 class Inputs(NamedTuple):
-    """What the control network is given."""
+    """What the control network is given, scaled to about 1."""
 
     scan: Floats  # (SECTORS,)
-    landmarks: Floats  # (n, 5)
-    numbers: Floats  # (NUMBERS,)
+    landmarks: Floats  # (n, 5) x, y, two variances' logarithms, whether there is one
+    numbers: Floats  # (NUMBERS,) the way, and the other numbers of the observation
 
 
-class DriveNetwork:
+class DriveNetwork(Layers):
     """Observation in, twist out.
 
     Parameters
     ----------
     weights : mapping
-        Name to array, as PyTorch names them.
+        As for :class:`agents.learned.layers.Layers`.
     settings : PlanSettings
         Of the planning layer.
     uncertainty : bool
         Whether the belief's covariance and its landmarks are looked at; without, for an ablation.
-
-    Raises
-    ------
-    ValueError
-        Where a weight is missing or has another shape than the others ask for.
     """
 
     def __init__(
         self, weights: Mapping[str, Floats], settings: PlanSettings | None = None, *, uncertainty: bool = True
     ) -> None:
-        self._weights = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in weights.items()}
         self._settings, self._uncertainty = settings or PlanSettings(), uncertainty
-        self._check()
+        super().__init__(weights)
 
     def plan(self, observation: Mapping[str, Any]) -> Plan:
-        """Return the way that the planning layer finds."""
-        return plan(self._weights, observation, self._settings)
+        """Return the way that the planning layer finds on what the convolutions make of the maps."""
+        near, far = self.of_map("local", observation["map_local"]), observation["map_global"]
+        pose, turn_m = observation["pose"], self._settings.turn_m
+        pixel = pixel_size(observation["map_local"], far, pose)
+        used = _used(far[1])
+        said = self.of_map("overview", far[:, used[0], used[1]])
+        prices = np.float32(pixel) * STEP_LENGTHS * np.exp(np.clip(said[:4], *LOG_PRICES))
+        onwards = np.full((SIZE, SIZE), _FAR)
+        onwards[used] = distances(prices, self._doubt(said[4]))[0]
+        ends = _ends(self._doubt(near[1]), onwards, pose, pixel, turn_m)
+        price = np.clip(near[0], 0.0, 3.5)
+        best, parent = distances(node_prices(np.exp(price), CELL_M), ends)
+        start = min(((i, j) for i in (31, 32) for j in (31, 32)), key=lambda p: best[p])
+        way = descend(parent, *start)
+        path = _smooth(np.asarray((0.5 * SIZE - 0.5 - way) * CELL_M, dtype=np.float64))
+        arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+        at = np.minimum(np.arange(1, PATH_POINTS + 1) * PATH_STEP_M, arc[-1])
+        points = np.stack([np.interp(at, arc, path[:, k]) for k in (0, 1)], axis=1)
+        cells = np.clip(np.round(0.5 * SIZE - 0.5 - points / CELL_M).astype(np.int64), 0, SIZE - 1)
+        along = price[cells[:, 0], cells[:, 1]]
+        return Plan(path, float(best[start]), along, points.astype(np.float32), float(arc[-1]))
+
+    def of_map(self, name: str, maps: Bytes) -> Floats:
+        """Return what a stack of convolutions, ``local`` or ``overview``, makes of a map ``(3, n, m)``."""
+        x = maps.astype(np.float32) / np.float32(128.0) - np.float32(1.0)
+        for layer, dilation in ((0, 1), (2, 1), (4, 2)):
+            x = self._convolved(f"{name}.{layer}", x, dilation)
+            np.maximum(x, 0.0, out=x)
+        return self._convolved(f"{name}.6", x)
+
+    def _doubt(self, logit: Floats) -> Floats:
+        return np.asarray(np.float32(self._settings.goal_m) * np.logaddexp(np.float32(0.0), -logit))
 
     def inputs(self, observation: Mapping[str, Any], way: Plan) -> Inputs:
         """Return what the control network is given."""
-        return Inputs(
-            sectors(observation["scan"]),
-            landmark_rows(observation["landmarks"], uncertainty=self._uncertainty),
-            numbers(observation, way, uncertainty=self._uncertainty),
-        )
+        rows = observation["landmarks"]
+        landmarks = np.empty((len(rows), 5), np.float32)
+        landmarks[:, :2] = rows[:, :2] / 8.0
+        landmarks[:, 2:4] = np.log10(np.maximum(rows[:, [2, 4]], _LEAST)) / 4.0 + 1.0
+        landmarks[:, 4] = rows[:, 5]
+        landmarks *= rows[:, 5:] if self._uncertainty else 0.0
+        variances = np.log10(np.maximum(observation["pose_cov"][[0, 3, 5]], _LEAST)) / 4.0 + 1.0
+        numbers = [
+            0.5 * way.points.ravel(), way.prices / 3.5, [min(way.length, 3.0) / 3.0, min(way.cost, 20.0) / 20.0],
+            observation["twist"], observation["progress"], variances if self._uncertainty else np.zeros(3),
+        ]  # fmt: skip
+        return Inputs(sectors(observation["scan"]), landmarks, np.concatenate(numbers, dtype=np.float32))
 
     def twist(self, inputs: Inputs) -> Floats:
         """Return the action ``(3,)``."""
-        return np.clip(control(self._weights, *inputs), -1.0, 1.0).astype(np.float32)
+        return np.clip(self.control(inputs), -1.0, 1.0).astype(np.float32)
+
+    def control(self, inputs: Inputs) -> Floats:
+        """Return the twist ``(3,)`` as fractions of the limits, before it is cut off at ±1."""
+        scan, landmarks, rest = inputs
+        x = scan[None]
+        for layer in (0, 2):
+            x = np.maximum(self._around(f"scan.{layer}", x), 0.0)
+        each = np.maximum(self._linear("landmark.0", landmarks), 0.0)
+        each = self._linear("landmark.2", each) * landmarks[:, 4:] + (landmarks[:, 4:] - 1.0) * 1e3
+        x = np.concatenate([x.ravel(), np.maximum(each.max(axis=0), 0.0), rest])
+        for layer in (0, 2):
+            x = np.maximum(self._linear(f"head.{layer}", x), 0.0)
+        return self._linear("head.4", x)
+
+    def _around(self, name: str, x: Floats) -> Floats:
+        """Return the convolution around the circle with stride 2 ``(out, n / 2)`` of ``(in, n)``."""
+        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
+        out, channels, k = weight.shape
+        n = x.shape[1]
+        index = (np.arange(0, n, 2)[None] + np.arange(k)[:, None] - k // 2) % n
+        view = x[:, index].reshape(channels * k, -1)
+        return np.asarray(weight.reshape(out, -1) @ view + bias[:, None])
 
     def _check(self) -> None:
-        try:
-            width, hidden = len(self._weights["local.0.bias"]), len(self._weights["head.0.bias"])
-            summary = 16 * SECTORS // 4 + 16 + NUMBERS
-            wanted: dict[str, tuple[int, ...]] = {
-                "scan.0.weight": (8, 1, 5), "scan.2.weight": (16, 8, 5), "landmark.0.weight": (16, 5),
-                "landmark.2.weight": (16, 16), "head.0.weight": (hidden, summary),
-                "head.2.weight": (hidden, hidden), "head.4.weight": (3, hidden),
+        width, hidden = len(self._weights["local.0.bias"]), len(self._weights["head.0.bias"])
+        summary = 16 * SECTORS // 4 + 16 + NUMBERS
+        wanted: dict[str, tuple[int, ...]] = {
+            "scan.0.weight": (8, 1, 5), "scan.2.weight": (16, 8, 5), "landmark.0.weight": (16, 5),
+            "landmark.2.weight": (16, 16), "head.0.weight": (hidden, summary),
+            "head.2.weight": (hidden, hidden), "head.4.weight": (3, hidden),
+        }  # fmt: skip
+        for name, out in (("local", 2), ("overview", 5)):
+            wanted |= {
+                f"{name}.0.weight": (width, 3, 5, 5), f"{name}.2.weight": (width, width, 3, 3),
+                f"{name}.4.weight": (width, width, 3, 3), f"{name}.6.weight": (out, width, 1, 1),
             }  # fmt: skip
-            for name, out in (("local", 2), ("overview", 5)):
-                wanted |= {
-                    f"{name}.0.weight": (width, 3, 5, 5), f"{name}.2.weight": (width, width, 3, 3),
-                    f"{name}.4.weight": (width, width, 3, 3), f"{name}.6.weight": (out, width, 1, 1),
-                }  # fmt: skip
-            for name, shape in list(wanted.items()):
-                wanted[name.replace("weight", "bias")] = shape[:1]
-            for name, shape in wanted.items():
-                found: Any = self._weights[name].shape
-                if found != shape:
-                    raise ValueError(f"weight {name} has the shape {found}, expected {shape}")
-        except KeyError as error:
-            raise ValueError(f"weight {error.args[0]} is missing") from error
+        self._expect(wanted)
+        self._expect({name.replace("weight", "bias"): shape[:1] for name, shape in wanted.items()})

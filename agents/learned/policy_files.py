@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load_file
+from safetensors.numpy import load_file, save
 
-__all__ = ["policy_format", "read_policy"]
+from slam.formats import atomic_write
+
+__all__ = ["policy_format", "read_policy", "write_policy"]
+
+Made = TypeVar("Made")
 
 
 def policy_format(path: Path) -> str:
@@ -22,6 +27,43 @@ def policy_format(path: Path) -> str:
     ValueError
         Where one of the two files is missing, or the JSON file cannot be read.
     """
+    return str(_described(path).get("format"))
+
+
+def read_policy(
+    path: Path, wanted: str, make: Callable[[dict[str, NDArray[np.float32]], dict[str, Any]], Made]
+) -> tuple[Made, dict[str, Any]]:
+    """Return what ``make`` makes of a policy's weights and of what the JSON file says, and the latter.
+
+    Neither file can run code.
+
+    Raises
+    ------
+    ValueError
+        For a missing or damaged file, or one of another format than ``wanted``; the message names it.
+    """
+    described = _described(path)
+    try:
+        weights = load_file(path)
+    except (OSError, SafetensorError) as error:
+        raise ValueError(f"policy {path} cannot be read: {error}") from error
+    if described.get("format") != wanted:
+        raise ValueError(f"policy {path.with_suffix('.json')}: format is not {wanted!r}")
+    try:
+        return make(weights, described), described
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path}: {error}") from error
+
+
+def write_policy(path: Path, weights: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> None:
+    """Write a policy's weights, in half precision, and the JSON file beside them."""
+    # Safetensors writes memory as it lies, whatever its order.
+    halved = {name: np.asarray(value, dtype=np.float16, order="C") for name, value in weights.items()}
+    atomic_write(path, save(halved))
+    atomic_write(path.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
+
+
+def _described(path: Path) -> dict[str, Any]:
     about = path.with_suffix(".json")
     for file in (path, about):
         if not file.is_file():
@@ -30,25 +72,4 @@ def policy_format(path: Path) -> str:
         described = json.loads(about.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ValueError(f"policy {path} cannot be read: {error}") from error
-    return str(described.get("format")) if isinstance(described, dict) else ""
-
-
-def read_policy(path: Path, wanted: str) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
-    """Return a policy's weights, and what the JSON file beside them says; neither file can run code.
-
-    Raises
-    ------
-    ValueError
-        For a missing or damaged file, or one of another format than ``wanted``; the message names it.
-    """
-    about = path.with_suffix(".json")
-    try:
-        described = json.loads(about.read_text(encoding="utf-8"))
-        weights = load_file(path)
-    except FileNotFoundError as error:
-        raise ValueError(f"policy {path}: {error.filename or path} is missing; both files are needed") from error
-    except (OSError, ValueError, SafetensorError) as error:
-        raise ValueError(f"policy {path} cannot be read: {error}") from error
-    if not isinstance(described, dict) or described.get("format") != wanted:
-        raise ValueError(f"policy {about}: format is not {wanted!r}")
-    return weights, described
+    return described if isinstance(described, dict) else {}

@@ -7,14 +7,13 @@ is in ``training/dungeons/networks.py``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.learned.convolution import convolve
+from agents.learned.layers import Layers
 from agents.stations.survey import STRIDE, Openings, Survey
 from slam.grids.occupancy import FREE, UNKNOWN
 
@@ -139,28 +138,13 @@ def opening_numbers(losses_m: Array | Floats, legs_m: Array | Floats) -> Floats:
     return np.stack(columns, axis=-1).astype(np.float32)
 
 
-class StationNetwork:
-    """``training.dungeons.networks.StationNetwork``, forward only.
+class StationNetwork(Layers):
+    """``training.dungeons.networks.StationNetwork``, forward only."""
 
-    Parameters
-    ----------
-    weights : mapping
-        Name to array, as PyTorch names them.
-
-    Raises
-    ------
-    ValueError
-        Where a weight is missing, or does not fit the picture.
-    """
-
-    def __init__(self, weights: Mapping[str, NDArray[np.floating]]) -> None:
-        self._weights = {name: np.asarray(value, dtype=np.float32, order="C") for name, value in weights.items()}
-        try:
-            blank = Picture(np.zeros((PLANES, SIDE, SIDE), np.float32), np.zeros(2, np.int64))
-            nothing = Openings(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
-            self.costs_m(blank, np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), nothing)
-        except KeyError as error:
-            raise ValueError(f"weight {error.args[0]} is missing") from error
+    def _check(self) -> None:
+        blank = Picture(np.zeros((PLANES, SIDE, SIDE), np.float32), np.zeros(2, np.int64))
+        nothing = Openings(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
+        self.costs_m(blank, np.zeros((1, 2), np.int64), np.zeros((1, 2), np.int64), nothing)
 
     def costs_m(self, shown: Picture, targets: Cells, hops: Cells, openings: Openings) -> Array:
         """Return what each opening ``(c,)`` is expected to cost [m], but for what all of them cost alike.
@@ -188,12 +172,6 @@ class StationNetwork:
         skip = self._convolved(f"{name}.skip", x) if f"{name}.skip.weight" in self._weights else x
         inner = np.maximum(self._convolved(f"{name}.first", x), 0.0)
         return np.asarray(np.maximum(skip + self._convolved(f"{name}.second", inner), 0.0))
-
-    def _convolved(self, name: str, x: Floats) -> Floats:
-        return convolve(x, self._weights[f"{name}.weight"], self._weights[f"{name}.bias"])
-
-    def _linear(self, name: str, x: Floats) -> Floats:
-        return np.asarray(x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"])
 
 
 def _halved(x: Floats) -> Floats:

@@ -5,19 +5,18 @@ Shared by the agents that choose among stations with :mod:`agents.stations.surve
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Goal
+from agents.base import Agent, Goal
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive, require
 
-__all__ = ["StationRound", "StationStop", "StationsConfig"]
+__all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
 Array = NDArray[np.float64]
 Cell = tuple[int, int]
@@ -32,9 +31,9 @@ class StationsConfig:
     reach_m: float = 12.0  # from which a piece of frontier is looked at
 
     def __post_init__(self) -> None:
-        require(math.isfinite(self.spacing_m) and self.spacing_m >= 0, "StationsConfig.spacing_m must be ≥ 0")
+        not_negative(self, "spacing_m")
         require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
-        require(math.isfinite(self.reach_m) and self.reach_m > 0, "StationsConfig.reach_m must be > 0")
+        positive(self, "reach_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,48 +66,45 @@ class StationStop:
         return np.asarray((cells[..., ::-1] + np.array(self.corner[::-1]) + 0.5) * self.resolution)
 
 
-class StationRound:
-    """A robot's round over the stations of a lattice, in the course of an episode.
+class StationAgent(Agent):
+    """What agents share that may hop over the lattice ``config.stations``: where they began, and have looked."""
 
-    Parameters
-    ----------
-    belief
-        At the start, which is a station.
-    config
-        The lattice.
-    """
+    _began_at: Array = np.zeros(2)  # [m], a station
+    _looked_at: tuple[Array, ...] = ()  # [m]
 
-    def __init__(self, belief: Belief, config: StationsConfig) -> None:
-        self._config = config
-        self._start = np.array(belief.pose[:2], dtype=np.float64)
-        self._looked_from: list[Array] = []
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; where the robot is now is a station, if there are any."""
+        super().reset(belief, seed)
+        self._began_at, self._looked_at = np.array(belief.pose[:2], dtype=np.float64), ()
 
     def looked(self, belief: Belief) -> None:
         """Take note that the sensor looked from the belief's pose."""
-        self._looked_from.append(np.array(belief.pose[:2], dtype=np.float64))
+        super().looked(belief)
+        self._looked_at += (np.array(belief.pose[:2], dtype=np.float64),)
 
-    def stop(self, belief: Belief) -> StationStop | None:
-        """Return what there is to do, ``None`` where the robot stands on no station.
+    def _stop(self, belief: Belief) -> StationStop | None:
+        """Return what there is to do, ``None`` where there is nothing or the robot stands on no station.
 
         Only lattices of :data:`agents.stations.survey.STRIDE` cells of the grid, and hops of
         :data:`agents.stations.survey.HOP` stations, are known here.
         """
+        stations: StationsConfig = self.config.stations
         resolution = belief.grid.resolution
-        if round(self._config.spacing_m / resolution) != STRIDE or self._config.hop != HOP:
+        if round(stations.spacing_m / resolution) != STRIDE or stations.hop != HOP:
             return None
         known, corner = _aligned(belief)
-        robot, first = (_cell_of(at, resolution, corner) for at in (belief.pose, self._start))
+        robot, first = (_cell_of(at, resolution, corner) for at in (belief.pose, self._began_at))
         if not _is_free(known, robot) or any((robot[k] - first[k]) % STRIDE for k in (0, 1)):
             return None
         visited = np.zeros(known.shape, dtype=np.bool_)
-        for position in self._looked_from:
+        for position in self._looked_at:
             cell = _cell_of(position, resolution, corner)
             if _is_free(known, cell):
                 visited[cell] = True
         pieces = no_pieces(known.shape)
         find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-        found = survey(known, pieces, visited, first, robot, resolution, self._config.reach_m / resolution)
-        return StationStop(known, visited, corner, first, robot, resolution, found)
+        found = survey(known, pieces, visited, first, robot, resolution, stations.reach_m / resolution)
+        return StationStop(known, visited, corner, first, robot, resolution, found) if found.worth.any() else None
 
 
 def _aligned(belief: Belief) -> tuple[NDArray[np.int8], Cell]:
@@ -133,7 +129,4 @@ def _is_free(known: NDArray[np.int8], cell: Cell) -> bool:
 
 
 def _cell_of(pose: NDArray[np.float64], resolution: float, corner: Cell) -> Cell:
-    return (
-        int(np.floor(pose[1] / resolution)) - corner[0],
-        int(np.floor(pose[0] / resolution)) - corner[1],
-    )
+    return (int(np.floor(pose[1] / resolution)) - corner[0], int(np.floor(pose[0] / resolution)) - corner[1])

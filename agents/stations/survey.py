@@ -113,10 +113,7 @@ def _unknown_around(known: Classes, row: int, col: int) -> int:
 def _listed(pieces: Cells, cols: int) -> Cells:
     flat = pieces.ravel()
     flat = flat[flat >= 0]
-    out = np.empty((len(flat), 2), np.int64)
-    for k in range(len(flat)):
-        out[k, 0], out[k, 1] = flat[k] // cols, flat[k] % cols
-    return out
+    return np.column_stack((flat // cols, flat % cols))
 
 
 @njit(cache=True, nogil=True)

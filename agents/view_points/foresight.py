@@ -30,7 +30,7 @@ from slam.gaussian.stacked_update import whiten, work_space
 from slam.gaussian.tiles import downdate
 from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, predict_robot, twist_between
-from slam.settings import require
+from slam.settings import positive
 from slam.types import LINE
 
 __all__ = [
@@ -61,10 +61,7 @@ class ForesightConfig:
     sensor: SensorModel = field(default_factory=SensorModel)
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if f.name != "sensor":
-                require(math.isfinite(value) and value > 0, f"ForesightConfig.{f.name} must be > 0, got {value}")
+        positive(self, *(f.name for f in fields(self) if f.name != "sensor"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +143,6 @@ class Foresight:
         """Return what is left of the uncertainty at the end of a path ``(n, 2)`` [m] from the robot's place."""
         poses, times = self.legs(marks.x[:3], path)
         return self.through(marks, cost_map, poses, times)
-
-    def standing(self, marks: Marks, cost_map: CostMap, time_s: float) -> Foreseen:
-        """Return the same for looking on from here for so long."""
-        return self.through(marks, cost_map, marks.x[None, :3], np.array([time_s]))
 
     def legs(self, pose: Array, path: Array) -> tuple[Array, Array]:
         """Return the poses ``(k, 3)`` at the ends of a path's legs, the start's first, and the legs' times [s]."""

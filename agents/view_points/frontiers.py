@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
 
@@ -36,27 +35,13 @@ class FrontierConfig:
     beyond_m: float = 0.3  # how far behind the frontier a view point must see
 
     def __post_init__(self) -> None:
-        for name in (
-            "min_extent_m",
-            "far_extent_m",
-            "opening_m2",
-            "min_unknown_m2",
-            "min_unknown_width_m",
-            "min_clearance_m",
-            "beyond_m",
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"FrontierConfig.{name} must be ≥ 0, got {value}")
-        for name in ("spacing_m", "view_range_m", "far_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"FrontierConfig.{name} must be > 0, got {value}")
+        not_negative(self)
+        positive(self, "spacing_m", "view_range_m", "far_m")
 
     def for_body(self, width_m: float) -> FrontierConfig:
         """Return the same for a body of this width [m]: where a small one could pass is worth a look."""
         return replace(
-            self,
-            min_extent_m=min(self.min_extent_m, width_m),
-            far_extent_m=min(self.far_extent_m, 2.0 * width_m),
+            self, min_extent_m=min(self.min_extent_m, width_m), far_extent_m=min(self.far_extent_m, 2.0 * width_m)
         )
 
     def wanted_extent(self, costs: Array) -> Array:
@@ -191,12 +176,9 @@ def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
 
 @njit(cache=True, nogil=True)
 def _bordering(
-    classes: NDArray[np.int8],
-    clearance: NDArray[np.float32],
-    suspect: NDArray[np.bool_],
-    near: NDArray[np.uint8],
+    classes: NDArray[np.int8], clearance: NDArray[np.float32], suspect: NDArray[np.bool_], near: NDArray[np.uint8],
     min_clearance: float,
-) -> NDArray[np.int64]:
+) -> NDArray[np.int64]:  # fmt: skip
     """Return the FREE, unsuspected cells ``(n, 2)`` near the unknown that are no gaps in a wall, row by row."""
     cells = np.empty((1024, 2), dtype=np.int64)
     count = 0
@@ -214,12 +196,9 @@ def _bordering(
 
 @njit(cache=True, nogil=True)
 def _join(
-    cells: NDArray[np.int64],
-    order: NDArray[np.int64],
-    index: NDArray[np.int32],
-    labels: NDArray[np.int64],
+    cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], labels: NDArray[np.int64],
     boxes: NDArray[np.int64],
-) -> int:
+) -> int:  # fmt: skip
     """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is −1 all over."""
     rows, cols = index.shape
     for i in range(len(cells)):

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import OCCUPIED, UNKNOWN
 
 __all__ = ["expected_area"]
@@ -51,7 +51,6 @@ def expected_area(
 def _cast(
     classes: NDArray[np.int8], cells: NDArray[np.int64], reach: float, depth: float, rays: int, area: Array
 ) -> None:
-    rows, cols = classes.shape
     sector = _STEP * 2.0 * math.pi / rays
     for i in range(cells.shape[0]):
         if cells[i, 0] < 0:
@@ -63,9 +62,7 @@ def _cast(
             dx, dy = math.cos(angle), math.sin(angle)
             away, unknown = 0.5 * _STEP, 0.0
             while away < reach and unknown < depth:
-                row, col = math.floor(y0 + away * dy), math.floor(x0 + away * dx)
-                # Beyond the grid nothing is known.
-                kind = classes[row, col] if 0 <= row < rows and 0 <= col < cols else UNKNOWN
+                kind = kind_at(classes, math.floor(y0 + away * dy), math.floor(x0 + away * dx))
                 if kind == OCCUPIED:
                     break
                 if kind == UNKNOWN:

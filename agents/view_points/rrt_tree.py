@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 
 __all__ = ["Tree", "mean_shift"]
@@ -54,7 +54,7 @@ class Tree:
     def prune(self, cost_map: CostMap) -> None:
         """Drop the edges that the map no longer shows free, and all that hangs on them."""
         nodes = self._nodes[: self._count]
-        kept = _prune(cost_map.classes, _in_cells(cost_map, nodes), self._parents, nodes)
+        kept = _prune(cost_map.classes, cost_map.in_cells(nodes), self._parents, nodes)
         self._count = int(kept)
 
     def grow(self, cost_map: CostMap, draws: Array, *, restart: bool = False) -> Array:
@@ -65,17 +65,17 @@ class Tree:
         """
         if self._count == 0 or len(draws) == 0:
             return np.zeros((0, 2))
-        nodes = _in_cells(cost_map, self._nodes)
+        nodes = cost_map.in_cells(self._nodes)
         hits = np.empty((len(draws), 2))
-        goals = _in_cells(cost_map, draws)
+        goals = cost_map.in_cells(draws)
         stride = self._stride_m / cost_map.resolution
         before = 1 if restart else self._count
         self._count, found = _grow(
             cost_map.classes, nodes, self._parents, self._count, goals, stride, restart, hits
         )
-        to_metres = cost_map.resolution, np.asarray(cost_map.origin)
-        self._nodes[before : self._count] = nodes[before : self._count] * to_metres[0] + to_metres[1]
-        return np.asarray(hits[:found] * to_metres[0] + to_metres[1])
+        resolution, origin = cost_map.resolution, np.asarray(cost_map.origin)
+        self._nodes[before : self._count] = nodes[before : self._count] * resolution + origin
+        return np.asarray(hits[:found] * resolution + origin)
 
 
 def mean_shift(points: Array, bandwidth: float, iterations: int = 20) -> NDArray[np.int64]:
@@ -89,18 +89,6 @@ def mean_shift(points: Array, bandwidth: float, iterations: int = 20) -> NDArray
     return np.unique(chosen[:count])
 
 
-def _in_cells(cost_map: CostMap, points: Array) -> Array:
-    """Return points ``(n, 2)`` [m] as x, y in cells from the grid's corner."""
-    return np.asarray((points - np.asarray(cost_map.origin)) / cost_map.resolution)
-
-
-@njit(cache=True, nogil=True)
-def _kind(classes: NDArray[np.int8], row: int, col: int) -> int:
-    if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
-        return UNKNOWN
-    return int(classes[row, col])
-
-
 @njit(cache=True, nogil=True)
 def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float) -> tuple[int, float]:
     """Return the kind of the first cell from a to b that is not free, and the share of the way it is met at.
@@ -109,7 +97,7 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
     """
     row, col = math.floor(ay), math.floor(ax)
     last_row, last_col = math.floor(by), math.floor(bx)
-    kind = _kind(classes, row, col)
+    kind = kind_at(classes, row, col)
     if kind != FREE:
         return kind, 0.0
     dx, dy = bx - ax, by - ay
@@ -121,7 +109,7 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
     for _ in range(abs(last_row - row) + abs(last_col - col)):
         at = min(next_c, next_r)
         if abs(next_c - next_r) < 1e-9:
-            beside = max(_kind(classes, row, col + step_c), _kind(classes, row + step_r, col))
+            beside = max(kind_at(classes, row, col + step_c), kind_at(classes, row + step_r, col))
             if beside == OCCUPIED:
                 return OCCUPIED, at
         if next_c < next_r:
@@ -130,7 +118,7 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
         else:
             row += step_r
             next_r += per_r
-        kind = _kind(classes, row, col)
+        kind = kind_at(classes, row, col)
         if kind != FREE:
             return kind, at
     return FREE, 1.0
@@ -138,15 +126,9 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
 
 @njit(cache=True, nogil=True)
 def _grow(
-    classes: NDArray[np.int8],
-    nodes: Array,
-    parents: NDArray[np.int64],
-    count: int,
-    goals: Array,
-    stride: float,
-    restart: bool,
-    hits: Array,
-) -> tuple[int, int]:
+    classes: NDArray[np.int8], nodes: Array, parents: NDArray[np.int64], count: int, goals: Array, stride: float,
+    restart: bool, hits: Array,
+) -> tuple[int, int]:  # fmt: skip
     """Fill ``nodes``, ``parents`` and ``hits``; return how many there are of the first and the last."""
     found = 0
     for k in range(goals.shape[0]):

@@ -16,11 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["ViewPoints", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
+__all__ = ["Watch", "first_in_good_sight", "in_good_sight", "view_points"]
 
 Array = NDArray[np.float64]
 
@@ -36,26 +36,20 @@ class Watch:
     half_view_rad: float  # half the field of view; π and more: all round
 
 
-@dataclass(frozen=True, eq=False)
-class ViewPoints:
-    """For each piece of frontier, the cheapest reachable place to look beyond it from."""
-
-    cells: NDArray[np.int64]  # (m, 2) row, column of the planning grid; −1 where there is none
-    costs: Array  # (m,) travel cost, inf where there is none
-
-
 def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, watch: Watch) -> NDArray[np.bool_]:
     """Return which frontier cells ``(n, 2)`` (row, column) were in good sight from any of the watch's poses.
 
     ``normals`` ``(n, 2)`` point from free to unknown; where one is zero, every direction is as good.
     """
-    seen = np.zeros(len(cells), dtype=np.bool_)
-    poses = _in_cells(cost_map, np.asarray(watch.poses, dtype=np.float64).reshape(-1, 3))
+    poses = np.array(watch.poses, dtype=np.float64).reshape(-1, 3)
+    poses[:, :2] = cost_map.in_cells(poses[:, :2])
     # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
     poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
     reach = watch.range_m / cost_map.resolution
-    _mark_seen(cost_map.classes, cells, normals, poses, reach, watch.half_view_rad, seen)
-    return seen
+    # A cell to spare: what rounding puts just within reach is not left out here.
+    x, far = cells[:, 1] + 0.5, reach + 1.0
+    first, beyond = np.searchsorted(poses[:, 0], x - far), np.searchsorted(poses[:, 0], x + far, side="right")
+    return _first_seen(cost_map.classes, cells, normals, poses, first, beyond, reach, watch.half_view_rad) >= 0
 
 
 def first_in_good_sight(
@@ -84,95 +78,52 @@ def first_in_good_sight(
     range_m : float
         Diameter of the circle of good sight.
     """
-    found = np.full(len(cells), -1, dtype=np.int64)
-    poses = _in_cells(cost_map, np.column_stack([places, np.zeros(len(places))]))
-    _first_seen(cost_map.classes, cells, normals, poses, worth, least, range_m / cost_map.resolution, found)
-    return found
-
-
-def _in_cells(cost_map: CostMap, poses: Array) -> Array:
-    """Return poses ``(k, 3)`` with their positions in cells from the grid's corner."""
-    poses = poses.copy()
-    poses[:, :2] = (poses[:, :2] - np.asarray(cost_map.origin)) / cost_map.resolution
-    return poses
+    poses = np.column_stack([cost_map.in_cells(places), np.zeros(len(places))])
+    beyond = np.searchsorted(-worth, -least)
+    reach = range_m / cost_map.resolution
+    first = np.zeros_like(beyond)
+    return np.asarray(_first_seen(cost_map.classes, cells, normals, poses, first, beyond, reach, math.pi))
 
 
 def view_points(
     cost_map: CostMap, travel: TravelCosts, targets: Array, normals: Array, *, range_m: float, beyond_m: float
-) -> ViewPoints:
+) -> tuple[NDArray[np.int64], Array]:
     """Return, for each piece of frontier ``(m, 2)`` [m], the cheapest cell that has it in good sight.
+
+    Row and column ``(m, 2)``, −1 where there is none, and the cell's travel cost ``(m,)``, there infinite.
 
     Sight lines are walked backwards from a point ``beyond_m`` behind the frontier. Where no reachable cell sees
     that point, one near the frontier that sees the frontier itself will do: it is the last that can be tried.
     """
     reach = _NEARER * range_m / cost_map.resolution
-    start = (targets - np.asarray(cost_map.origin)) / cost_map.resolution
+    start = cost_map.in_cells(targets)
     cells = np.full((len(start), 2), -1, dtype=np.int64)
     costs = np.full(len(start), np.inf)
     _look(cost_map.classes, travel.cost, start, normals, reach, beyond_m / cost_map.resolution, cells, costs)
-    return ViewPoints(cells, costs)
-
-
-@njit(cache=True, nogil=True)
-def _mark_seen(
-    classes: NDArray[np.int8],
-    cells: NDArray[np.int64],
-    normals: Array,
-    poses: Array,
-    reach: float,
-    half_view: float,
-    seen: NDArray[np.bool_],
-) -> None:
-    for i in range(cells.shape[0]):
-        x, y = cells[i, 1] + 0.5, cells[i, 0] + 0.5
-        nx, ny = normals[i, 0], normals[i, 1]
-        # A cell to spare: what rounding puts just within reach below is not left out here.
-        first = np.searchsorted(poses[:, 0], x - reach - 1.0)
-        for k in range(first, poses.shape[0]):
-            if poses[k, 0] > x + reach + 1.0:
-                break
-            if _is_good(classes, x, y, nx, ny, poses[k, 0], poses[k, 1], poses[k, 2], reach, half_view):
-                seen[i] = True
-                break
+    return cells, costs
 
 
 @njit(cache=True, nogil=True)
 def _first_seen(
-    classes: NDArray[np.int8],
-    cells: NDArray[np.int64],
-    normals: Array,
-    poses: Array,
-    worth: Array,
-    least: Array,
-    reach: float,
-    found: NDArray[np.int64],
-) -> None:
-    """Note for each cell the first pose that has it in good sight, of those worth more than its least."""
-    for i in range(cells.shape[0]):
-        x, y = cells[i, 1] + 0.5, cells[i, 0] + 0.5
-        for k in range(poses.shape[0]):
-            if worth[k] <= least[i]:
-                break
-            if _is_good(
-                classes, x, y, normals[i, 0], normals[i, 1], poses[k, 0], poses[k, 1], poses[k, 2], reach, math.pi
-            ):
+    classes: NDArray[np.int8], cells: NDArray[np.int64], normals: Array, poses: Array, first: NDArray[np.int64],
+    beyond: NDArray[np.int64], reach: float, half_view: float,
+) -> NDArray[np.int64]:  # fmt: skip
+    """Return each cell's first pose, from ``first`` to before ``beyond``, that has it in good sight; or −1."""
+    found = np.full(len(cells), -1, dtype=np.int64)
+    for i in range(len(cells)):
+        x, y, nx, ny = cells[i, 1] + 0.5, cells[i, 0] + 0.5, normals[i, 0], normals[i, 1]
+        for k in range(first[i], beyond[i]):
+            if _is_good(classes, x, y, nx, ny, poses[k, 0], poses[k, 1], poses[k, 2], reach, half_view):
                 found[i] = k
                 break
+    return found
 
 
 @njit(cache=True, nogil=True)
 def _is_good(
-    classes: NDArray[np.int8],
-    x: float,
-    y: float,
-    nx: float,
-    ny: float,
-    px: float,
-    py: float,
-    heading: float,
-    reach: float,
-    half_view: float,
-) -> bool:
+    classes: NDArray[np.int8], x: float, y: float, nx: float, ny: float, px: float, py: float, heading: float,
+    reach: float, half_view: float,
+) -> bool:  # fmt: skip
     """Tell whether a sensor at px, py has the point x, y with its normal in good sight; positions in cells."""
     dx, dy = x - px, y - py
     square = dx * dx + dy * dy
@@ -193,28 +144,22 @@ def _is_free_line(classes: NDArray[np.int8], x0: float, y0: float, x1: float, y1
     count = int(length / 0.7) + 1  # less than a cell: no wall is stepped over, diagonal ones included
     for i in range(count):
         share = i / count
-        if _at(classes, x0 + share * (x1 - x0), y0 + share * (y1 - y0)) != FREE:
+        if kind_at(classes, math.floor(y0 + share * (y1 - y0)), math.floor(x0 + share * (x1 - x0))) != FREE:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
 def _look(
-    classes: NDArray[np.int8],
-    cost: NDArray[np.float32],
-    targets: Array,
-    normals: Array,
-    reach: float,
-    beyond: float,
-    cells: NDArray[np.int64],
-    costs: Array,
-) -> None:
+    classes: NDArray[np.int8], cost: NDArray[np.float32], targets: Array, normals: Array, reach: float,
+    beyond: float, cells: NDArray[np.int64], costs: Array,
+) -> None:  # fmt: skip
     """Find the cheapest cell in sight of each target; positions in cells, x first."""
     for i in range(targets.shape[0]):
         x, y = targets[i, 0], targets[i, 1]
         nx, ny = normals[i, 0], normals[i, 1]
         push = beyond
-        while push > 0.0 and _at(classes, x + push * nx, y + push * ny) == OCCUPIED:
+        while push > 0.0 and kind_at(classes, math.floor(y + push * ny), math.floor(x + push * nx)) == OCCUPIED:
             push -= 1.0
         push = max(push, 0.0)
         _sweep(classes, cost, x, y, nx, ny, reach, push, push + 2.0, i, cells, costs)
@@ -223,28 +168,10 @@ def _look(
 
 
 @njit(cache=True, nogil=True)
-def _at(classes: NDArray[np.int8], x: float, y: float) -> int:
-    row, col = math.floor(y), math.floor(x)
-    if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
-        return UNKNOWN
-    return int(classes[row, col])
-
-
-@njit(cache=True, nogil=True)
 def _sweep(
-    classes: NDArray[np.int8],
-    cost: NDArray[np.float32],
-    x: float,
-    y: float,
-    nx: float,
-    ny: float,
-    reach: float,
-    push: float,
-    blind: float,
-    index: int,
-    cells: NDArray[np.int64],
-    costs: Array,
-) -> None:
+    classes: NDArray[np.int8], cost: NDArray[np.float32], x: float, y: float, nx: float, ny: float, reach: float,
+    push: float, blind: float, index: int, cells: NDArray[np.int64], costs: Array,
+) -> None:  # fmt: skip
     """Walk sight lines from ``push`` cells behind (x, y) and keep to the places that see it well.
 
     They go through anything but walls for ``blind`` cells, then through free ones.
@@ -258,12 +185,12 @@ def _sweep(
         while away <= reach + push:
             px, py = x + push * nx + away * dx, y + push * ny + away * dy
             away += 0.7  # less than a cell: no wall is stepped over, diagonal ones included
-            kind = _at(classes, px, py)
+            row, col = math.floor(py), math.floor(px)
+            kind = kind_at(classes, row, col)
             if kind == OCCUPIED or (kind == UNKNOWN and away > blind + 0.7):
                 break
             if kind != FREE:
                 continue
-            row, col = math.floor(py), math.floor(px)
             if cost[row, col] >= costs[index]:
                 continue
             ex, ey = x - (col + 0.5), y - (row + 0.5)

@@ -8,16 +8,16 @@ as the beams are dense there.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.cost_map import CostMap
+from agents.ways.cost_map import CostMap, kind_at
 from mecanum_env.config import LidarConfig
-from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import require
+from slam.grids.occupancy import FREE
+from slam.settings import positive
 from slam.types import LINE
 
 __all__ = ["BEAM", "SensorModel", "expected_sightings"]
@@ -47,9 +47,7 @@ class SensorModel:
     wall_sigma_rad: float = 0.0002
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"SensorModel.{f.name} must be > 0, got {value}")
+        positive(self)
 
 
 def expected_sightings(
@@ -170,14 +168,12 @@ def _sees(classes: NDArray[np.int8], frame: Array, sensor: Array, x: float, y: f
         off = math.atan2(dy, dx) - sensor[2]
         if abs(math.atan2(math.sin(off), math.cos(off))) > limits[2]:
             return False
-    rows, cols = classes.shape
     column, row = (sensor[0] - frame[0]) / frame[2], (sensor[1] - frame[1]) / frame[2]
     reach = rho / frame[2]
     dx, dy = dx / rho, dy / rho
     at = 0.0
     while at < reach:
-        r, c = math.floor(row + at * dy), math.floor(column + at * dx)
-        kind = classes[r, c] if 0 <= r < rows and 0 <= c < cols else UNKNOWN
+        kind = kind_at(classes, math.floor(row + at * dy), math.floor(column + at * dx))
         if kind != FREE and at < reach - _BLIND:
             return False
         at += _STEP

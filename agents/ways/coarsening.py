@@ -36,15 +36,6 @@ class Blocks:
     suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
 
 
-def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Return the box of what is known or was visited: first row and column, and those beyond the last.
-
-    Of an empty grid the first are beyond all.
-    """
-    row0, col0, row1, col1 = _box(log_odds, visited)
-    return int(row0), int(col0), int(row1), int(col1)
-
-
 def coarsen(
     log_odds: NDArray[np.int8],
     visited: NDArray[np.uint8],
@@ -75,8 +66,12 @@ def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True)
-def _box(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
-    """Look at each row only outside the columns that are in the box already."""
+def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+    """Return the box of what is known or was visited: first row and column, and those beyond the last.
+
+    Of an empty grid the first are beyond all. Each row is looked at only outside the columns that are in the box
+    already.
+    """
     rows, cols = log_odds.shape
     row0, row1 = 0, rows
     while row0 < rows and _is_blank(log_odds[row0], visited[row0]):
@@ -106,18 +101,10 @@ def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
 
 @njit(cache=True, nogil=True)
 def _fill(
-    log_odds: NDArray[np.int8],
-    visited: NDArray[np.uint8],
-    distance: NDArray[np.float32],
-    resolution: np.float32,
-    far: np.float32,
-    factor: int,
-    row_pad: int,
-    col_pad: int,
-    classes: NDArray[np.int8],
-    clearance: NDArray[np.float32],
-    suspect: NDArray[np.bool_],
-) -> None:
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], resolution: np.float32,
+    far: np.float32, factor: int, row_pad: int, col_pad: int, classes: NDArray[np.int8],
+    clearance: NDArray[np.float32], suspect: NDArray[np.bool_],
+) -> None:  # fmt: skip
     """Fill the blocks but for the ring, a row of them at a time."""
     fine_rows, fine_cols = log_odds.shape
     blocks = classes.shape[1] - 2
@@ -147,14 +134,9 @@ def _fill(
 
 @njit(cache=True, nogil=True)
 def _read(
-    log_odds: NDArray[np.int8],
-    visited: NDArray[np.uint8],
-    distance: NDArray[np.float32],
-    resolution: np.float32,
-    far: np.float32,
-    metres: NDArray[np.float32],
-    marks: NDArray[np.int64],
-) -> None:
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], resolution: np.float32,
+    far: np.float32, metres: NDArray[np.float32], marks: NDArray[np.int64],
+) -> None:  # fmt: skip
     """Write each fine cell's clearance [m] and what it is, in a row; without branches, for many at a time."""
     half = np.float32(0.5)  # a cell: from the occupied cell's centre to its edge
     for col in range(log_odds.shape[0]):
@@ -169,13 +151,9 @@ def _read(
 
 @njit(cache=True, nogil=True)
 def _add(
-    metres: NDArray[np.float32],
-    marks: NDArray[np.int64],
-    shift: int,
-    factor: int,
-    totals: NDArray[np.float64],
+    metres: NDArray[np.float32], marks: NDArray[np.int64], shift: int, factor: int, totals: NDArray[np.float64],
     counts: NDArray[np.int64],
-) -> None:
+) -> None:  # fmt: skip
     """Add to each block the cell of a row that lies ``shift`` cells from the block's beginning, if any."""
     first, beyond = 1 if shift < 0 else 0, (metres.shape[0] - 1 - shift) // factor + 1
     start = factor * first + shift

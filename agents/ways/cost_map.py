@@ -19,9 +19,9 @@ from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
-from slam.settings import require
+from slam.settings import not_negative, positive
 
-__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "position_sigma"]
+__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma"]
 
 Array = NDArray[np.float64]
 
@@ -48,19 +48,8 @@ class PlannerConfig:
     path_spacing_m: float = 0.1
 
     def __post_init__(self) -> None:
-        for name in ("resolution_m", "preferred_m", "path_spacing_m"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"PlannerConfig.{name} must be > 0, got {value}")
-        for name in (
-            "margin_m",
-            "max_sigma_margin_m",
-            "tight_margin_m",
-            "unknown_margin_m",
-            "near_cost",
-            "tight_cost",
-        ):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"PlannerConfig.{name} must be ≥ 0, got {value}")
+        not_negative(self)
+        positive(self, "resolution_m", "preferred_m", "path_spacing_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +71,21 @@ class CostMap:
 
     def to_cells(self, points: Array) -> NDArray[np.int64]:
         """Return the cells ``(n, 2)`` (row, column) of points ``(n, 2)`` [m], held within the grid."""
-        index = np.floor((np.asarray(points) - np.asarray(self.origin)) / self.resolution).astype(np.int64)
+        index = np.floor(self.in_cells(np.asarray(points))).astype(np.int64)
         limit = np.array(self.classes.shape, dtype=np.int64) - 1
         return np.asarray(np.clip(index[:, ::-1], 0, limit))
+
+    def in_cells(self, points: Array) -> Array:
+        """Return points ``(n, 2)`` [m] as x, y in cells from the grid's corner."""
+        return np.asarray((points - np.asarray(self.origin)) / self.resolution)
+
+
+@njit(cache=True, nogil=True)
+def kind_at(classes: NDArray[np.int8], row: int, col: int) -> int:
+    """Return a cell's class; beyond the grid nothing is known."""
+    if row < 0 or col < 0 or row >= classes.shape[0] or col >= classes.shape[1]:
+        return UNKNOWN
+    return int(classes[row, col])
 
 
 def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> NDArray[np.int8]:
@@ -117,10 +118,7 @@ def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
         belief.grid.origin[1] + rows.start * fine_resolution,
     ]
     col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
-    origin = (
-        corner[0] - (col_pad + factor) * fine_resolution,
-        corner[1] - (row_pad + factor) * fine_resolution,
-    )
+    origin = (corner[0] - (col_pad + factor) * fine_resolution, corner[1] - (row_pad + factor) * fine_resolution)
     blocks = coarsen(
         belief.grid.log_odds[rows, cols],
         belief.grid.visited[rows, cols],
@@ -213,14 +211,9 @@ def _classify(
 
 @njit(cache=True, nogil=True)
 def _weigh_cells(
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    near_unknown: NDArray[np.uint8],
-    levels: Array,
-    near_cost: float,
-    tight_cost: float,
-    weight: NDArray[np.float32],
-) -> None:
+    classes: NDArray[np.int8], wall: NDArray[np.float32], near_unknown: NDArray[np.uint8], levels: Array,
+    near_cost: float, tight_cost: float, weight: NDArray[np.float32],
+) -> None:  # fmt: skip
     tight, comfortable, preferred = levels
     for row in range(1, classes.shape[0] - 1):
         for col in range(1, classes.shape[1] - 1):
@@ -239,15 +232,9 @@ def _weigh_cells(
 
 @njit(cache=True, nogil=True)
 def _free_start(
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    row: int,
-    col: int,
-    reach: float,
-    body: float,
-    highest: float,
-) -> None:
+    classes: NDArray[np.int8], wall: NDArray[np.float32], weight: NDArray[np.float32], row: int, col: int,
+    reach: float, body: float, highest: float,
+) -> None:  # fmt: skip
     """Let the robot out of where it stands: cells around it, never occupied ones, at the highest price."""
     here = wall[row, col]
     span = math.ceil(reach)

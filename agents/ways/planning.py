@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
 
-__all__ = ["TravelCosts", "resample", "shortest_path", "travel_costs", "way_cells"]
+__all__ = ["TravelCosts", "cell_before", "resample", "shortest_path", "travel_costs", "way_cells"]
 
 Array = NDArray[np.float64]
 
@@ -33,8 +33,8 @@ class TravelCosts:
     step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where inf
 
 
-def travel_costs(cost_map: CostMap, max_cost_m: float = math.inf) -> TravelCosts:
-    """Return the travel costs from the robot's cell; what costs more than ``max_cost_m`` is left at infinity.
+def travel_costs(cost_map: CostMap) -> TravelCosts:
+    """Return the travel costs from the robot's cell.
 
     A step costs its length times the mean weight of its two cells. A diagonal step needs both cells beside it
     free, so that no path slips between two walls that touch at a corner.
@@ -44,15 +44,7 @@ def travel_costs(cost_map: CostMap, max_cost_m: float = math.inf) -> TravelCosts
     step = np.full(shape, -1, dtype=np.int8)
     highest = float(cost_map.weight.max())
     buckets = math.ceil(math.sqrt(2.0) * highest) + 3
-    _dial(
-        cost_map.weight,
-        cost_map.start[0],
-        cost_map.start[1],
-        buckets,
-        max_cost_m / cost_map.resolution,
-        cost,
-        step,
-    )
+    _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, cost, step)
     cost *= np.float32(cost_map.resolution)
     return TravelCosts(cost, step)
 
@@ -96,14 +88,9 @@ def resample(path: Array, spacing_m: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def _dial(
-    weight: NDArray[np.float32],
-    start_row: int,
-    start_col: int,
-    buckets: int,
-    max_cost: float,
-    cost: NDArray[np.float32],
+    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, cost: NDArray[np.float32],
     step: NDArray[np.int8],
-) -> None:
+) -> None:  # fmt: skip
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
 
     Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
@@ -151,7 +138,7 @@ def _dial(
                 if price <= 0.0:
                     continue
                 total = here + np.float32((diagonal if k & 1 else 0.5) * (own + price))
-                if total >= before or total > max_cost:
+                if total >= before:
                     continue
                 if k & 1 and (
                     weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0
@@ -196,31 +183,24 @@ def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 @njit(cache=True, nogil=True)
+def cell_before(step: NDArray[np.int8], row: int, col: int) -> tuple[int, int]:
+    """Return the row and column that the last step of the way to a cell, which is not the start, came from."""
+    k = step[row, col]
+    return row - _D_ROW[k], col - _D_COL[k]
+
+
+@njit(cache=True, nogil=True)
 def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
-    count = 1
-    r, c = row, col
-    while step[r, c] >= 0:
-        k = step[r, c]
-        r, c = r - _D_ROW[k], c - _D_COL[k]
-        count += 1
-    cells = np.empty((count, 2), dtype=np.int64)
-    r, c = row, col
-    for i in range(count - 1, -1, -1):
-        cells[i, 0], cells[i, 1] = r, c
-        k = step[r, c]
-        if k >= 0:
-            r, c = r - _D_ROW[k], c - _D_COL[k]
-    return cells
+    cells = [(row, col)]
+    while step[row, col] >= 0:
+        row, col = cell_before(step, row, col)
+        cells.append((row, col))
+    return np.array(cells[::-1])
 
 
 @njit(cache=True, nogil=True)
 def _segment(
-    a: Array,
-    b: Array,
-    weight: NDArray[np.float32],
-    wall: NDArray[np.float32],
-    resolution: float,
-    origin: Array,
+    a: Array, b: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
 ) -> tuple[float, float]:
     """Price of the straight line a–b (inf where it leaves passable cells) and its smallest clearance."""
     length = math.hypot(b[0] - a[0], b[1] - a[1])
@@ -240,11 +220,7 @@ def _segment(
 
 @njit(cache=True, nogil=True)
 def _cut_straight(
-    points: Array,
-    weight: NDArray[np.float32],
-    wall: NDArray[np.float32],
-    resolution: float,
-    origin: Array,
+    points: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
 ) -> NDArray[np.int64]:
     """Return the indices of the points to keep."""
     n = points.shape[0]

@@ -159,7 +159,7 @@ def best_tour(sight: Sight, distance: Array, weight: Array, luck: Array) -> tupl
         places = np.zeros(1, dtype=np.int64)
         places = np.concatenate((places, cover(sight, distance[0], luck[t])))
         for rounds in range(4):
-            own, own_weight = _among(distance, weight, places)
+            own, own_weight = distance[places][:, places], weight[places]
             order = nearest_order(own) if rounds == 0 else np.arange(len(places))
             improve(own, own_weight, order)
             places = places[order]
@@ -186,7 +186,7 @@ def tours_begun_with(sight: Sight, distance: Array, weight: Array, tour: Indices
         rest = tour[tour != first]
         rest[0] = first  # in the robot's place: the rest of the tour begins here
         rest = _without_idle(sight, rest)
-        own, own_weight = _among(distance, weight, rest)
+        own, own_weight = distance[rest][:, rest], weight[rest]
         leg = distance[0, first]
         after = improve(own, own_weight, np.arange(len(rest)))
         late = own_weight[1:].sum()
@@ -209,17 +209,6 @@ def _without_idle(sight: Sight, places: Indices) -> Indices:
             for j in range(sight.shape[1]):
                 count[j] -= sight[places[k], j]
     return places[kept]
-
-
-@njit(cache=True, nogil=True)
-def _among(distance: Array, weight: Array, places: Indices) -> tuple[Array, Array]:
-    n = len(places)
-    own, own_weight = np.empty((n, n)), np.empty(n)
-    for a in range(n):
-        own_weight[a] = weight[places[a]]
-        for b in range(n):
-            own[a, b] = distance[places[a], places[b]]
-    return own, own_weight
 
 
 @njit(cache=True, nogil=True)

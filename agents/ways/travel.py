@@ -9,15 +9,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
-from agents.ways.planning import TravelCosts, travel_costs
+from agents.ways.planning import TravelCosts, cell_before, travel_costs
 
 __all__ = ["between"]
 
 Array = NDArray[np.float64]
-
-# Neighbours in the order that TravelCosts.step counts them in.
-_D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 
 _CELLS = 100_000  # that may be searched for exact costs in one call: some 5 ms
 
@@ -46,17 +42,14 @@ def _along_tree(cost: NDArray[np.float32], step: NDArray[np.int8], cells: NDArra
     passed = np.full(cost.shape, -1, dtype=np.int32)
     for i in range(n):
         row, col = cells[i, 0], cells[i, 1]
-        while True:
+        passed[row, col] = i
+        while step[row, col] >= 0:
+            row, col = cell_before(step, row, col)
             passed[row, col] = i
-            k = step[row, col]
-            if k < 0:
-                break
-            row, col = row - _D_ROW[k], col - _D_COL[k]
         for j in range(i):
             row, col = cells[j, 0], cells[j, 1]
             while passed[row, col] != i and step[row, col] >= 0:
-                k = step[row, col]
-                row, col = row - _D_ROW[k], col - _D_COL[k]
+                row, col = cell_before(step, row, col)
             out[i, j] = cost[cells[i, 0], cells[i, 1]] + cost[cells[j, 0], cells[j, 1]] - 2.0 * cost[row, col]
             out[j, i] = out[i, j]
     return out

@@ -24,16 +24,12 @@ __all__ = [
     "TWIST",
     "WHEELS",
     "WheelTargets",
-    "action_to_wheels",
     "dynamics_constants",
     "forward_kinematics",
     "forward_matrix",
     "inverse_kinematics",
-    "inverse_matrix",
     "motor_constants",
     "turn_wheels",
-    "twist_action_to_wheels",
-    "wheel_dynamics",
     "wheel_positions",
 ]
 
@@ -47,7 +43,7 @@ LEVER_SIGN = (-1.0, 1.0, -1.0, 1.0)
 """Sign of the yaw moment of a unit force along each roller's axis: (x_i t_i − y_i)/l."""
 
 SUBSTEP_S = 1e-3
-"""Longest inner step of :func:`wheel_dynamics` [s]; its error is of this order, its stability is not at stake."""
+"""Longest inner step of :func:`turn_wheels` [s]; its error is of this order, its stability is not at stake."""
 
 # The state that the kernels carry: one array, so that a call unpacks one argument.
 POSE = slice(0, 3)
@@ -63,13 +59,8 @@ INCREMENTS = slice(14, 18)
 STATE_SIZE = 18
 
 
-def inverse_matrix(robot: RobotConfig) -> Array:
-    """Return the matrix ``(4, 3)`` that takes a body twist [m/s, m/s, rad/s] to wheel speeds [rad/s]."""
-    return _matrices(robot)[0].copy()
-
-
 def forward_matrix(robot: RobotConfig) -> Array:
-    """Return the pseudo-inverse ``(3, 4)`` of :func:`inverse_matrix`: wheel speeds to body twist."""
+    """Return the matrix ``(3, 4)`` that takes wheel speeds [rad/s] to the body twist that fits them best."""
     return _matrices(robot)[1].copy()
 
 
@@ -106,7 +97,10 @@ class WheelTargets:
         ])  # fmt: skip
 
     def of_twist(self, action: ArrayLike) -> Array:
-        """Return the targets for a body twist ``(3,)`` in fractions of the limits; see above."""
+        """Return the targets for a body twist ``(3,)`` in fractions of the limits, clipped.
+
+        Where a wheel would have to exceed its limit, all are slowed alike: the motion keeps its direction.
+        """
         wheels = np.empty(4)
         fractions = _numbers(action)
         if fractions.shape != (3,) or not _twist_to_wheels(fractions, self._limits, wheels):
@@ -120,29 +114,6 @@ class WheelTargets:
         if fractions.shape != (4,) or not _scale_wheels(fractions, self._limits, wheels):
             raise _no_action(action, 4)
         return wheels
-
-
-def twist_action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
-    """Return wheel speed targets ``(4,)`` [rad/s] for a body twist in fractions of the robot's limits.
-
-    Parameters
-    ----------
-    robot
-        Its limits are ``max_speed_m_s`` along x and along y, and ``max_turn_rate_rad_s``.
-    action
-        Fractions ``(3,)`` of vx, vy, ω; values beyond [-1, 1] are clipped.
-
-    Returns
-    -------
-    Array
-        Where a wheel would have to exceed its limit, all are slowed alike: the motion keeps its direction.
-    """
-    return WheelTargets(robot).of_twist(action)
-
-
-def action_to_wheels(robot: RobotConfig, action: ArrayLike) -> Array:
-    """Return wheel speed targets ``(4,)`` [rad/s] for wheel speeds in fractions of the limit, clipped."""
-    return WheelTargets(robot).of_wheels(action)
 
 
 def _numbers(action: ArrayLike) -> Array:
@@ -196,7 +167,7 @@ def _matrices(robot: RobotConfig) -> tuple[Array, Array]:
 
 
 def dynamics_constants(robot: RobotConfig, *, lever_m: float | None = None) -> Array:
-    """Return what :func:`wheel_dynamics` needs to know of a robot, in its order.
+    """Return what :func:`turn_wheels` needs to know of a robot, in its order.
 
     Parameters
     ----------
@@ -259,17 +230,11 @@ def _solve(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def wheel_dynamics(
-    state: Array,
-    targets: Array,
-    radii: Array,
-    friction: Array,
-    constants: Array,
-    dt: float,
-    substeps: int,
-    motion: Array,
-) -> None:
-    """Integrate wheels, motors, traction and body velocity over ``dt``; theory.md, "The robot itself".
+def turn_wheels(
+    state: Array, targets: Array, radii: Array, friction: Array, constants: Array, m: Array, h: float,
+    substeps: int, motion: Array,
+) -> None:  # fmt: skip
+    """Integrate wheels, motors, traction and body velocity over substeps; theory.md, "The robot itself".
 
     Each substep splits into motors, traction and drift. Traction is semi-implicit: with k_i = μ N/√(s_i² + s₀²)
     frozen at the slip s_i at its start, the forces −k_i s_i are taken at its end, which costs a 3 × 3 solve
@@ -289,22 +254,13 @@ def wheel_dynamics(
         μ under each wheel ``(4,)``.
     constants
         From :func:`dynamics_constants`.
-    dt, substeps
-        Time to integrate [s], and into how many equal steps.
+    m
+        From :func:`motor_constants`, for substeps of ``h``.
+    h, substeps
+        Length of a substep [s], and how many to take.
     motion
         ``(3,)``, filled: displacement in the world frame [m, m] and rotation [rad].
     """
-    motor = np.empty(7)
-    motor_constants(constants, dt / substeps, motor)
-    turn_wheels(state, targets, radii, friction, constants, motor, dt / substeps, substeps, motion)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def turn_wheels(
-    state: Array, targets: Array, radii: Array, friction: Array, constants: Array, m: Array, h: float,
-    substeps: int, motion: Array,
-) -> None:  # fmt: skip
-    """Do what :func:`wheel_dynamics` says in substeps of ``h`` [s], of which ``m`` are the motor's constants."""
     mass, lever, s0_squared = constants[0], constants[2], constants[8] * constants[8]
     lever_inertia = constants[1] / (lever * lever)
     # Per wheel: radius, μ N h, and by how much a wheel's own yielding softens the grip on it.

@@ -1,6 +1,6 @@
 """The world: static walls and obstacles, the robot's body, the floor under its wheels, and collisions.
 
-Wheels, motors and traction are integrated by :func:`mecanum_env.physics.robot.wheel_dynamics`; contacts are
+Wheels, motors and traction are integrated by :func:`mecanum_env.physics.robot.turn_wheels`; contacts are
 pymunk's. In each physics step the kernel advances the body's velocity, and pymunk moves the body at its mean
 velocity over that step, so that where nothing is touched the path is the kernel's own. For as long as nothing
 *can* be touched, which a distance field and then the exact geometry tell, pymunk is left out: the result is the
@@ -72,7 +72,7 @@ _FIXED_SIZE = 28
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
-    """Run :func:`wheel_dynamics` over a physics step with the μ that the wheels stand on at its start."""
+    """Run :func:`turn_wheels` over a physics step with the μ that the wheels stand on at its start."""
     state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
     wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
     c, s = math.cos(state[2]), math.sin(state[2])
@@ -178,15 +178,13 @@ class World:
     true_radii, true_lever
         The robot's true wheel radii ``(4,)`` [m] and lever [m], where they differ from the nominal ones
         (:class:`mecanum_env.sensing.sensors.WheelEncoders` draws them).
-    start
-        Pose ``(3,)`` instead of the plan's own.
     shortcut
         Leave pymunk out while nothing can be touched. The path is the same without, only slower.
 
     Raises
     ------
     FloorPlanError
-        Where the start is not in free space or the robot would touch something there.
+        Where the robot would touch something at the plan's start.
     """
 
     def __init__(
@@ -198,7 +196,6 @@ class World:
         *,
         true_radii: ArrayLike | None = None,
         true_lever: float | None = None,
-        start: ArrayLike | None = None,
         shortcut: bool = True,
     ) -> None:
         self.plan, self.robot, self.noise = plan, robot, noise
@@ -218,7 +215,7 @@ class World:
         self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
         self._work = np.zeros(_WORK_SIZE)
-        self._work[POSE] = plan.start if start is None else start
+        self._work[POSE] = plan.start
         self._wrap_pose()
         self._contacts = Contacts()
         self._space = build_space(plan, self._contacts)
@@ -228,15 +225,14 @@ class World:
         self._check_start()
 
     def _check_start(self) -> None:
-        x, y, theta = self._work[POSE].tolist()
-        at = f"the start ({x:.2f}, {y:.2f}, {theta:.2f})"
-        if not self.plan.is_free(np.array([[x, y]]))[0]:
-            raise FloorPlanError(f"{at} is not in the free space of {self.plan.name!r}; choose another")
         self._place_body()
         (shape,) = self._body.shapes
         shape.cache_bb()
         if self._space.shape_query(shape):
-            raise FloorPlanError(f"{at} in {self.plan.name!r} has the robot touch something; choose another")
+            at = ", ".join(f"{v:.2f}" for v in self.plan.start)
+            raise FloorPlanError(
+                f"the start ({at}) in {self.plan.name!r} has the robot touch something; choose another"
+            )
 
     def step(self, wheel_targets: ArrayLike, step_s: float, physics_step_s: float) -> None:
         """Drive for one control step.

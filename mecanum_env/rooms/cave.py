@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
-from mecanum_env.rooms.layout.assembly import choose_start, generator, unreached
+from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M
 from mecanum_env.rooms.layout.limits import interval
-from mecanum_env.rooms.outlines.distance import distance_to_zero
+from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise
-from slam.settings import require
+from slam.settings import require, shares
 
 __all__ = ["CaveConfig", "cave"]
 
@@ -26,7 +26,6 @@ Mask = NDArray[np.bool_]
 
 _ATTEMPTS = 60
 _AREA_WIDTH = 1.05  # of area_m2: its upper limit by the lower, at least
-_START_M = 0.5  # clearance of the start, as of every generated plan
 _MARGIN_M = 0.2  # solid around the cave
 _BOX = 1.6  # area of the box that the chambers' centres are placed in, by that of the cave
 _SHARE = 0.55  # of the cave that is chambers, about; the rest is passages
@@ -63,11 +62,8 @@ class CaveConfig:
                                              f"{self.area_m2}; widen it")  # fmt: skip
         interval(self, "chamber_m", low=1.0, high=4.0)
         interval(self, "passage_m", low=1.3, high=4.0)
-        interval(self, "pillars", low=0, high=10)
-        require(all(isinstance(n, int) for n in self.pillars), "CaveConfig.pillars must be two whole numbers")
-        for name in ("loops", "roughness"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"CaveConfig.{name} must be in [0, 1], got {value}")
+        interval(self, "pillars", low=0, high=10, whole=True)
+        shares(self, "loops", "roughness")
 
 
 def cave(config: CaveConfig, *, seed: int) -> FloorPlan:
@@ -103,21 +99,19 @@ def _plan(field: Array, config: CaveConfig, seed: int, rng: np.random.Generator)
     pillars = _pillars(floor, config, rng)
     free = floor & ~_under(pillars, size)
     clearance = clearance_of(free, CELL_M)
-    reach, pocket = unreached(free, clearance, resolution=CELL_M)
+    reach, pocket = unreached(free, clearance)
     area = float(np.count_nonzero(free)) * CELL_M**2
     low, high = config.area_m2
-    if pocket is not None or not low <= area <= high or clearance[reach].max() < _START_M + CELL_M:
+    if pocket is not None or not low <= area <= high or clearance[reach].max() < START_M + CELL_M:
         return None
     plan = FloorPlan(
         name=f"cave-{seed}",
         walls=walls,
-        polygons=(),
         circles=pillars,
         free=free,
         resolution=CELL_M,
-        origin=(0.0, 0.0),
-        start=choose_start(clearance, reach, resolution=CELL_M, origin=(0.0, 0.0), rng=rng),
-        start_clearance_m=_START_M,
+        start=choose_start(clearance, reach, rng),
+        start_clearance_m=START_M,
     )
     # Where rock came out very thin, or pieces much shorter than a cell, there may be a corner after all.
     return None if len(plan.corners) else plan
@@ -194,7 +188,7 @@ def _distance_to_line(points: Array, shape: tuple[int, int]) -> Field:
     canvas = np.ones(shape, np.uint8)
     pixels = np.floor(points / CELL_M).astype(np.int32)
     cv2.polylines(canvas, [pixels[:, None]], False, 0, 1, cv2.LINE_8)
-    return np.asarray(distance_to_zero(canvas) * CELL_M, np.float32)
+    return _distance(canvas)
 
 
 def _noise(shape: tuple[int, int], spacing_m: float, rng: np.random.Generator) -> Field:
@@ -220,15 +214,11 @@ def _drivable(field: Field) -> Array | None:
 
 def _rolled(free: Mask) -> Mask | None:
     """Return what a disc sweeps that rolls through the largest part of free space it can."""
-    places = (clearance_of(free, CELL_M) >= _DISC_M).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(places, connectivity=4)
-    if count < 2:
-        return None
-    reach = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    return np.asarray(_distance(~reach) <= _DISC_M)
+    reach = largest_part(clearance_of(free, CELL_M) >= _DISC_M)
+    return None if reach is None else np.asarray(_distance(~reach) <= _DISC_M)
 
 
-def _distance(mask: Mask) -> Field:
+def _distance(mask: Mask | NDArray[np.uint8]) -> Field:
     """Return how far [m] each cell of a mask is from the nearest one that is not of it."""
     return np.asarray(distance_to_zero(mask) * CELL_M, np.float32)
 

@@ -16,7 +16,7 @@ from mecanum_env.rooms.layout.corridor_layout import (
     draw_layout,
     sizes_of,
 )
-from mecanum_env.rooms.outlines.rectilinear import surfaces
+from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
 
 __all__ = ["PAPER_D", "CorridorsConfig", "corridors"]
 
@@ -41,19 +41,13 @@ def corridors(config: CorridorsConfig, *, seed: int) -> FloorPlan:
     shift = margin - boxes[:, :2].min(axis=0)
     boxes += np.tile(shift, 2)
     cols, rows = boxes[:, 2:].max(axis=0) + margin
-    free = np.zeros((rows, cols), np.bool_)
-    for x0, y0, x1, y1 in boxes:
-        free[y0:y1, x0:x1] = True
     x, y = ((v + d) * sizes.cell_m for v, d in zip(start[:2], shift.tolist(), strict=True))
     kind = "corridors" if config.map is None else f"corridors-map{config.map}"
     return FloorPlan(
         name=f"{kind}-{seed}",
-        walls=np.round(surfaces(boxes.astype(np.float64)) * sizes.cell_m, 6),
-        polygons=(),
-        circles=np.zeros((0, 3)),
-        free=free,
+        walls=np.round(surfaces(boxes) * sizes.cell_m, 6),
+        free=raster(boxes, (cols, rows)),
         resolution=sizes.cell_m,
-        origin=(0.0, 0.0),
         start=(round(x, 6), round(y, 6), start[2]),
         # Half a cell off the centre line, less what the coordinates are rounded by.
         start_clearance_m=(sizes.half - 0.5) * sizes.cell_m - 1e-5,

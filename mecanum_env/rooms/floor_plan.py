@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,7 +35,7 @@ def clearance_of(free: NDArray[np.bool_], resolution: float) -> NDArray[np.float
     return np.asarray(np.maximum(cells - 0.5, 0.0) * resolution, np.float32)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FloorPlan:
     """Walls, obstacles, free space and a start, in the world frame [m].
 
@@ -53,11 +52,11 @@ class FloorPlan:
 
     name: str
     walls: Array  # (w, 4) segments x1, y1, x2, y2
-    polygons: tuple[Array, ...]  # obstacles: (k, 2) vertices each, convex, counter-clockwise
-    circles: Array  # (c, 3) obstacles: x, y, radius
+    polygons: tuple[Array, ...] = ()  # obstacles: (k, 2) vertices each, convex, counter-clockwise
+    circles: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) obstacles: x, y, radius
     free: NDArray[np.bool_]  # (rows, cols) True where a point is in free space; row 0 at the lowest y
     resolution: float  # [m] of a cell of ``free``
-    origin: tuple[float, float]  # world position of the lower-left corner of cell (0, 0)
+    origin: tuple[float, float] = (0.0, 0.0)  # world position of the lower-left corner of cell (0, 0)
     start: tuple[float, float, float]  # x, y, θ: a pose in which the robot touches nothing
     start_clearance_m: float = 0.0  # [m] that the start keeps from every surface
 
@@ -125,7 +124,7 @@ class FloorPlan:
 
     @cached_property
     def _corners_and_kinds(self) -> tuple[Array, NDArray[np.int8]]:
-        return find_corners(self.walls, self.polygons, self.free, self.resolution, self.origin)
+        return find_corners(self.walls, self.polygons, self.is_free, self.resolution)
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
@@ -176,17 +175,6 @@ class FloorPlan:
             rims = np.hypot(*(point - self.circles[:, :2]).T) - self.circles[:, 2]
             best[i] = min(best[i], np.maximum(rims, 0.0).min(initial=np.inf))
         return best
-
-    def reachable(self, radius_m: float) -> NDArray[np.bool_]:
-        """Return the cells ``(rows, cols)`` that the centre of a disc can be driven to from the start.
-
-        The start's own cell counts as passable, even where the disc would touch something there.
-        """
-        passable = clearance_of(self.free, self.resolution) >= radius_m
-        col, row = (int((v - o) // self.resolution) for v, o in zip(self.start[:2], self.origin, strict=True))
-        passable[row, col] = True
-        _, labels = cv2.connectedComponents(passable.astype(np.uint8), connectivity=4)
-        return np.asarray(labels == labels[row, col], np.bool_)
 
     def with_start(self, start: Sequence[float], *, clearance_m: float = 0.0) -> FloorPlan:
         """Return the same plan with another start pose (x, y, θ), checked like the first.

@@ -8,16 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
-from mecanum_env.rooms.layout.assembly import choose_start, generator, unreached
+from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, cells
 from mecanum_env.rooms.layout.limits import interval
-from mecanum_env.rooms.outlines.rectilinear import surfaces
-from slam.settings import require
+from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
+from slam.settings import shares
 
 __all__ = ["Grid", "MazeConfig", "draw_grid", "maze"]
 
 _MARGIN = 4  # solid cells around the maze
-_START_M = 0.5  # clearance of the start, as of every generated plan
 _BRANCH = 0.2  # probability to go on from any place reached, not from the last one: shorter, more branched ways
 
 
@@ -33,12 +32,10 @@ class MazeConfig:
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows"):
-            interval(self, name, low=2, high=24)
-            whole = all(isinstance(n, int) for n in getattr(self, name))
-            require(whole, f"MazeConfig.{name} must be two whole numbers")
+            interval(self, name, low=2, high=24, whole=True)
         interval(self, "corridor_m", low=1.1, high=4.0)
         interval(self, "wall_m", low=0.05, high=1.0)
-        require(0 <= self.loops <= 1, f"MazeConfig.loops must be in [0, 1], got {self.loops}")
+        shares(self, "loops")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +44,6 @@ class Grid:
 
     east: NDArray[np.bool_]  # (rows, columns - 1): from (row, column) to (row, column + 1)
     north: NDArray[np.bool_]  # (rows - 1, columns): from (row, column) to (row + 1, column)
-
-    @property
-    def openings(self) -> int:
-        """Number of open pairs."""
-        return int(np.count_nonzero(self.east)) + int(np.count_nonzero(self.north))
-
-    @property
-    def loops(self) -> int:
-        """Number of independent ways round, where all cells are connected."""
-        rows, columns = self.east.shape[0], self.north.shape[1]
-        return int(self.openings - rows * columns + 1)
-
-    def degrees(self) -> NDArray[np.int64]:
-        """Return how many neighbours each cell ``(rows, columns)`` is open to."""
-        count = np.zeros((self.east.shape[0], self.north.shape[1]), np.int64)
-        count[:, :-1] += self.east
-        count[:, 1:] += self.east
-        count[:-1] += self.north
-        count[1:] += self.north
-        return count
 
 
 def maze(config: MazeConfig, *, seed: int) -> FloorPlan:
@@ -80,21 +57,16 @@ def maze(config: MazeConfig, *, seed: int) -> FloorPlan:
         for count in (columns, rows)
     )
     floors = _floors(grid, spans_x, spans_y)
-    free = np.zeros((spans_y[-1][1] + _MARGIN, spans_x[-1][1] + _MARGIN), np.bool_)
-    for x0, y0, x1, y1 in floors:
-        free[y0:y1, x0:x1] = True
+    free = raster(floors, (spans_x[-1][1] + _MARGIN, spans_y[-1][1] + _MARGIN))
     clearance = clearance_of(free, CELL_M)
-    reach, _ = unreached(free, clearance, resolution=CELL_M)
+    reach, _ = unreached(free, clearance)
     return FloorPlan(
         name=f"maze-{seed}",
-        walls=np.round(surfaces(np.array(floors, np.float64)) * CELL_M, 6),
-        polygons=(),
-        circles=np.zeros((0, 3)),
+        walls=np.round(surfaces(floors) * CELL_M, 6),
         free=free,
         resolution=CELL_M,
-        origin=(0.0, 0.0),
-        start=choose_start(clearance, reach, resolution=CELL_M, origin=(0.0, 0.0), rng=rng),
-        start_clearance_m=_START_M,
+        start=choose_start(clearance, reach, rng),
+        start_clearance_m=START_M,
     )
 
 

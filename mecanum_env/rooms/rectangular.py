@@ -10,7 +10,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.rooms.layout.assembly import assemble, generator
 from mecanum_env.rooms.layout.furniture import Furnisher, cells
 from mecanum_env.rooms.layout.limits import interval
-from slam.settings import require
+from slam.settings import require, shares
 
 __all__ = ["RectangularConfig", "rectangular"]
 
@@ -30,9 +30,7 @@ class RectangularConfig:
     def __post_init__(self) -> None:
         for name in ("length_m", "width_m"):
             interval(self, name, low=2.0, high=30.0)
-        for name in ("furniture", "turned", "round"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"RectangularConfig.{name} must be in [0, 1], got {value}")
+        shares(self, "furniture", "turned", "round")
         require(self.turned + self.round <= 1, "RectangularConfig needs turned + round ≤ 1")
 
 

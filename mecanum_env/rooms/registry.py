@@ -42,11 +42,11 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_GENERATORS))
 
 
-def check(name: str, config: Mapping[str, Any] | Any | None = None) -> None:
-    """Raise the ``ValueError`` that :func:`make` would for an unknown name or key, without drawing a plan."""
+def check(name: str, config: Mapping[str, Any] | Any | None = None) -> Any:
+    """Return a generator's whole config, or raise the ``ValueError`` for an unknown name or key."""
     if name not in _GENERATORS:
         raise unknown_name("rooms", name, _GENERATORS)
-    from_mapping(_GENERATORS[name][1], config)
+    return from_mapping(_GENERATORS[name][1], config)
 
 
 def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None) -> FloorPlan:
@@ -66,7 +66,5 @@ def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None)
     ValueError
         For an unknown name or key, a value out of its limits, or a seed that is no integer ≥ 0.
     """
-    if name not in _GENERATORS:
-        raise unknown_name("rooms", name, names())
-    generator, config_type = _GENERATORS[name]
-    return generator(from_mapping(config_type, config), seed=seed)
+    settings = check(name, config)
+    return _GENERATORS[name][0](settings, seed=seed)

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
-from mecanum_env.physics.robot import twist_action_to_wheels
+from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.sensors import WheelEncoders
 from slam.motion import OdometryNoise, twist_between
 
-__all__ = ["Calibration", "Drives", "calibrate", "drift_ratios", "drive", "fit", "open_floor"]
+__all__ = ["Calibration", "Drives", "drift_ratios", "drive", "fit", "open_floor"]
 
 Array = NDArray[np.float64]
 
@@ -74,17 +74,9 @@ class Calibration:
 # ---- driving ---------------------------------------------------------------------------------------------------
 
 
-def calibrate(
-    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0
-) -> Calibration:
-    """Drive a robot, and return V as measured; see :func:`drive` for the parameters."""
-    return fit(drive(robot, noise, episodes=episodes, steps=steps, seed=seed), robot.lever_m)
-
-
 def drive(
-    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0,
-    step_s: float = 0.1, physics_step_s: float = 0.02,
-) -> Drives:  # fmt: skip
+    robot: RobotConfig, noise: NoiseConfig, *, episodes: int = 60, steps: int = 400, seed: int = 0
+) -> Drives:
     """Drive a robot by smooth random twists, with stops, over an open floor.
 
     Parameters
@@ -95,9 +87,8 @@ def drive(
         How many, and the control steps of each.
     seed
         Of the first episode; the others follow.
-    step_s, physics_step_s
-        As the environments have them.
     """
+    step_s, physics_step_s = 0.1, 0.02  # as the environments have them
     measured, true = np.empty((episodes, steps, 3)), np.empty((episodes, steps, 3))
     plan = open_floor()
     for episode in range(episodes):
@@ -108,10 +99,10 @@ def drive(
         world = World(
             plan, robot, noise, world_rng, true_radii=encoders.true_radii, true_lever=encoders.true_lever
         )
-        driver = _Driver(robot, drive_rng, step_s)
+        driver, targets = _Driver(robot, drive_rng, step_s), WheelTargets(robot)
         for k in range(steps):
             before = world.pose
-            world.step(twist_action_to_wheels(robot, driver.action(before)), step_s, physics_step_s)
+            world.step(targets.of_twist(driver.action(before)), step_s, physics_step_s)
             odometry = encoders.odometry(world.wheel_increments, step_s, sensor_rng)
             measured[episode, k] = odometry.twist
             true[episode, k] = twist_between(before, world.pose, step_s)
@@ -126,8 +117,6 @@ def open_floor() -> FloorPlan:
     return FloorPlan(
         name="open floor",
         walls=np.hstack([corners, np.roll(corners, -1, axis=0)]),
-        polygons=(),
-        circles=np.zeros((0, 3)),
         free=np.ones((cells, cells), np.bool_),
         resolution=resolution,
         origin=(-half, -half),

@@ -110,15 +110,9 @@ def _locate(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _edge_on(
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    angle_min: float,
-    angle_increment: float,
-    directions: Array,
+    ax: float, ay: float, bx: float, by: float, angle_min: float, angle_increment: float, directions: Array,
     inverse: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Draw a segment on whose line the sensor lies: its nearer end, or nothing but walls if it is on it."""
     if ax * bx + ay * by <= 0.0:
         inverse[:] = np.inf
@@ -178,13 +172,7 @@ def _draw_segments(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _circle(
-    x: float,
-    y: float,
-    radius: float,
-    angle_min: float,
-    angle_increment: float,
-    directions: Array,
-    inverse: Array,
+    x: float, y: float, radius: float, angle_min: float, angle_increment: float, directions: Array, inverse: Array
 ) -> None:
     """Draw a circle whose centre is given in the sensor frame into the buffer of inverse ranges."""
     gap = x * x + y * y - radius * radius
@@ -208,17 +196,9 @@ def _circle(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def cast_rays(
-    segments: Array,
-    circles: Array,
-    x: float,
-    y: float,
-    theta: float,
-    directions: Array,
-    angle_min: float,
-    angle_increment: float,
-    range_max: float,
-    out: Array,
-) -> None:
+    segments: Array, circles: Array, x: float, y: float, theta: float, directions: Array, angle_min: float,
+    angle_increment: float, range_max: float, out: Array,
+) -> None:  # fmt: skip
     """Fill ``out`` with the range of each beam [m], ``inf`` where it meets nothing within ``range_max``.
 
     Parameters

@@ -25,31 +25,11 @@ Array = NDArray[np.float64]
 
 
 @njit(cache=True, nogil=True)
-def _measure(
-    ranges: Array,
-    normals: Array,
-    uniforms: Array,
-    sigma: float,
-    dropout: float,
-    range_min: float,
-    range_max: float,
-) -> None:
-    """Turn true ranges [m] into measured ones, in place (REP 117: ``inf`` no return, ``nan`` no measurement)."""
-    for k in range(ranges.shape[0]):
-        measured = ranges[k] + sigma * normals[k]
-        if measured > range_max:
-            measured = np.inf
-        if uniforms[k] < dropout or measured < range_min:
-            measured = np.nan
-        ranges[k] = measured
-
-
-@njit(cache=True, nogil=True)
 def _sweep(
     segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, normals: Array,
     uniforms: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Cast the rays of a robot at a pose, and measure them: one call instead of two, which each step makes.
+    """Cast the rays of a robot at a pose, and measure them (REP 117: ``inf`` no return, ``nan`` no measurement).
 
     ``limits`` are those of :class:`Lidar`.
     """
@@ -58,7 +38,13 @@ def _sweep(
     theta = pose[2]
     x, y = pose[0] + offset * math.cos(theta), pose[1] + offset * math.sin(theta)
     cast_rays(segments, circles, x, y, theta, directions, angle_min, angle_increment, range_max, out)
-    _measure(out, normals, uniforms, sigma, dropout, range_min, range_max)
+    for k in range(out.shape[0]):
+        measured = out[k] + sigma * normals[k]
+        if measured > range_max:
+            measured = np.inf
+        if uniforms[k] < dropout or measured < range_min:
+            measured = np.nan
+        out[k] = measured
 
 
 @njit(cache=True, nogil=True)
@@ -107,21 +93,13 @@ class Lidar:
         pose
             Of the robot's centre in the world frame ``(3,)``; the sensor is ``offset_m`` ahead of it.
         """
-        config = self.config
+        config, out = self.config, np.empty(self._beams)
         x, y, theta = np.asarray(pose, dtype=np.float64).tolist()
-        out = np.empty(config.beams)
+        x, y = x + config.offset_m * math.cos(theta), y + config.offset_m * math.sin(theta)
         cast_rays(
-            segments,
-            circles,
-            x + config.offset_m * math.cos(theta),
-            y + config.offset_m * math.sin(theta),
-            theta,
-            self._directions,
-            self._angle_min,
-            self._angle_increment,
-            config.range_max_m,
-            out,
-        )
+            segments, circles, x, y, theta, self._directions, self._angle_min, self._angle_increment,
+            config.range_max_m, out,
+        )  # fmt: skip
         return out
 
     def scan(self, segments: Array, circles: Array, pose: ArrayLike, rng: RandomNumbers) -> Scan:
@@ -199,16 +177,9 @@ class WheelEncoders:
         twist = np.empty(3)
         if isinstance(rng, NoiseStream):
             _read_noisy_encoders(
-                self._forward,
-                increments,
-                rng.words,
-                self._sigma,
-                self._rolling,
-                self._creep,
-                dt,
-                self._last,
+                self._forward, increments, rng.words, self._sigma, self._rolling, self._creep, dt, self._last,
                 twist,
-            )
+            )  # fmt: skip
         else:
             _read_encoders(
                 self._forward, increments, rng.standard_normal(4), self._sigma, self._rolling, self._creep, dt,

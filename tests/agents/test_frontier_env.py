@@ -15,7 +15,6 @@ from agents.brisk_tour import BRISK
 from agents.frontier_env import ExploreFrontierEnv
 from agents.learned.choice import CANDIDATE, STATE
 from agents.ppo_frontier import load_choice_policy
-from training.learning.choice_world import Teacher
 
 ID = "mecanum_env:mecanum_env/ExploreFrontier-v0"
 TIME_ALONE = {"area": 0.0, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": 0.0, "effort": 0.0, "time": -1.0}
@@ -93,15 +92,20 @@ def test_pieces_of_frontier_at_one_view_point_are_one_candidate():
 def test_the_tour_that_is_shown_is_that_of_the_agent_tour():
     env = gymnasium.make(ID, rooms="apartment").unwrapped
     observation, _ = env.reset(seed=0)
-    teacher = Teacher("tour", env)
-    teacher.begin()
+    driver, body = env.driver, env.config
+    shared = {"frontiers": driver.frontiers, "planner": driver.planner, "control": driver.control}
+    tour = agents.make("tour", config=shared, robot=body.robot, lidar=body.lidar, step_s=body.step_s)
+    tour.reset(env.belief)
     first, place, loss = (CANDIDATE.index(f"tour_{name}") for name in ("first", "place", "loss"))
     for _ in range(12):
         rows = observation["candidates"][observation["present"] > 0.5]
         assert rows[:, first].sum() == 1.0 and (rows[:, place] >= 0.0).all()
         np.testing.assert_array_equal(rows[:, first] == 1.0, rows[:, place] == 0.0)
         assert rows[np.argmax(rows[:, first]), loss] == 0.0
-        action = int(teacher())
+        choice, found = env.agent.described
+        cell = found.cells[tour._by_views(found, np.flatnonzero(np.isfinite(found.costs)))]
+        # Pieces at one view point are one candidate.
+        action = int(np.flatnonzero((found.cells[choice.index] == cell).all(axis=1))[0])
         assert rows[action, first] == 1.0
         observation, *_ = env.step(action)
 

@@ -19,6 +19,7 @@ import mecanum_env
 import slam
 from mecanum_env import rooms
 from mecanum_env.config import EnvConfig, to_toml
+from mecanum_env.ground_truth import Coverage
 
 IDS = ["mecanum_env/Explore-v0", "mecanum_env/ExploreWheels-v0"]
 ROOT = Path(__file__).parents[2]
@@ -234,10 +235,8 @@ def test_a_turned_start_gives_the_same_coverage_accounts() -> None:
             *_, info = env.step(np.array([0.0, 0.0, 1.0 if k < 20 else -1.0], np.float32))
         areas.append(env.unwrapped.truth.ground.mappable_cells * 0.05**2)
         assert info["coverage"] > 0.5
-        fresh = env.unwrapped._coverage._overlap(env.unwrapped.backend.grid)
-        assert info["coverage"] == pytest.approx(
-            np.count_nonzero(fresh) / env.unwrapped.truth.ground.mappable_cells
-        )
+        fresh = Coverage(env.unwrapped.truth.ground).update(env.unwrapped.backend.grid)
+        assert info["coverage"] == pytest.approx(fresh)
     assert areas[0] == pytest.approx(areas[1], rel=0.02)
 
 

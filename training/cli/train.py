@@ -6,7 +6,7 @@ import os
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
     from training.learning.config import TrainConfig
     from training.learning.end_to_end.config import DriveConfig
-    from training.learning.end_to_end.run import DriveRun
-    from training.learning.ensemble import EnsembleRun
-    from training.learning.ppo import Run
+    from training.learning.folder import FolderRun
 
 __all__ = ["train"]
 
@@ -42,7 +40,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
 ) -> None:
-    """Train a policy with PPO, after rehearsals or a warm start by imitation, as the configuration says.
+    """Train a policy with PPO, in rehearsals or after imitation, as the configuration says.
 
     Writes into --out: checkpoint and best (zips of stable-baselines3; of ppo, safetensors), progress.json,
     curve.jsonl (a line per evaluation on validation seeds) and TensorBoard's files. A run that was broken off goes
@@ -77,7 +75,7 @@ def train(
         raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
 
 
-def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | EnsembleRun | DriveRun]:
+def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., FolderRun]:
     from training.learning.end_to_end.config import DriveConfig
 
     if isinstance(settings, DriveConfig):
@@ -91,53 +89,23 @@ def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., Run | Ensemble
 
 
 def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
+    """Read a configuration by its name in the package, or from a file."""
     from slam.settings import from_mapping
     from training.learning.config import TrainConfig
     from training.learning.end_to_end.config import DriveConfig
 
-    values = _tables(config)
-    if "base" in values:
-        values = _laid_over(_base(config, values.pop("base")), values)
-    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
-    with bad_input():
-        return from_mapping(kind, values if seed is None else values | {"seed": seed})
-
-
-def _base(config: str, name: object) -> dict[str, Any]:
-    """Read the configuration that another one names as its base: of the package, or a file beside it."""
-    if not isinstance(name, str):
-        raise BadInput(f"{config}: base is the name of a configuration or a file, not {name!r}")
-    beside = Path(config).parent / name
-    try:
-        base = _tables(str(beside) if beside.is_file() else name)
-    except BadInput as error:
-        raise BadInput(f"{config}: base: {error}") from error
-    if "base" in base:
-        raise BadInput(f"{config}: the base of a configuration has none itself")
-    return base
-
-
-def _tables(config: str) -> dict[str, Any]:
-    """Read a configuration by its name in the package, or from a file."""
     shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
     path = CONFIGS / f"{config}.toml" if config in shipped else Path(config)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         hint = suggestion(config, shipped)
         raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise BadInput(f"cannot read {path}: {error}") from error
-
-
-def _laid_over(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
-    """Return the base's tables with what the values say instead, table by table."""
-    tables = {
-        key: _laid_over(base[key], value)
-        for key, value in values.items()
-        if isinstance(value, dict) and isinstance(base.get(key), dict)
-    }
-    return base | values | tables
+    kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
+    with bad_input():
+        return from_mapping(kind, values if seed is None else values | {"seed": seed})
 
 
 def _say(text: str) -> None:

@@ -11,8 +11,7 @@ algorithms", 1997).
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +22,11 @@ from agents.learned.station_network import SIDE, Picture, picture
 from slam.formats import replacing
 from slam.grids.occupancy import FREE, OCCUPIED
 from training.dungeons.plans import dungeon_plan
-from training.dungeons.walks import MOST, MOST_HOPS, Driver, LearnedDriver, Stop, TourDriver, Walk
+from training.dungeons.walks import MOST, MOST_HOPS, LearnedDriver, Stop, TourDriver, Walk
 from training.dungeons.world import CELL_M
 from training.runs.campaign import run_all
 
-__all__ = ["Lessons", "gather", "joined", "lessons_of", "read_lessons"]
+__all__ = ["Lessons", "gather", "lessons_of", "read_lessons"]
 
 _AT_RANDOM = 0.1  # share of the hops that are drawn at random
 
@@ -46,8 +45,8 @@ class Lessons:
     path_m: NDArray[np.float32]  # (n, MOST) to the end
 
 
-def lessons_of(seed: int, driver: Driver) -> Lessons:
-    """Drive one episode on the plan of a seed, and return the lessons drawn on the way."""
+def lessons_of(seed: int, driver: TourDriver) -> Lessons | None:
+    """Drive one episode on the plan of a seed, and return the lessons drawn on the way, if any were."""
     walk, rng = Walk(dungeon_plan(seed)), np.random.default_rng([driver.stream, seed])
     drawn: list[tuple[NDArray[Any], ...]] = []
     tried: list[list[Walk]] = []
@@ -64,7 +63,7 @@ def lessons_of(seed: int, driver: Driver) -> Lessons:
             choice = int(rng.integers(count))
         walk.hop(stop.hop_cell(choice))
     if not drawn:
-        return _none()
+        return None
     paths = np.full((len(tried), MOST), np.nan, dtype=np.float32)
     ends = iter(driver.finish([other for walks in tried for other in walks]))
     for k, walks in enumerate(tried):
@@ -102,27 +101,7 @@ def _true_share(stop: Stop, shown: Picture) -> NDArray[np.uint8]:
     return out
 
 
-def _none() -> Lessons:
-    return Lessons(
-        planes=np.zeros((0, 13, SIDE, SIDE), np.uint8),
-        outside=np.zeros((0, 4, SIDE, SIDE), np.uint8),
-        free=np.zeros((0, 4, SIDE, SIDE), np.uint8),
-        targets=np.zeros((0, MOST, 2), np.int64),
-        hops=np.zeros((0, MOST, 2), np.int64),
-        losses_m=np.zeros((0, MOST), np.float32),
-        legs_m=np.zeros((0, MOST), np.float32),
-        path_m=np.zeros((0, MOST), np.float32),
-    )
-
-
 # ---- on disk ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Job:
-    seed: int
-    path: Path
-    policy: Path | None
 
 
 def gather(folder: Path, seeds: range, *, policy: Path | None = None, workers: int = 1) -> None:
@@ -136,27 +115,21 @@ def gather(folder: Path, seeds: range, *, policy: Path | None = None, workers: i
         On Ctrl-C.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    jobs = [_Job(seed, _file(folder, seed), policy) for seed in seeds if not _file(folder, seed).exists()]
+    jobs = [seed for seed in seeds if not _file(folder, seed).exists()]
     if jobs:
-        run_all(jobs, _write, workers=workers, keep=lambda _job, _result: None, what="plans")
+        write = functools.partial(_write, folder, policy)
+        run_all(jobs, write, workers=workers, keep=lambda _job, _result: None, what="plans")
 
 
-def read_lessons(folder: Path, seeds: range) -> Lessons:
-    """Return the lessons of all seeds, which :func:`gather` has written."""
-    parts = []
-    for seed in seeds:
-        with np.load(_file(folder, seed), allow_pickle=False) as file:
-            parts.append(Lessons(**file))
-    return joined(parts)
-
-
-def joined(parts: Sequence[Lessons]) -> Lessons:
-    """Return lessons one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    return Lessons(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in Lessons.__dataclass_fields__)
-    )
+def read_lessons(*parts: tuple[Path, range]) -> Lessons:
+    """Return the lessons of all seeds, one after the other, that :func:`gather` has written to folders."""
+    found = []
+    for folder, seeds in parts:
+        for seed in seeds:
+            with np.load(_file(folder, seed), allow_pickle=False) as file:
+                found.append(dict(file))
+    names = [f.name for f in fields(Lessons)]
+    return Lessons(*(np.concatenate([part[name] for part in found if part]) for name in names))
 
 
 def _file(folder: Path, seed: int) -> Path:
@@ -164,11 +137,12 @@ def _file(folder: Path, seed: int) -> Path:
 
 
 @functools.lru_cache(maxsize=1)
-def _driver(policy: Path | None) -> Driver:
+def _driver(policy: Path | None) -> TourDriver:
     return TourDriver() if policy is None else LearnedDriver.read(policy)
 
 
-def _write(job: _Job) -> None:
-    lessons = lessons_of(job.seed, _driver(job.policy))
-    with replacing(job.path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **{name: getattr(lessons, name) for name in Lessons.__dataclass_fields__})
+def _write(folder: Path, policy: Path | None, seed: int) -> None:
+    lessons = lessons_of(seed, _driver(policy))
+    arrays = {} if lessons is None else {f.name: getattr(lessons, f.name) for f in fields(lessons)}
+    with replacing(_file(folder, seed)) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)

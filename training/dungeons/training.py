@@ -14,7 +14,7 @@ import shlex
 import statistics
 import sys
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,15 +23,15 @@ import torch
 import typer
 from numpy.typing import NDArray
 from safetensors import safe_open
-from safetensors.numpy import save
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from agents.learned.policy_files import write_policy
 from agents.learned.station_network import PLANES, opening_numbers, with_walls
-from agents.learned_tour import FORMAT, PRECISION
-from slam.formats import atomic_write, replacing
+from agents.learned_tour import FORMAT
+from slam.formats import replacing
 from training.dungeons.episode import explore
-from training.dungeons.lessons import Lessons, gather, joined, read_lessons
+from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork
 from training.dungeons.plans import dungeon_plan
 from training.runs.campaign import check_settings, installed_version, write_settings
@@ -97,35 +97,21 @@ def batch_of(lessons: Lessons, rows: NDArray[np.int64], told: NDArray[np.bool_] 
 
 def turned(batch: Batch, quarters: int, mirrored: bool) -> Batch:
     """Return the batch with its pictures turned by quarters of a circle, and mirrored after that."""
+
+    def change(x: NDArray[Any]) -> NDArray[Any]:
+        x = np.rot90(x, quarters, axes=(-2, -1))
+        return np.ascontiguousarray(x[..., ::-1] if mirrored else x)
+
     side = batch.planes.shape[-1]
-    planes, free = batch.planes, batch.free
-    targets, hops = batch.targets, batch.hops
-    for _ in range(quarters):
-        planes, free = (_each_quarter(x, lambda q: np.rot90(q, 1, axes=(1, 2))) for x in (planes, free))
-        planes, free = np.rot90(planes, 1, axes=(2, 3)), np.rot90(free, 1, axes=(2, 3))
-        targets, hops = (np.stack([side - 1 - at[..., 1], at[..., 0]], axis=-1) for at in (targets, hops))
-    if mirrored:
-        planes, free = (_each_quarter(x, lambda q: q[:, :, ::-1]) for x in (planes, free))
-        planes, free = planes[..., ::-1], free[..., ::-1]
-        targets, hops = (np.stack([at[..., 0], side - 1 - at[..., 1]], axis=-1) for at in (targets, hops))
-    return Batch(
-        np.ascontiguousarray(planes),
-        np.ascontiguousarray(free),
-        targets,
-        hops,
-        batch.numbers,
-        batch.paths,
-        batch.there,
+    order = change(np.arange(4).reshape(2, 2)).ravel()  # of the quarters of a pixel
+    planes = np.concatenate([order, order + 4, np.arange(8, PLANES)])
+    place = np.argsort(change(np.arange(side * side).reshape(side, side)).ravel())  # where each pixel comes to lie
+    targets, hops = (
+        np.stack(np.divmod(place[at[..., 0] * side + at[..., 1]], side), axis=-1)
+        for at in (batch.targets, batch.hops)
     )
-
-
-def _each_quarter(x: Floats, change: Any) -> Floats:
-    """Change the order of the quarters of a pixel, ``(b, 2, 2, n, n)``, in the planes that show them."""
-    x = x.copy()
-    for begin in (0, 4) if x.shape[1] == PLANES else (0,):
-        quarters = x[:, begin : begin + 4].reshape(len(x), 2, 2, *x.shape[2:])
-        x[:, begin : begin + 4] = change(quarters).reshape(len(x), 4, *x.shape[2:])
-    return x
+    moved = {"planes": change(batch.planes[:, planes]), "free": change(batch.free[:, order])}
+    return replace(batch, **moved, targets=targets, hops=hops)
 
 
 # ---- training --------------------------------------------------------------------------------------------------
@@ -135,14 +121,19 @@ def _centred(scores: Tensor, there: Tensor) -> Tensor:
     return (scores - (scores * there).sum(1, keepdim=True) / there.sum(1, keepdim=True)) * there
 
 
+def _asked(network: StationNetwork, planes: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+    said: tuple[Tensor, Tensor] = network(
+        planes, torch.tensor(batch.targets), torch.tensor(batch.hops), torch.tensor(batch.numbers)
+    )
+    return said
+
+
 def _losses(network: StationNetwork, batch: Batch) -> tuple[Tensor, Tensor]:
     """Return how far off the costs of openings are, and what is free where nothing is known yet."""
     there, free = torch.tensor(batch.there), torch.tensor(batch.free)
     planes = torch.tensor(batch.planes).contiguous(memory_format=torch.channels_last)
     with torch.autocast("cpu", torch.bfloat16):
-        scores, odds = network(
-            planes, torch.tensor(batch.targets), torch.tensor(batch.hops), torch.tensor(batch.numbers)
-        )
+        scores, odds = _asked(network, planes, batch)
     scores, odds = scores.float(), odds.float()
     off = nn.functional.smooth_l1_loss(_centred(scores, there), torch.tensor(batch.paths), reduction="sum")
     unknown = (planes[:, -1:] > 0.5).float()
@@ -157,10 +148,7 @@ def regret_m(network: StationNetwork, lessons: Lessons) -> tuple[float, float]:
         for begin in range(0, len(lessons.planes), 256):
             rows = np.arange(begin, min(begin + 256, len(lessons.planes)))
             batch = batch_of(lessons, rows)
-            scores, _ = network(
-                torch.tensor(batch.planes), torch.tensor(batch.targets), torch.tensor(batch.hops),
-                torch.tensor(batch.numbers),
-            )  # fmt: skip
+            scores, _ = _asked(network, torch.tensor(batch.planes), batch)
             choice = np.where(batch.there > 0, scores.numpy(), np.inf).argmin(axis=1)
             picked.append(lessons.path_m[rows, choice] - lessons.path_m[rows, 0])
     longer = np.concatenate(picked)
@@ -172,10 +160,10 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
 
     A run that was broken off goes on from its last whole epoch. What is validated on is the last round's.
     """
-    folders = {k: _round(out, k) for k in range(1, number + 1)}
-    lessons = joined([read_lessons(folder / "lessons", _seeds(config, k)) for k, folder in folders.items()])
-    unseen = read_lessons(folders[number] / "lessons", _unseen(config))
-    out = folders[number]
+    rounds = range(1, number + 1)
+    lessons = read_lessons(*((_round(out, k) / "lessons", _seeds(config, k)) for k in rounds))
+    out = _round(out, number)
+    unseen = read_lessons((out / "lessons", _unseen(config)))
     torch.manual_seed(config.seed)
     network = StationNetwork()
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -227,11 +215,9 @@ def _unseen(config: TrainingConfig) -> range:
 def _rate_at(share: float) -> float:
     """Return the learning rate's share: up over the first seventh, then down along a cosine."""
     warm = 1.0 / 7.0
-    return (
-        0.04 + 0.96 * share / warm
-        if share < warm
-        else 0.5 + 0.5 * math.cos(math.pi * (share - warm) / (1.0 - warm))
-    )
+    if share < warm:
+        return 0.04 + 0.96 * share / warm
+    return 0.5 + 0.5 * math.cos(math.pi * (share - warm) / (1.0 - warm))
 
 
 def _keep(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, curve: list[dict[str, float]]) -> None:
@@ -285,10 +271,6 @@ def study(
     print(out / _WEIGHTS)
 
 
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     """Gather lessons, train and write the policy."""
     settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
@@ -302,28 +284,25 @@ def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
             gather(folder / "lessons", seeds, policy=policy, workers=workers)
         network, curve = train(out, config, number)
         curves.append(curve)
-        weights = {
-            name: np.asarray(value.numpy(), PRECISION, order="C")  # as it lies in memory, channels may come last
-            for name, value in network.state_dict().items()
-            if not name.startswith("free.")
-        }
-        policy = folder / _WEIGHTS
-        atomic_write(policy, save(weights))
-    arguments = [f"{_option(name)}={value}" for name, value in asdict(config).items()]
-    last = _VALIDATION + config.validation_plans - 1
-    about: dict[str, Any] = {
-        "format": FORMAT,
-        "command": shlex.join(["mecanum", "study", "learned-tour", "--out", "OUT", *arguments]),
-        "config": asdict(config),
-        "seeds": f"plans 0-{config.plans - 1}; validation {_VALIDATION}-{last}",
-        "curves": curves,
-    }
-    atomic_write(out / _WEIGHTS, save(weights))
-    atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")
+        weights = {name: v.numpy() for name, v in network.state_dict().items() if not name.startswith("free.")}
+        policy, about = folder / _WEIGHTS, _about(config, curves)
+        write_policy(policy, weights, about)
+    write_policy(out / _WEIGHTS, weights, about)
     # What counts is whole episodes: what a single choice gains, as lessons have it, says little of them.
-    plans = [dungeon_plan(_VALIDATION + k) for k in range(config.validation_plans)]
+    plans = [dungeon_plan(seed) for seed in _unseen(config)]
     about["validation_path_m"] = {
         name: round(statistics.fmean(float(explore(plan, agent)["path_m"]) for plan in plans), 2)
         for name, agent in (("tour", "tour"), ("learned-tour", str(out / _WEIGHTS)))
     }
-    atomic_write((out / _WEIGHTS).with_suffix(".json"), json.dumps(about, indent=1) + "\n")
+    write_policy(out / _WEIGHTS, weights, about)
+
+
+def _about(config: TrainingConfig, curves: list[list[dict[str, float]]]) -> dict[str, Any]:
+    arguments = [f"--{name.replace('_', '-')}={value}" for name, value in asdict(config).items()]
+    return {
+        "format": FORMAT,
+        "command": shlex.join(["mecanum", "study", "learned-tour", "--out", "OUT", *arguments]),
+        "config": asdict(config),
+        "seeds": f"plans 0-{config.plans - 1}; validation {_VALIDATION}-{_unseen(config)[-1]}",
+        "curves": curves,
+    }

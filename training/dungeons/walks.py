@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -35,7 +34,7 @@ from slam.grids.occupancy import UNKNOWN
 from training.dungeons.networks import StationNetwork
 from training.dungeons.world import CELL_M, TREE, Dungeon, look, scan
 
-__all__ = ["LUCK", "MOST", "REACH", "Driver", "LearnedDriver", "Stop", "TourDriver", "Walk", "rest_of_the_tour"]
+__all__ = ["LUCK", "MOST", "REACH", "LearnedDriver", "Stop", "TourDriver", "Walk", "rest_of_the_tour"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -154,34 +153,20 @@ def rest_of_the_tour(
     return total
 
 
-class Driver(Protocol):
-    """What chooses at stops, and goes on to the end."""
-
-    stream: int
-    """Number that the draws of an episode begin with."""
-    asked: float
-    """Share of the stops that lessons are drawn from."""
-
-    def choose(self, stops: Sequence[Stop]) -> list[int]:
-        """Return the opening to take at each stop."""
-        ...
-
-    def finish(self, walks: Sequence[Walk]) -> list[float]:
-        """Drive all robots to the end; return the lengths of their paths [m]. What they know may be used up."""
-        ...
-
-
 class TourDriver:
     """Goes on with the tour over what is known."""
 
-    stream, asked = 5, 0.4
+    stream = 5
+    """Number that the draws of an episode begin with."""
+    asked = 0.4
+    """Share of the stops that lessons are drawn from."""
 
     def choose(self, stops: Sequence[Stop]) -> list[int]:
         """Return the opening to take at each stop: the first is the best tour."""
         return [0] * len(stops)
 
     def finish(self, walks: Sequence[Walk]) -> list[float]:
-        """Drive all robots to the end; return the lengths of their paths [m]."""
+        """Drive all robots to the end; return the lengths of their paths [m]. What they know is used up."""
         return [
             walk.path_m
             + rest_of_the_tour(
@@ -192,7 +177,7 @@ class TourDriver:
         ]  # fmt: skip
 
 
-class LearnedDriver:
+class LearnedDriver(TourDriver):
     """Goes on as ``learned-tour`` does, with the network in PyTorch and half precision.
 
     Parameters
@@ -218,10 +203,7 @@ class LearnedDriver:
     def choose(self, stops: Sequence[Stop]) -> list[int]:
         """Return the opening to take at each stop."""
         choices = [0] * len(stops)
-        asked = []
-        for k, stop in enumerate(stops):
-            if stop.walk.is_news() and len(stop.openings.targets) > 1:
-                asked.append(k)
+        asked = [k for k, stop in enumerate(stops) if stop.walk.is_news() and len(stop.openings.targets) > 1]
         if not asked:
             return choices
         planes = np.empty((len(asked), PLANES, SIDE, SIDE), np.float32)

@@ -8,94 +8,59 @@ from __future__ import annotations
 import json
 import multiprocessing
 import queue
-import time
-from concurrent.futures import Future
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from agents.learned.choice_network import joined
-from slam.formats import atomic_write
 from training.learning.config import TrainConfig
+from training.learning.folder import FolderRun, seed_of
 from training.learning.networks import read_zip
-from training.learning.ppo import Log, Run, Weights, evaluate, trials_in_full
-from training.runs.campaign import worker_pool
-from training.runs.running import progress_of_run
+from training.learning.ppo import Run, Weights, evaluate, trials_in_full
 
 __all__ = ["EnsembleRun", "best_weights", "curve_of"]
 
 
-class EnsembleRun:
+class EnsembleRun(FolderRun):
     """A run for each member, in folders ``member-1``, ``member-2`` and so on, and a trial of all at the end.
 
-    The folder itself gets ``progress.json`` and ``curve.jsonl``; a member that is done is not trained again. As
-    many members as there are workers are trained at a time, each in one process.
-
-    Raises
-    ------
-    ValueError
-        Where the folder holds a run with another configuration.
+    A member that is done is not trained again. As many members as there are workers are trained at a time, each in
+    one process.
     """
 
-    def __init__(self, config: TrainConfig, out: Path, *, workers: int, log: Log, command: str = "") -> None:
-        self.config, self.out, self._workers, self._log = config, out, workers, log
-        self._progress = progress_of_run(out, config, command=command, steps=0, wall_s=0.0, done=False)
+    config: TrainConfig
 
-    def train(self) -> None:
-        """Train to the end; a run broken off anywhere goes on from its last checkpoint."""
-        self.out.mkdir(parents=True, exist_ok=True)
-        self._began = time.perf_counter() - self._progress["wall_s"]
-        self._keep_progress()
-        if not self._progress["done"]:
-            self._train_members()
-            self._evaluate()
-
-    def _train_members(self) -> None:
-        jobs = [
-            (replace(self.config, members=1, seed=_seed_of(self.config.seed, number)), folder)
-            for number, folder in enumerate(_folders(self.config, self.out))
-        ]
-        command = self._progress["command"]
-        with multiprocessing.get_context("spawn").Manager() as manager, worker_pool(self._workers) as pool:
+    def _train(self, pool: ProcessPoolExecutor) -> None:
+        folders = _folders(self.config, self.out)
+        with multiprocessing.get_context("spawn").Manager() as manager:
             said = manager.Queue()
-            futures = [pool.submit(_train_member, *job, f"{command}: {job[1].name}", said) for job in jobs]
+            futures = []
+            for number, folder in enumerate(folders):
+                config = replace(self.config, members=1, seed=seed_of(self.config.seed, number))
+                command = f"{self._progress['command']}: {folder.name}"
+                futures.append(pool.submit(_train_member, config, folder, command, said))
             while not said.empty() or not all(future.done() for future in futures):
                 self._pass_on(said, futures)
         for future in futures:
             future.result()
+        steps = sum(json.loads((folder / "progress.json").read_text())["steps"] for folder in folders)
+        self._keep(steps=steps)
+        weights = best_weights(self.config, self.out)
+        result = evaluate(weights, self.config.heads, trials_in_full(self.config), pool)
+        at = {"stage": "all members", "steps": steps}
+        self._note_trial(at, result, result["time_to_95_s"], lambda: None)
 
     def _pass_on(self, said: queue.Queue[tuple[str, str]], futures: list[Future[None]]) -> None:
         """Log what a member says next, if any does within a second; raise what one failed of."""
         try:
             name, text = said.get(timeout=1.0)
-            self._keep_progress()
+            self._keep()
             self._log(f"{name}: {text}")
         except queue.Empty:
             for future in futures:
                 if future.done():
                     future.result()
-
-    def _keep_progress(self) -> None:
-        if not self._progress["done"]:
-            self._progress["wall_s"] = time.perf_counter() - self._began
-        atomic_write(self.out / "progress.json", json.dumps(self._progress))
-
-    def _evaluate(self) -> None:
-        with worker_pool(self._workers) as pool:
-            weights = best_weights(self.config, self.out)
-            result = evaluate(weights, self.config.heads, trials_in_full(self.config), pool)
-        members = [
-            json.loads((folder / "progress.json").read_text()) for folder in _folders(self.config, self.out)
-        ]
-        self._progress["steps"] = sum(member["steps"] for member in members)
-        self._keep_progress()
-        line = {"stage": "all members", **result} | {key: self._progress[key] for key in ("steps", "wall_s")}
-        atomic_write(self.out / "curve.jsonl", json.dumps(line) + "\n")
-        self._progress["done"] = True
-        self._keep_progress()
-        self._log(f"all members: {result['time_to_95_s']:.2f} s to 95 %, {result['collisions']} collisions")
 
 
 def _train_member(config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]]) -> None:
@@ -123,7 +88,3 @@ def _read(folder: Path) -> list[dict[str, Any]]:
 
 def _folders(config: TrainConfig, out: Path) -> list[Path]:
     return [out] if config.members == 1 else [out / f"member-{k + 1}" for k in range(config.members)]
-
-
-def _seed_of(seed: int, number: int) -> int:
-    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0] % 2**31)

@@ -10,20 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, SupportsInt, cast
+from typing import Any, SupportsInt
 
 import cv2
-import gymnasium
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
-from agents.frontier_env import Observation, as_observation, choice_space
+from agents.frontier_env import ChoiceEnv, Observation
 from agents.learned.chooser import Chooser, ChooserConfig
-from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.rooms.floor_plan import FloorPlan
-from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from mecanum_env.sensing.sensors import Lidar
 from slam.belief import Belief
 from slam.features.extraction import FeatureExtractor
 from slam.geometry import inverse, transform_points
@@ -48,7 +46,7 @@ _ROOM_M = 0.4  # around a place to begin at
 _POSE_COV = np.diag([2.5e-5, 2.5e-5, 1e-6])  # that the planner keeps off walls by; a filter's is about that
 
 
-class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
+class JumpWorld(ChoiceEnv):
     """The choices of ``ExploreFrontier-v0``, with jumps from look to look in between.
 
     Parameters
@@ -57,9 +55,9 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         As there. Covariance and landmarks there are none of: their columns are 0.
     time_limit_s : float
         Of an episode.
-    time_1_s, covered_1 : float
-        Reward of a second, and of all there is to map, as far as 95 % of it. An episode that ends with nothing
-        left to choose before that is charged with the time until the limit.
+    time_1_s : float
+        Reward of a second. An episode that ends with nothing left to choose before 95 % are mapped is charged with
+        the time until the limit.
 
     Notes
     -----
@@ -73,16 +71,13 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         driver: ChooserConfig | Mapping[str, Any] | None = None,
         time_limit_s: float = 300.0,
         time_1_s: float = -1.0 / 30.0,
-        covered_1: float = 0.0,
     ) -> None:
         config = from_mapping(ChooserConfig, driver)
-        self.driver = replace(config, choice=replace(config.choice, uncertainty=False))
-        self.time_limit_s, self._time_1_s, self._covered_1 = time_limit_s, time_1_s, covered_1
-        self.action_space = spaces.Discrete(self.driver.choice.most)
-        self.observation_space = cast("spaces.Space[Observation]", choice_space(self.driver))
+        super().__init__(replace(config, choice=replace(config.choice, uncertainty=False)))
+        self.time_limit_s, self._time_1_s = time_limit_s, time_1_s
         self.robot, self.lidar = RobotConfig(), LidarConfig()
-        self.agent = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
-        self._eye = _Eye(self.lidar, self.robot)
+        self.agent: _Passenger = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
+        self._eye, self._extractor = Lidar(self.lidar, NoiseConfig()), FeatureExtractor()
         self._place: _Place | None = None
 
     @property
@@ -98,12 +93,6 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         """The truth of the episode."""
         assert self._place is not None
         return self._place.truth
-
-    def action_masks(self) -> NDArray[np.bool_]:
-        """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
-        masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
-        masks[0] = True
-        return masks
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -123,14 +112,13 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         self._look()
         self._look()
         self._choice = self.agent.survey(self.belief)
-        return as_observation(self._choice, self.driver), self._info(0.0)
+        return self._observed(), self._info(0.0)
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Go to a view point until the next choice of more than one is due."""
-        k, before, began = int(action), self.covered, self.time_s
+        k, began = int(action), self.time_s
         while not self._over:
-            if self._choice is not None:
-                self.agent.take(self._choice, k if k < len(self._choice.index) else 0)
+            self._take(k)
             self._choice, k = None, 0
             if not self._go() or self.covered >= COVERED:
                 break
@@ -138,15 +126,11 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
             if self._choice is not None and len(self._choice.index) > 1:
                 break
         reward = self._time_1_s * (self.time_s - began)
-        reward += self._covered_1 * (min(self.covered, COVERED) - min(before, COVERED))
         truncated = self.time_s >= self.time_limit_s and self.covered < COVERED
         terminated = not truncated and (self.covered >= COVERED or self._choice is None)
         if terminated and self.covered < COVERED:
             reward += self._time_1_s * (self.time_limit_s - self.time_s)
-        return (
-            as_observation(self._choice, self.driver), reward, terminated, truncated,
-            self._info(self.time_s - began),
-        )  # fmt: skip
+        return self._observed(), reward, terminated, truncated, self._info(self.time_s - began)
 
     @property
     def _over(self) -> bool:
@@ -159,16 +143,27 @@ class JumpWorld(gymnasium.Env[Observation, SupportsInt]):
         }  # fmt: skip
 
     def _look(self) -> None:
+        """Draw into the grid what is seen, without noise."""
         assert self._place is not None
-        self._eye.look(self._place, self._pose, self._grid)
+        lidar, (x, y, heading) = self.lidar, self._pose.tolist()
+        scan = Scan(
+            self._eye.true_ranges(self._place.segments, self._place.circles, self._pose),
+            angle_min=lidar.angle_min, angle_increment=lidar.angle_increment, range_max=lidar.range_max_m,
+        )  # fmt: skip
+        self._extractor.extract(scan)
+        eye = (x + lidar.offset_m * math.cos(heading), y + lidar.offset_m * math.sin(heading), heading)
+        self._grid.integrate(eye, scan, self._extractor.surface, body=(x, y, self.robot.inscribed_radius_m))
         self.covered = self._coverage.update(self._grid)
 
     def _go(self) -> bool:
         """Go until a choice is due; return whether there was anywhere to go."""
         began = self.time_s
-        path = self.agent.set_off(self.belief, self.time_s)
-        if path is None:
+        belief = self.belief
+        self.agent.pass_by(belief, self.time_s)
+        goal = self.agent.choose(belief)
+        if goal is None:
             return False
+        path = goal.path
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         self.time_s += _TURN_S * (1.0 - self._kept(path, along))
         gone, length = 0.0, float(along[-1])
@@ -207,13 +202,7 @@ def _at(path: Array, along: Array, s: float) -> Array:
 
 
 class _Passenger(Chooser):
-    """A chooser that is carried: it says where to, and is told when it is there."""
-
-    def set_off(self, belief: Belief, time_s: float) -> Array | None:
-        """Return the way ``(n, 2)`` to what was taken last; None where there is nothing to go to."""
-        self.pass_by(belief, time_s)
-        goal = self.choose(belief)
-        return None if goal is None else goal.path
+    """A chooser that is carried: it is told where it is."""
 
     def pass_by(self, belief: Belief, time_s: float) -> None:
         """Take note of the time, and of where the sensor is."""
@@ -262,27 +251,3 @@ class _Place:
             return np.zeros((1, 2))
         cells = np.argwhere(labels == labels[row, col])
         return np.asarray((cells + np.array(truth.lattice_origin) + 0.5)[:, ::-1] * truth.resolution)
-
-
-class _Eye:
-    """The lidar without noise, and its scans drawn."""
-
-    def __init__(self, lidar: LidarConfig, robot: RobotConfig) -> None:
-        self._lidar, self._body_m = lidar, robot.inscribed_radius_m
-        self._directions = beam_directions(lidar.beams, lidar.angle_min, lidar.angle_increment)
-        self._extractor = FeatureExtractor()
-
-    def look(self, place: _Place, pose: Array, grid: OccupancyGrid) -> None:
-        """Draw into the grid what is seen from a pose ``(3,)`` of the robot."""
-        lidar, (x, y, heading) = self._lidar, pose.tolist()
-        eye = (x + lidar.offset_m * math.cos(heading), y + lidar.offset_m * math.sin(heading), heading)
-        ranges = np.empty(lidar.beams)
-        cast_rays(
-            place.segments, place.circles, *eye, self._directions, lidar.angle_min, lidar.angle_increment,
-            lidar.range_max_m, ranges,
-        )  # fmt: skip
-        scan = Scan(
-            ranges, angle_min=lidar.angle_min, angle_increment=lidar.angle_increment, range_max=lidar.range_max_m
-        )
-        self._extractor.extract(scan)
-        grid.integrate(eye, scan, self._extractor.surface, body=(x, y, self._body_m))

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from agents.learned.choice import CANDIDATE, STATE
 
-__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "PassedOn", "read_zip"]
+__all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "read_zip"]
 
 _NOWHERE = -1e9
 _INSIDE = "features_extractor.network."  # where the network is among the parameters of ChoicePolicy
@@ -126,28 +126,8 @@ class ChoiceExtractor(BaseFeaturesExtractor):
         return torch.cat([tokens.flatten(1), observation["present"]], dim=1)
 
 
-class PassedOn(nn.Module):
-    """No further layers between what stable-baselines3 calls features and the heads."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.latent_dim_pi = self.latent_dim_vf = width
-
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the features for actor and critic."""
-        return features, features
-
-    def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the features for the actor."""
-        return features
-
-    def forward_critic(self, features: Tensor) -> Tensor:
-        """Return the features for the critic."""
-        return features
-
-
 class _Head(nn.Module):
-    """A head of the network, on the features as they are passed on."""
+    """A head of the network, on the features."""
 
     def __init__(self, network: ChoiceNetwork, candidates: int, *, value: bool) -> None:
         super().__init__()
@@ -170,7 +150,7 @@ class ChoicePolicy(MaskableActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         extractor = cast("ChoiceExtractor", self.features_extractor)
         k = int(cast("spaces.Discrete", self.action_space).n)
-        self.mlp_extractor = PassedOn(extractor.features_dim)  # type: ignore[assignment]
+        self._build_mlp_extractor()  # of no layers: the network is all there is
         self.action_net = _Head(extractor.network, k, value=False)
         self.value_net = _Head(extractor.network, k, value=True)  # type: ignore[assignment]
         make: Any = self.optimizer_class

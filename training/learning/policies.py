@@ -10,18 +10,19 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load_file
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents import ppo, ppo_frontier
+from agents.learned.choice import CANDIDATE, STATE
 from agents.learned.choice_network import apart
 from agents.learned.chooser import ChooserConfig
-from agents.ppo import FORMAT, load_drive_policy
-from agents.ppo_frontier import load_choice_policy, policy_description
-from slam.formats import atomic_write, replacing
+from agents.learned.policy_files import write_policy
 from slam.settings import from_mapping, to_mapping
 from training.learning.choice_world import make_world
 from training.learning.config import TrainConfig
 from training.learning.ensemble import best_weights, curve_of
+from training.learning.folder import save_model
 from training.learning.networks import ChoicePolicy
 from training.learning.ppo import make_model
 
@@ -42,10 +43,12 @@ def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, trai
     """
     config = training["config"]
     driver = to_mapping(from_mapping(ChooserConfig, config["world"]["driver"]))
-    described = policy_description(config["heads"], driver, **training)
-    atomic_write(target, save(_halved(weights)))
-    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
-    load_choice_policy(target)  # it is read back
+    described = {
+        "format": ppo_frontier.FORMAT, "heads": config["heads"], "candidate": list(CANDIDATE),
+        "state": list(STATE), "driver": driver, **training,
+    }  # fmt: skip
+    write_policy(target, weights, described)
+    ppo_frontier.load_choice_policy(target)  # it is read back
 
 
 def export_run(run: Path, target: Path) -> None:
@@ -87,7 +90,7 @@ def write_zip(source: Path, target: Path, member: int | None = None) -> None:
         Where ``source`` is no such policy, is of several networks and ``member`` none of them, or its JSON file
         does not say how it was trained.
     """
-    count = len(load_choice_policy(source)[0].members)
+    count = len(ppo_frontier.load_choice_policy(source)[0].members)
     if not 1 <= (member or (1 if count == 1 else 0)) <= count:
         raise ValueError(f"{source} is of {count} network{'s' * (count > 1)}: choose one by --member 1 … {count}")
     described = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
@@ -95,31 +98,24 @@ def write_zip(source: Path, target: Path, member: int | None = None) -> None:
         raise ValueError(f"{source.with_suffix('.json')} does not say with which config it was trained")
     config = from_mapping(TrainConfig, described["config"])
     env = DummyVecEnv([lambda: make_world(config.world)])
-    model = make_model(config, env)
+    model = make_model(config, env, config.ppo)
     network = cast("ChoicePolicy", model.policy).network
     weights = apart(load_file(source))[(member or 1) - 1]
     network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
-    with replacing(target) as new:
-        model.save(new)
+    save_model(model, target)
     env.close()
 
 
 def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: Any) -> None:
-    """Write the best weights of a run of ``ppo`` in half precision, and the JSON file."""
+    """Write the best weights of a run of ``ppo``, and the JSON file."""
     config = progress["config"]
     described = {
-        "format": FORMAT, "uncertainty": config["uncertainty"],
+        "format": ppo.FORMAT, "uncertainty": config["uncertainty"],
         "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
         **_training(progress, curve),
     }  # fmt: skip
-    atomic_write(target, save(_halved(load_file(run / "best.safetensors"))))
-    atomic_write(target.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
-    load_drive_policy(target)  # it is read back
-
-
-def _halved(weights: Mapping[str, NDArray[np.float32]]) -> dict[str, NDArray[np.float16]]:
-    # Safetensors writes memory as it lies, whatever its order.
-    return {name: np.asarray(value, dtype=np.float16, order="C") for name, value in weights.items()}
+    write_policy(target, load_file(run / "best.safetensors"), described)
+    ppo.load_drive_policy(target)  # it is read back
 
 
 def _training(progress: Mapping[str, Any], curve: Any) -> dict[str, Any]:

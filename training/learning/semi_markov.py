@@ -13,7 +13,7 @@ __all__ = ["Durations", "SemiMarkovBuffer"]
 
 
 class SemiMarkovBuffer(MaskableDictRolloutBuffer):
-    """A rollout buffer that discounts by ``gamma`` per unit of time, not per step.
+    """A rollout buffer that discounts by ``gamma`` per second, not per step.
 
     ``durations`` ``(steps, environments)`` are set before each :meth:`add` by :class:`Durations`. λ is per step.
     """
@@ -38,13 +38,9 @@ class SemiMarkovBuffer(MaskableDictRolloutBuffer):
 
 
 class Durations(BaseCallback):
-    """Tells the buffer how long each step took, in units of ``unit_s``."""
-
-    def __init__(self, unit_s: float = 1.0) -> None:
-        super().__init__()
-        self._unit_s = unit_s
+    """Tells the buffer how many seconds each step took."""
 
     def _on_step(self) -> bool:
         buffer = self.model.rollout_buffer  # type: ignore[attr-defined]
-        buffer.durations[buffer.pos] = [info["duration_s"] / self._unit_s for info in self.locals["infos"]]
+        buffer.durations[buffer.pos] = [info["duration_s"] for info in self.locals["infos"]]
         return True

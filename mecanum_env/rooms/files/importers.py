@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -19,12 +18,14 @@ from numpy.typing import NDArray
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES, read_bytes, read_grey
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.assembly import DRIVE_RADIUS_M, generator
+from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
 
-__all__ = ["from_raster", "load", "load_image", "load_ros_map"]
+__all__ = ["from_raster", "load"]
 
 Mask = NDArray[np.bool_]
 Pose = Sequence[float]
+Raster = tuple[Mask, float, tuple[float, float]]  # free cells, their side [m], the lower-left corner [m]
 
 _START_CLEARANCE_M = 0.6
 _RADII_M = (DRIVE_RADIUS_M, 0.35, 0.3, 0.2, 0.1, 0.0)
@@ -54,35 +55,34 @@ def load(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES:
-        return load_image(path, start=start, seed=seed, resolution=0.05 if resolution is None else resolution)
-    if suffix not in (".yaml", ".yml"):
+        what = f"image {path}"
+        raster = _read_image(path, 0.05 if resolution is None else resolution, what)
+    elif suffix not in (".yaml", ".yml"):
         valid = ", ".join((".yaml", ".yml", *IMAGE_SUFFIXES))
         raise FloorPlanError(f"floor plan {path} has the unknown suffix {suffix!r}; valid: {valid}")
-    if resolution is not None:
+    elif resolution is not None:
         raise FloorPlanError(f"map {path} says its own resolution; leave resolution out or give the image")
-    return load_ros_map(path, start=start, seed=seed)
+    else:
+        what = f"map {path}"
+        raster = _read_ros_map(path, what)
+    free, cell_m, origin = raster
+    return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)
 
 
-def load_image(
-    path: str | Path, *, start: Pose | None = None, seed: int = 0, resolution: float = 0.05
-) -> FloorPlan:
+def _read_image(path: Path, resolution: float, what: str) -> Raster:
     """Read a picture of a plan: bright pixels (above 127) are free, the lower-left one is at the origin."""
-    path = Path(path)
-    resolution = _resolution(resolution, f"image {path}")
-    free = read_grey(path)[::-1] > 127
-    return from_raster(free, name=path.stem, resolution=resolution, start=start, seed=seed, what=f"image {path}")
+    resolution = _resolution(resolution, what)
+    return read_grey(path)[::-1] > 127, resolution, (0.0, 0.0)
 
 
-def load_ros_map(path: str | Path, *, start: Pose | None = None, seed: int = 0) -> FloorPlan:
+def _read_ros_map(path: Path, what: str) -> Raster:
     """Read a ROS map_server map: a cell is free where its occupancy is below ``free_thresh``, else solid.
 
     The occupancy of a grey value c is (255 − c) / 255, or c / 255 if ``negate``; in ``mode: raw`` it is c %.
     """
-    path = Path(path)
-    what = f"map {path}"
     values = _read_yaml(path, what)
     resolution = _resolution(values.get("resolution"), what)
-    x, y = _origin(values.get("origin"), what)
+    origin = _origin(values.get("origin"), what)
     limit = _threshold(values, "free_thresh", 0.196, what)
     _threshold(values, "occupied_thresh", 0.65, what)
     negate = values.get("negate", 0)
@@ -99,15 +99,7 @@ def load_ros_map(path: str | Path, *, start: Pose | None = None, seed: int = 0) 
         occupancy = grey / np.float32(100.0)
     else:
         occupancy = (grey if negate else np.float32(255.0) - grey) / np.float32(255.0)
-    return from_raster(
-        occupancy < limit,
-        name=path.stem,
-        resolution=resolution,
-        origin=(x, y),
-        start=start,
-        seed=seed,
-        what=what,
-    )
+    return occupancy < limit, resolution, origin
 
 
 def from_raster(
@@ -143,8 +135,6 @@ def from_raster(
     return FloorPlan(
         name=name,
         walls=walls,
-        polygons=(),
-        circles=np.zeros((0, 3)),
         free=free,
         resolution=resolution,
         origin=origin,
@@ -158,9 +148,8 @@ def _start(
     clearance = clearance_of(free, resolution)
     # Of a free cell's centre at the least, so that some radius fits.
     radius = next((r for r in _RADII_M if np.any(clearance >= r)), 0.0)
-    passable = ((clearance >= radius) & free).astype(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(passable, connectivity=4)
-    area = labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    area = largest_part((clearance >= radius) & free)
+    assert area is not None
     # Surfaces may lie half a cell before the cells' edges.
     wanted = min(_START_CLEARANCE_M + 0.5 * resolution, float(clearance[area].max()))
     places = np.flatnonzero(area & (clearance >= wanted))

@@ -14,7 +14,7 @@ import numpy as np
 
 from mecanum_env.rooms.layout.furniture import Box, cells
 from mecanum_env.rooms.layout.limits import interval
-from slam.settings import require
+from slam.settings import shares
 
 __all__ = ["ApartmentConfig", "Door", "Layout", "draw_layout"]
 
@@ -37,15 +37,12 @@ class ApartmentConfig:
 
     def __post_init__(self) -> None:
         interval(self, "area_m2", low=60.0, high=200.0)
-        interval(self, "rooms", low=4, high=12)
+        interval(self, "rooms", low=4, high=12, whole=True)
         interval(self, "corridor_m", low=1.1, high=3.0)
         # Below 0.9 m the disc that must get everywhere does not pass on the lattice.
         interval(self, "door_m", low=0.9, high=1.6)
         interval(self, "wall_m", low=0.1, high=0.5)
-        require(all(isinstance(n, int) for n in self.rooms), "ApartmentConfig.rooms must be two whole numbers")
-        for name in ("links", "furniture"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"ApartmentConfig.{name} must be in [0, 1], got {value}")
+        shares(self, "links", "furniture")
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, Piece
-from mecanum_env.rooms.outlines.distance import distance_to_zero
-from mecanum_env.rooms.outlines.rectilinear import surfaces
+from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
+from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
 
-__all__ = ["DRIVE_RADIUS_M", "MAX_POCKET_M2", "assemble", "choose_start", "generator", "unreached"]
+__all__ = ["DRIVE_RADIUS_M", "START_M", "assemble", "choose_start", "generator", "unreached"]
 
 Mask = NDArray[np.bool_]
 
 DRIVE_RADIUS_M = 0.40
 """Disc that can be driven everywhere in a generated plan [m]: a youBot, 0.347 m, with 5 cm to spare."""
-MAX_POCKET_M2 = 0.25
-"""Largest connected patch of free space that the disc may leave unswept [m²], such as a corner's rest."""
+START_M = 0.5
+"""Clearance of a generated plan's start [m]: what is left where the raster cuts round and turned pieces short."""
+_MAX_POCKET_M2 = 0.25  # largest patch of free space that the disc may leave unswept, such as a corner's rest
 _START_CLEARANCES_M = (0.65, 0.60, 0.55)
-_START_EXACT_M = 0.5  # what is left of the least of them where the raster cuts round and turned pieces short
 _HEADINGS = (0.0, 0.5 * math.pi, -math.pi, -0.5 * math.pi)
 
 
@@ -41,12 +41,7 @@ def generator(seed: int) -> np.random.Generator:
 
 
 def assemble(
-    name: str,
-    floors: Sequence[Box],
-    pieces: Sequence[Piece],
-    *,
-    size: tuple[int, int],
-    rng: np.random.Generator,
+    name: str, floors: Sequence[Box], pieces: Sequence[Piece], *, size: tuple[int, int], rng: np.random.Generator
 ) -> FloorPlan:
     """Return the floor plan of free rectangles and furniture, after taking out what bars the way.
 
@@ -61,9 +56,7 @@ def assemble(
     rng
         Draws the start pose.
     """
-    floor = np.zeros((size[1], size[0]), np.bool_)
-    for x0, y0, x1, y1 in floors:
-        floor[y0:y1, x0:x1] = True
+    floor = raster(floors, size)
     kept = list(pieces)
     stamps = [_stamp(piece, size) for piece in kept]
     while True:
@@ -71,7 +64,7 @@ def assemble(
         for (x0, y0, x1, y1), stamp in stamps:
             free[y0:y1, x0:x1] &= ~stamp
         clearance = clearance_of(free, CELL_M)
-        reach, pocket = unreached(free, clearance, resolution=CELL_M)
+        reach, pocket = unreached(free, clearance)
         if pocket is None and clearance[reach].max() >= _START_CLEARANCES_M[-1]:
             break
         if not kept:
@@ -80,33 +73,30 @@ def assemble(
         del kept[worst], stamps[worst]
     return FloorPlan(
         name=name,
-        walls=np.round(surfaces(np.array(floors, np.float64)) * CELL_M, 6),
+        walls=np.round(surfaces(floors) * CELL_M, 6),
         polygons=tuple(np.round(piece.polygon(), 6) for piece in kept if not piece.radius),
         circles=np.array([(*p.centre_m, p.radius * CELL_M) for p in kept if p.radius]).reshape(-1, 3),
         free=free,
         resolution=CELL_M,
-        origin=(0.0, 0.0),
-        start=choose_start(clearance, reach, resolution=CELL_M, origin=(0.0, 0.0), rng=rng),
-        start_clearance_m=_START_EXACT_M,
+        start=choose_start(clearance, reach, rng),
+        start_clearance_m=START_M,
     )
 
 
-def unreached(
-    free: Mask, clearance: NDArray[np.float32], *, resolution: float, radius_m: float = DRIVE_RADIUS_M
-) -> tuple[Mask, Mask | None]:
-    """Return the largest area a disc's centre can move in, and the largest patch it wrongly leaves unswept.
+def unreached(free: Mask, clearance: NDArray[np.float32]) -> tuple[Mask, Mask | None]:
+    """Return the largest area that the disc's centre can move in, and the largest patch it leaves unswept.
 
     The patch is None if all is well: free space is in one piece, and no patch of it that the disc cannot sweep
-    is larger than ``MAX_POCKET_M2``.
+    is larger than 0.25 m².
     """
-    reach = _largest(clearance >= radius_m)
+    reach = largest_part(clearance >= DRIVE_RADIUS_M)
     if reach is None:
         return np.zeros_like(free), free
-    missed = free & (distance_to_zero(~reach) * resolution > radius_m + 0.5 * resolution)
+    missed = free & (distance_to_zero(~reach) * CELL_M > DRIVE_RADIUS_M + 0.5 * CELL_M)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(missed.astype(np.uint8), connectivity=4)
     if count > 1:
         worst = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-        if stats[worst, cv2.CC_STAT_AREA] * resolution**2 > MAX_POCKET_M2:
+        if stats[worst, cv2.CC_STAT_AREA] * CELL_M**2 > _MAX_POCKET_M2:
             return reach, labels == worst
     count, labels, stats, _ = cv2.connectedComponentsWithStats(free.astype(np.uint8), connectivity=4)
     if count > 2:
@@ -115,12 +105,7 @@ def unreached(
 
 
 def choose_start(
-    clearance: NDArray[np.float32],
-    reach: Mask,
-    *,
-    resolution: float,
-    origin: tuple[float, float],
-    rng: np.random.Generator,
+    clearance: NDArray[np.float32], reach: Mask, rng: np.random.Generator
 ) -> tuple[float, float, float]:
     """Return a random pose x, y [m], θ [rad] at a cell's centre with much clearance, along one of the axes."""
     for needed in _START_CLEARANCES_M:
@@ -132,16 +117,7 @@ def choose_start(
         rooms = np.flatnonzero(best == best.max())
     row, col = divmod(int(rooms[int(rng.integers(rooms.size))]), reach.shape[1])
     theta = _HEADINGS[int(rng.integers(4))]
-    x, y = ((v + 0.5) * resolution + o for v, o in zip((col, row), origin, strict=True))
-    return round(x, 6), round(y, 6), theta
-
-
-def _largest(mask: Mask) -> Mask | None:
-    """Largest connected part of a mask, None if it is empty."""
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    if count < 2:
-        return None
-    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])), np.bool_)
+    return round((col + 0.5) * CELL_M, 6), round((row + 0.5) * CELL_M, 6), theta
 
 
 def _stamp(piece: Piece, size: tuple[int, int]) -> tuple[Box, Mask]:

@@ -68,8 +68,7 @@ class CorridorsConfig:
             for name in ("total_length_m", "longest_m"):
                 value = getattr(self, name)
                 require(
-                    value is None,
-                    f"CorridorsConfig.map={self.map} sets {name} already: leave out one of the two",
+                    value is None, f"CorridorsConfig.map={self.map} sets {name} already: leave out one of the two"
                 )
         sizes_of(self)
 

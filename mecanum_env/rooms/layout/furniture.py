@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,18 +118,7 @@ class Furnisher:
                 group += [(cx, -side, cx + 9, 0), (cx, d, cx + 9, d + side)]
             if chairs == 4 or not long:
                 group += [(-side, cy, 0, cy + 9), (w, cy, w + side, cy + 9)]
-        left, below = min(b[0] for b in group), min(b[1] for b in group)
-        right, above = max(b[2] for b in group), max(b[3] for b in group)
-        for _ in range(self.tries):
-            place = self._free_place(right - left, above - below)
-            if place is None:
-                return False
-            dx, dy = place[0] - left, place[1] - below
-            boxes = [(a + dx, b + dy, c + dx, e + dy) for a, b, c, e in group]
-            if self._fits(boxes):
-                self.pieces += [Piece(box) for box in boxes]
-                return True
-        return False
+        return self._try_free(group)
 
     def turned_box(self, width_m: float, depth_m: float) -> bool:
         """Place a free-standing box at a random angle of 15° to 75°, or that less 90°."""
@@ -138,31 +128,32 @@ class Furnisher:
         span = math.ceil(w * c + d * s), math.ceil(w * s + d * c)
         if self.rng.random() < 0.5:
             angle, span = angle - 0.5 * math.pi, (span[1], span[0])
-        return self._try_free(span, angle=angle, size=(w, d))
+        return self._try_free([(0, 0, *span)], flush=False, angle=angle, size=(w, d))
 
     def round_table(self, radius_m: float) -> bool:
         """Place a free-standing round table or column."""
         r = cells(radius_m)
-        return self._try_free((2 * r, 2 * r), radius=float(r))
+        return self._try_free([(0, 0, 2 * r, 2 * r)], flush=False, radius=float(r))
 
-    def _try_free(
-        self,
-        span: tuple[int, int],
-        *,
-        angle: float = 0.0,
-        size: tuple[float, float] = (0.0, 0.0),
-        radius: float = 0.0,
-    ) -> bool:
+    def _try_free(self, group: list[Box], *, flush: bool = True, **shape: Any) -> bool:
+        """Place pieces of a shape, given by their boxes about any origin, away from the walls."""
+        left, below = min(b[0] for b in group), min(b[1] for b in group)
+        right, above = max(b[2] for b in group), max(b[3] for b in group)
         for _ in range(self.tries):
-            place = self._free_place(*span)
+            place = self._free_place(right - left, above - below)
             if place is None:
                 return False
-            x, y = place
-            box = (x, y, x + span[0], y + span[1])
-            if self._fits([box], flush=False):
-                self.pieces.append(Piece(box, angle, size, radius))
+            dx, dy = place[0] - left, place[1] - below
+            if self._keep([(a + dx, b + dy, c + dx, d + dy) for a, b, c, d in group], flush, **shape):
                 return True
         return False
+
+    def _keep(self, boxes: list[Box], flush: bool = True, **shape: Any) -> bool:
+        """Add pieces if they fit; return whether they do."""
+        fit = self._fits(boxes, flush=flush)
+        if fit:
+            self.pieces += [Piece(box, **shape) for box in boxes]
+        return fit
 
     def _free_place(self, width: int, depth: int) -> tuple[int, int] | None:
         """Random lower-left corner of a box that keeps the gap to all walls."""
@@ -187,9 +178,7 @@ class Furnisher:
                 continue
             mirrored = bool(self.rng.random() < 0.5)
             at = 0 if self.rng.random() < corner else int(self.rng.integers(length - width + 1))
-            boxes = [self._against(side, at, length, mirrored, piece) for piece in local]
-            if self._fits(boxes):
-                self.pieces += [Piece(box) for box in boxes]
+            if self._keep([self._against(side, at, length, mirrored, piece) for piece in local]):
                 return True
         return False
 

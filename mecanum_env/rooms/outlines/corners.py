@@ -8,6 +8,7 @@ edge is a convex corner, the foot of its side a concave one, its back is hidden.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
@@ -26,11 +27,7 @@ _LEFT, _BOTH = 0, 1  # on which sides of a wall free space lies
 
 
 def find_corners(
-    walls: Array,
-    polygons: tuple[Array, ...],
-    free: NDArray[np.bool_],
-    resolution: float,
-    origin: tuple[float, float],
+    walls: Array, polygons: tuple[Array, ...], is_free: Callable[[Array], NDArray[np.bool_]], resolution: float
 ) -> tuple[Array, NDArray[np.int8]]:
     """Return corner points ``(n, 2)`` [m] and their kinds ``(n,)``: CONVEX, CONCAVE, or 0 between thin walls.
 
@@ -40,10 +37,10 @@ def find_corners(
         Surfaces ``(w, 4)``; turned so that free space is on their left, by the raster, where they are not.
     polygons
         Convex obstacles, counter-clockwise, ``(k, 2)`` each.
-    free, resolution, origin
-        The raster of free space, its cell size [m] and lower-left corner.
+    is_free, resolution
+        Tells of points ``(n, 2)`` [m] which lie in free cells ``(n,)``, and the size of these [m].
     """
-    walls, sides = _orient(walls, free, resolution, origin)
+    walls, sides = _orient(walls, is_free, resolution)
     edges = [np.hstack([p, np.roll(p, -1, axis=0)]) for p in polygons]
     edge_array = np.vstack(edges) if edges else np.zeros((0, 4))
     first = np.concatenate([[0], np.cumsum([len(p) for p in polygons])]).astype(np.int64)
@@ -75,7 +72,7 @@ def _first_of_cluster(points: Array) -> NDArray[np.bool_]:
 
 
 def _orient(
-    walls: Array, free: NDArray[np.bool_], resolution: float, origin: tuple[float, float]
+    walls: Array, is_free: Callable[[Array], NDArray[np.bool_]], resolution: float
 ) -> tuple[Array, NDArray[np.int64]]:
     """Turn walls so that free space is on the left; say which have it on both sides."""
     along = walls[:, 2:] - walls[:, :2]
@@ -85,19 +82,11 @@ def _orient(
     middle = walls[:, None, :2] + shares[None, :, None] * along[:, None, :]
     # 0.6 cells off the surface: surely in the next cell, and still within a wall one cell thick.
     offset = 0.6 * resolution * left[:, None, :]
-    count = [np.count_nonzero(_lookup(free, (middle + s * offset - origin) / resolution), axis=1) for s in (1, -1)]
+    count = [is_free((middle + s * offset).reshape(-1, 2)).reshape(-1, len(shares)).sum(axis=1) for s in (1, -1)]
     flip = count[1] > count[0]
     turned = np.where(flip[:, None], walls[:, [2, 3, 0, 1]], walls)
     both = (count[0] == len(shares)) & (count[1] == len(shares))
     return np.ascontiguousarray(turned), np.where(both, _BOTH, _LEFT).astype(np.int64)
-
-
-def _lookup(free: NDArray[np.bool_], lattice: Array) -> NDArray[np.bool_]:
-    cells = np.floor(lattice).astype(np.int64)
-    rows, cols = free.shape
-    inside = (cells[..., 0] >= 0) & (cells[..., 0] < cols) & (cells[..., 1] >= 0) & (cells[..., 1] < rows)
-    row, col = np.where(inside, cells[..., 1], 0), np.where(inside, cells[..., 0], 0)
-    return np.asarray(inside & free[row, col], np.bool_)
 
 
 @njit(cache=True, nogil=True)

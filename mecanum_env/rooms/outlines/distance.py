@@ -1,4 +1,4 @@
-"""Distances over a raster, to the last bit the same in every process."""
+"""Distances over a raster, to the last bit the same in every process, and its largest part."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["distance_to_zero"]
+__all__ = ["distance_to_zero", "largest_part"]
 
 
 def distance_to_zero(mask: NDArray[np.bool_] | NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -18,3 +18,11 @@ def distance_to_zero(mask: NDArray[np.bool_] | NDArray[np.uint8]) -> NDArray[np.
     rough = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     squared = np.rint(np.square(rough, dtype=np.float64))
     return np.sqrt(squared).astype(np.float32)
+
+
+def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Return the largest 4-connected part of a mask ``(rows, cols)``, None if it is empty."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
+    if count < 2:
+        return None
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])), np.bool_)

@@ -54,31 +54,15 @@ def trace(free: Mask) -> tuple[Array, NDArray[np.int64]]:
     """
     padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.bool_)
     padded[1:-1, 1:-1] = free
-    corners, first = _walk(padded, _count_corners(padded))
+    corners, first = _walk(padded)
     return corners - 1.0, first
 
 
 @njit(cache=True, nogil=True)
-def _count_corners(free: Mask) -> int:
-    """Corners of the outline: one or three free cells around a point make one, a diagonal pair two."""
-    total = 0
-    for r in range(1, free.shape[0]):
-        for c in range(1, free.shape[1]):
-            a, b, d, e = free[r - 1, c - 1], free[r - 1, c], free[r, c - 1], free[r, c]
-            count = int(a) + int(b) + int(d) + int(e)
-            if count == 1 or count == 3:
-                total += 1
-            elif count == 2 and a == e:
-                total += 2
-    return total
-
-
-@njit(cache=True, nogil=True)
-def _walk(free: Mask, corner_count: int) -> tuple[Array, NDArray[np.int64]]:
+def _walk(free: Mask) -> tuple[Array, NDArray[np.int64]]:
     """Walk every loop of the outline of a raster whose border is solid, in lattice coordinates."""
     rows, cols = free.shape
-    corners = np.empty((corner_count, 2), np.float64)
-    first = np.empty(corner_count // 4 + 2, np.int64)
+    corners, first = np.empty((1024, 2), np.float64), np.empty(256, np.int64)
     seen = np.zeros((rows, cols), np.bool_)  # eastward edges below a free cell
     n, loops = 0, 0
     for row in range(1, rows):
@@ -86,12 +70,16 @@ def _walk(free: Mask, corner_count: int) -> tuple[Array, NDArray[np.int64]]:
             if seen[row, col] or not free[row, col] or free[row - 1, col]:
                 continue
             # The first edge not yet walked, row by row, is the first of its run: a corner.
+            if loops + 1 == len(first):
+                first = np.concatenate((first, np.empty_like(first)))
             first[loops] = n
             loops += 1
             x, y, heading = col, row, 0
             turned = True
             while True:
                 if turned:
+                    if n == len(corners):
+                        corners = np.concatenate((corners, np.empty_like(corners)))
                     corners[n, 0], corners[n, 1] = x, y
                     n += 1
                 if heading == 0:
@@ -247,15 +235,9 @@ def _straighten_stair(
 
 @njit(cache=True, nogil=True)
 def _relax(
-    path: Array,
-    role: NDArray[np.int64],
-    count: int,
-    station: NDArray[np.int64],
-    i: int,
-    j: int,
-    cost: Array,
+    path: Array, role: NDArray[np.int64], count: int, station: NDArray[np.int64], i: int, j: int, cost: Array,
     previous: NDArray[np.int64],
-) -> bool:
+) -> bool:  # fmt: skip
     """Offer every piece from station i to station j; return whether one is within the bound."""
     spanned = False
     middle, last = _PLACES // 2, station.shape[0] - 1
@@ -293,15 +275,7 @@ def _place(path: Array, count: int, station: int, place: int) -> tuple[float, fl
 
 @njit(cache=True, nogil=True)
 def _deviation(
-    path: Array,
-    role: NDArray[np.int64],
-    count: int,
-    at: int,
-    end: int,
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
+    path: Array, role: NDArray[np.int64], count: int, at: int, end: int, ax: float, ay: float, bx: float, by: float
 ) -> float:
     """Return the largest distance of a corner between two stations from the straight piece, 2 if out of bounds."""
     ux, uy = bx - ax, by - ay

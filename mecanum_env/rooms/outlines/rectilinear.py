@@ -1,16 +1,24 @@
-"""Exact surfaces of a union of axis-aligned rectangles of free space."""
+"""Exact surfaces, and the raster, of a union of axis-aligned rectangles of free space."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["surfaces"]
+__all__ = ["raster", "surfaces"]
 
 Array = NDArray[np.float64]
 
 
-def surfaces(rectangles: Array) -> Array:
+def raster(rectangles: ArrayLike, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return which cells of a raster of ``size`` columns and rows lie in a rectangle ``(n, 4)`` [cells]."""
+    free = np.zeros(size[::-1], np.bool_)
+    for x0, y0, x1, y1 in np.asarray(rectangles):
+        free[y0:y1, x0:x1] = True
+    return free
+
+
+def surfaces(rectangles: ArrayLike) -> Array:
     """Return the boundary ``(w, 4)`` of a union of rectangles, free space on the left of every segment.
 
     The plane is cut along every side of every rectangle; the cells so made are free or solid, and the walls are

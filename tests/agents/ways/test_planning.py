@@ -136,10 +136,3 @@ def test_a_robot_too_near_a_wall_gets_out():
     assert cost_map.clearance[cost_map.start] < tight_clearance(PlannerConfig(), ROBOT, 0.01)
     path = shortest_path(cost_map, travel, cell, start=belief.pose)
     assert local_map(belief, 2.0).at(path[:10])[0] < local_map(belief, 2.0).at(path[:10])[-1]
-
-
-def test_max_cost_stops_early():
-    _, cost_map, travel, _ = planned(room(8.0, 8.0), (1.5, 1.5, 0.0), (6.0, 5.0))
-    near = travel_costs(cost_map, max_cost_m=2.0)
-    inside = travel.cost <= 2.0
-    np.testing.assert_array_equal(np.isfinite(near.cost), inside)

@@ -20,14 +20,13 @@ from mecanum_env.physics.robot import (
     STATE_SIZE,
     TWIST,
     WHEELS,
-    action_to_wheels,
+    WheelTargets,
     dynamics_constants,
     forward_kinematics,
     forward_matrix,
     inverse_kinematics,
-    inverse_matrix,
-    twist_action_to_wheels,
-    wheel_dynamics,
+    motor_constants,
+    turn_wheels,
     wheel_positions,
 )
 
@@ -55,18 +54,13 @@ def drive(
     constants: Array | None = None,
 ) -> None:
     """Advance ``state`` by ``duration`` [s], its pose included."""
-    motion = np.zeros(3)
+    motion, motor, h = np.zeros(3), np.empty(7), dt / substeps
+    targets, friction = np.asarray(targets, dtype=np.float64), np.full(4, mu)
+    radii = np.full(4, robot.wheel_radius_m) if radii is None else radii
+    constants = dynamics_constants(robot) if constants is None else constants
+    motor_constants(constants, h, motor)
     for _ in range(round(duration / dt)):
-        wheel_dynamics(
-            state,
-            np.asarray(targets, dtype=np.float64),
-            np.full(4, robot.wheel_radius_m) if radii is None else radii,
-            np.full(4, mu),
-            dynamics_constants(robot) if constants is None else constants,
-            dt,
-            substeps,
-            motion,
-        )
+        turn_wheels(state, targets, radii, friction, constants, motor, h, substeps, motion)
         state[POSE] += motion
 
 
@@ -102,7 +96,8 @@ def test_forward_inverts_inverse_kinematics(robot: RobotConfig, vx: float, vy: f
 
 @pytest.mark.parametrize("robot", PRESETS)
 def test_forward_kinematics_is_the_pseudo_inverse(robot: RobotConfig) -> None:
-    np.testing.assert_allclose(forward_matrix(robot), np.linalg.pinv(inverse_matrix(robot)), atol=1e-14)
+    inverse = np.column_stack([inverse_kinematics(robot, axis) for axis in np.eye(3)])
+    np.testing.assert_allclose(forward_matrix(robot), np.linalg.pinv(inverse), atol=1e-14)
     r, lever = robot.wheel_radius_m, robot.lever_m
     fl, fr, rl, rr = wheels = np.array([3.0, -1.0, 4.0, 1.5])
     expected = [
@@ -115,8 +110,8 @@ def test_forward_kinematics_is_the_pseudo_inverse(robot: RobotConfig) -> None:
 
 def test_matrices_are_copies() -> None:
     robot = RobotConfig()
-    inverse_matrix(robot)[:] = 0.0
-    assert np.all(inverse_matrix(robot)[:, 0] > 0)
+    forward_matrix(robot)[:] = 0.0
+    assert np.all(forward_matrix(robot)[0] > 0)
 
 
 @pytest.mark.parametrize("robot", PRESETS)
@@ -124,7 +119,7 @@ def test_matrices_are_copies() -> None:
 def test_twist_actions_keep_their_direction_within_the_wheels_limits(
     robot: RobotConfig, action: tuple[float, float, float]
 ) -> None:
-    wheels = twist_action_to_wheels(robot, action)
+    wheels = WheelTargets(robot).of_twist(action)
     limit = robot.max_wheel_speed_rad_s
     assert np.max(np.abs(wheels)) <= limit * (1 + 1e-12)
     wanted = np.array(action) * (robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s)
@@ -135,26 +130,27 @@ def test_twist_actions_keep_their_direction_within_the_wheels_limits(
 def test_actions_are_clipped_and_checked() -> None:
     robot = RobotConfig()
     limit = robot.max_wheel_speed_rad_s
-    np.testing.assert_allclose(action_to_wheels(robot, [2.0, -0.5, 0.0, 1.0]), limit * np.array([1, -0.5, 0, 1]))
-    np.testing.assert_allclose(twist_action_to_wheels(robot, [5, 0, 0]), np.full(4, limit))
+    targets = WheelTargets(robot)
+    np.testing.assert_allclose(targets.of_wheels([2.0, -0.5, 0.0, 1.0]), limit * np.array([1, -0.5, 0, 1]))
+    np.testing.assert_allclose(targets.of_twist([5, 0, 0]), np.full(4, limit))
     with pytest.raises(ValueError, match="3 finite numbers"):
-        twist_action_to_wheels(robot, [math.nan, 0, 0])
+        targets.of_twist([math.nan, 0, 0])
     with pytest.raises(ValueError, match="4 finite numbers"):
-        action_to_wheels(robot, [0, 0, 0])
+        targets.of_wheels([0, 0, 0])
 
 
 @pytest.mark.parametrize("bad", [[[0, 0, 0]], "abc", [None, 0, 0], [1j, 0, 0], 0.5, [], [[0], 0, 0], [1e308] * 3])
 def test_what_is_no_action_is_refused_in_words(bad: object) -> None:
     with pytest.raises(ValueError, match="3 finite numbers"):
-        twist_action_to_wheels(RobotConfig(), bad)  # type: ignore[arg-type]
+        WheelTargets(RobotConfig()).of_twist(bad)  # type: ignore[arg-type]
 
 
 def test_an_action_may_be_of_any_numbers_anywhere_in_memory() -> None:
     robot = RobotConfig()
-    expected = twist_action_to_wheels(robot, [1.0, 0.0, -1.0])
+    expected = WheelTargets(robot).of_twist([1.0, 0.0, -1.0])
     numbers = np.array([1.0, 9.0, 0.0, 9.0, -1.0, 9.0])
     for action in (numbers[::2], numbers[::2].astype(np.float32), numbers[::2].astype(int), (1, 0, -1)):
-        np.testing.assert_array_equal(twist_action_to_wheels(robot, action), expected)
+        np.testing.assert_array_equal(WheelTargets(robot).of_twist(action), expected)
     np.testing.assert_array_equal(numbers, [1.0, 9.0, 0.0, 9.0, -1.0, 9.0])
 
 

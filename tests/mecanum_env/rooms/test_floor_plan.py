@@ -109,18 +109,6 @@ def test_distance_to_surfaces_is_exact():
     assert plan.distance_to_surfaces(points) == pytest.approx([0.3, 0.25, 0.25, 0.0])
 
 
-def test_reachable_is_what_a_disc_can_get_to():
-    free = room().free.copy()
-    free[1:-1, 20] = False
-    free[10:16, 20] = True  # a gap of 0.6 m
-    plan = room(free=free, start=(2.0, 3.5, 0.0))
-    right = np.zeros_like(free)
-    right[:, 25:] = True
-    assert (plan.reachable(0.25) & right).any()
-    assert not (plan.reachable(0.35) & right).any()
-    assert plan.reachable(0.35).any()
-
-
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

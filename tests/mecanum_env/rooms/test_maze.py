@@ -34,6 +34,12 @@ def reached(grid: Grid) -> int:
     return len(seen)
 
 
+def loops(grid: Grid) -> int:
+    """How many ways round there are, where all cells are connected."""
+    rows, columns = grid.east.shape[0], grid.north.shape[1]
+    return int(grid.east.sum() + grid.north.sum()) - rows * columns + 1
+
+
 @few
 @given(seed=seeds, columns=st.integers(2, 10), rows=st.integers(2, 10), share=st.floats(0, 1))
 def test_every_cell_is_reached_and_no_post_stands_alone(seed, columns, rows, share):
@@ -41,8 +47,7 @@ def test_every_cell_is_reached_and_no_post_stands_alone(seed, columns, rows, sha
     assert reached(grid) == columns * rows
     inner = (columns - 1) * rows + columns * (rows - 1)
     tree = columns * rows - 1
-    assert 0 <= grid.loops <= round(share * (inner - tree))
-    assert grid.degrees().sum() == 2 * grid.openings
+    assert 0 <= loops(grid) <= round(share * (inner - tree))
     walls = (
         (~grid.east[1:]).astype(int) + (~grid.east[:-1]) + (~grid.north[:, 1:]).astype(int) + (~grid.north[:, :-1])
     )
@@ -53,7 +58,7 @@ def test_every_cell_is_reached_and_no_post_stands_alone(seed, columns, rows, sha
 @given(seed=seeds)
 def test_a_maze_without_loops_is_a_tree(seed):
     grid = draw_grid((7, 6), 0.0, generator(seed))
-    assert grid.loops == 0 and reached(grid) == 42
+    assert loops(grid) == 0 and reached(grid) == 42
 
 
 @few
@@ -75,7 +80,7 @@ def test_the_loops_of_the_plan_are_those_of_its_grid(seed):
     rng = generator(seed)
     rng.integers(6, 7), rng.integers(5, 6)
     grid = draw_grid((6, 5), config.loops, rng)
-    assert ndimage.label(~plan.free, np.ones((3, 3)))[1] - 1 == grid.loops
+    assert ndimage.label(~plan.free, np.ones((3, 3)))[1] - 1 == loops(grid)
 
 
 @few

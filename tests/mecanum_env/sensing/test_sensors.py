@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, NOISE_PRESETS, ROBOT_PRESETS, LidarConfig, NoiseConfig
-from mecanum_env.physics.robot import forward_kinematics, forward_matrix, twist_action_to_wheels
+from mecanum_env.physics.robot import WheelTargets, forward_kinematics, forward_matrix
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.noise import noise_stream
@@ -284,10 +284,10 @@ def test_scans_are_fresh_arrays() -> None:
 def test_pressed_against_a_wall_the_lidar_reads_the_robots_half_width(name: str) -> None:
     robot = ROBOT_PRESETS[name]
     free = np.ones((80, 80), bool)
-    plan = FloorPlan("square", SQUARE, (), NO_CIRCLES, free, 0.05, (0.0, 0.0), (2.0, 3.4, 0.0))
+    plan = FloorPlan(name="square", walls=SQUARE, free=free, resolution=0.05, start=(2.0, 3.4, 0.0))
     world = World(plan, robot, EXACT, np.random.default_rng(0))
     for _ in range(30):
-        world.step(twist_action_to_wheels(robot, (0.0, 0.5, 0.0)), 0.1, 0.02)
+        world.step(WheelTargets(robot).of_twist((0.0, 0.5, 0.0)), 0.1, 0.02)
     lidar = Lidar(LidarConfig(offset_m=0.0), EXACT)
     ranges = lidar.true_ranges(plan.segments, plan.circles, world.pose)
     assert world.collisions == 1

@@ -119,7 +119,7 @@ def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
     assert set(dates) == {"000000.npz", "000001.npz", "001000.npz"}
     gather(folder, range(2))
     assert {path.name: path.stat().st_mtime_ns for path in folder.iterdir()} == dates
-    lessons, own = read_lessons(folder, range(2)), lessons_of(1, TourDriver())
+    lessons, own = read_lessons((folder, range(2))), lessons_of(1, TourDriver())
     assert len(lessons.planes) > len(own.planes) > 5
     assert own.outside.max() == 100 > own.outside.mean() > 0
     for field in dataclasses.fields(own):
@@ -131,7 +131,7 @@ def test_lessons_are_drawn_once_and_the_same_each_time(run_folder):
 
 
 def test_some_lessons_do_not_tell_how_far_the_plan_extends(run_folder):
-    lessons = read_lessons(run_folder / "round-1" / "lessons", range(1))
+    lessons = read_lessons((run_folder / "round-1" / "lessons", range(1)))
     told, untold = batch_of(lessons, np.arange(4)), batch_of(lessons, np.arange(4), np.zeros(4, np.bool_))
     beyond = lessons.outside[:4] == 100
     known = lessons.planes[:4, :8].reshape(4, 2, 4, SIDE, SIDE).sum(axis=1) > 0
@@ -144,7 +144,7 @@ def test_some_lessons_do_not_tell_how_far_the_plan_extends(run_folder):
 
 
 def test_turning_a_lesson_turns_all_of_it(run_folder):
-    batch = batch_of(read_lessons(run_folder / "round-1" / "lessons", range(1)), np.arange(4))
+    batch = batch_of(read_lessons((run_folder / "round-1" / "lessons", range(1))), np.arange(4))
     round_again = batch
     for _ in range(4):
         round_again = turned(round_again, 1, False)

@@ -2,39 +2,27 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
-from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import require, unknown_name
-from training.learning.config import EvaluationConfig, PpoConfig
+from slam.settings import positive, require
+from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
 
 __all__ = ["DriveConfig", "DriveLearningConfig", "DriveLessonsConfig", "DriveWorldConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveWorldConfig:
-    """Where is trained: families of rooms and their seeds."""
+class DriveWorldConfig(RoomsConfig):
+    """Where driving is trained; the rewards are PPO's."""
 
     rooms: tuple[str, ...] = ("apartment", "rectangular")
     noise: str = "nominal"
-    seeds: tuple[int, int] = (0, 999)  # of the rooms, both included
-    slam: str = "invariant-ekf"
-    time_limit_s: float = 300.0
-    area_1_m2: float = 0.05  # PPO's reward per square metre newly mapped
+    area_1_m2: float = 0.05
     time_1_s: float = -0.02
-    collision: float = -1.0
 
     def __post_init__(self) -> None:
-        require(len(self.rooms) > 0, "[world] needs rooms")
-        for name in self.rooms:
-            if name not in room_registry.names():
-                raise unknown_name("rooms", name, room_registry.names())
-        if self.noise not in NOISE_PRESETS:
-            raise unknown_name("noise preset", self.noise, NOISE_PRESETS)
-        low, high = self.seeds
-        require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
+        super().__post_init__()
+        check_names("noise preset", [self.noise], NOISE_PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,9 +56,7 @@ class DriveLearningConfig:
     control_rate: float = 2e-3
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            require(math.isfinite(value) and value > 0, f"[learning] {f.name} must be > 0, got {value}")
+        positive(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,36 +31,25 @@ def learn_maps(
     network: PlanNetwork, lessons: Lessons, *, steps: int, batch: int, rate: float, rng: np.random.Generator
 ) -> Iterator[dict[str, float]]:
     """Train the map network; what is said every hundred steps are the means of the losses since."""
-    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
-    n, seen = len(lessons["pose"]), []
+    n = len(lessons["pose"])
     # Batches of maps that fill less of the image cost less time: those are taken together.
     small = _rims(lessons["map_global"]) >= _SMALL
     groups = np.flatnonzero(~small), np.flatnonzero(small)
-    for step in range(steps):
-        _set_rate(optimizer, rate, step, steps)
+
+    def losses(step: int) -> dict[str, Tensor]:
         group = groups[int(rng.random() < len(groups[1]) / n)]
         rows = np.sort(rng.choice(group, size=batch))
-        losses = map_losses(network, lessons, rows, mirrored=step % 2 == 1, every=2)
-        total = losses["price"] + 10.0 * (losses["goal_local"] + losses["goal_global"]) + losses["travel"]
-        _descend(network, optimizer, total)
-        seen.append([float(value.detach()) for value in losses.values()])
-        if (step + 1) % 100 == 0 or step + 1 == steps:
-            yield {"step": step + 1} | dict(zip(losses, np.mean(seen, axis=0).tolist(), strict=True))
-            seen = []
+        found = map_losses(network, lessons, rows, mirrored=step % 2 == 1)
+        found["total"] = found["price"] + 10.0 * (found["goal_local"] + found["goal_global"]) + found["travel"]
+        return found
+
+    return _descend(network, losses, steps=steps, rate=rate, every=100)
 
 
 def map_losses(
-    network: PlanNetwork,
-    lessons: Lessons,
-    rows: NDArray[np.int64],
-    *,
-    mirrored: bool = False,
-    every: int = 1,
+    network: PlanNetwork, lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool
 ) -> dict[str, Tensor]:
-    """Return the losses on some lessons, as they are or with left and right exchanged.
-
-    Of the local maps, which say more each, only ``every`` so many are looked at.
-    """
+    """Return the losses on some lessons, as they are or with left and right exchanged."""
     near, far, pose = lessons["map_local"][rows], lessons["map_global"][rows], lessons["pose"][rows].copy()
     price, travel = lessons["price"][rows], lessons["travel"][rows]
     goal_near, goal_far = (np.unpackbits(lessons[f"goal_{name}"][rows], axis=-1) for name in ("local", "global"))
@@ -68,7 +57,8 @@ def map_losses(
         near, price, goal_near = near[..., ::-1], price[..., ::-1], goal_near[..., ::-1]
         far, travel, goal_far = far[..., ::-1, :], travel[..., ::-1, :], goal_far[..., ::-1, :]
         pose[:, 1] *= -1.0
-    near, price, goal_near = near[::every], price[::every], goal_near[::every]
+    # Local maps say more each: every other one is looked at.
+    near, price, goal_near = near[::2], price[::2], goal_near[::2]
     rim = int(_rims(far).min())
     middle = (..., slice(rim, MAP_SIZE - rim), slice(rim, MAP_SIZE - rim))
     far, travel, goal_far = far[middle], travel[middle], goal_far[middle]
@@ -92,19 +82,13 @@ def learn_control(
     network: ControlNetwork, lessons: Lessons, *, steps: int, batch: int, rate: float, rng: np.random.Generator
 ) -> Iterator[dict[str, float]]:
     """Train the control network to send what the teacher would; every thousand steps the mean loss is said."""
-    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
-    n, seen = len(lessons["wanted"]), []
-    for step in range(steps):
-        _set_rate(optimizer, rate, step, steps)
-        scan, landmarks, numbers, wanted = control_batch(
-            lessons, np.sort(rng.integers(n, size=batch)), mirrored=step % 2 == 1
-        )
-        loss = functional.smooth_l1_loss(network(scan, landmarks, numbers), wanted, beta=0.1)
-        _descend(network, optimizer, loss)
-        seen.append(float(loss.detach()))
-        if (step + 1) % 1000 == 0 or step + 1 == steps:
-            yield {"step": step + 1, "control": float(np.mean(seen))}
-            seen = []
+
+    def losses(step: int) -> dict[str, Tensor]:
+        rows = np.sort(rng.integers(len(lessons["wanted"]), size=batch))
+        *inputs, wanted = control_batch(lessons, rows, mirrored=step % 2 == 1)
+        return {"total": functional.smooth_l1_loss(network(*inputs), wanted, beta=0.1)}
+
+    return _descend(network, losses, steps=steps, rate=rate, every=1000)
 
 
 def control_batch(lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool) -> tuple[Tensor, ...]:
@@ -133,18 +117,26 @@ def _goal_loss(logit: Tensor, goal: NDArray[np.uint8]) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logit, _tensor(goal.astype(np.float32)), pos_weight=weight)
 
 
-def _set_rate(optimizer: torch.optim.Optimizer, rate: float, step: int, steps: int) -> None:
-    """Warm up over 50 steps, then fall to a hundredth along a cosine."""
-    share = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / steps))
-    for group in optimizer.param_groups:
-        group["lr"] = rate * min(1.0, (step + 1) / 50) * share
-
-
-def _descend(network: nn.Module, optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    optimizer.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-    optimizer.step()
+def _descend(
+    network: nn.Module, losses: Callable[[int], dict[str, Tensor]], *, steps: int, rate: float, every: int
+) -> Iterator[dict[str, float]]:
+    """Go down the ``total`` of each step's losses; say their means every so many steps."""
+    optimizer = torch.optim.AdamW(network.parameters(), lr=rate, weight_decay=1e-4)
+    seen = []
+    for step in range(steps):
+        # Warm up over 50 steps, then fall to a hundredth along a cosine.
+        share = 0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+        for group in optimizer.param_groups:
+            group["lr"] = rate * min(1.0, (step + 1) / 50) * share
+        found = losses(step)
+        optimizer.zero_grad()
+        found["total"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        seen.append([float(value.detach()) for value in found.values()])
+        if (step + 1) % every == 0 or step + 1 == steps:
+            yield {"step": step + 1} | dict(zip(found, np.mean(seen, axis=0).tolist(), strict=True))
+            seen = []
 
 
 def _tensor(values: NDArray[Any]) -> Tensor:

@@ -44,14 +44,12 @@ _MIDDLE = 0.5 * MAP_SIZE - 0.5
 class FollowingTeacher:
     """Says which action a path follower would send along a given path, whoever drove so far."""
 
-    def __init__(self, env: ExploreEnv, control: ControlConfig | None = None) -> None:
+    def __init__(self, env: ExploreEnv) -> None:
         config = env.config
         robot = config.robot
         self._limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])
         self._step_s = config.step_s
-        self._follower = PathFollower(
-            control or ControlConfig(), robot=robot, lidar=config.lidar, step_s=config.step_s
-        )
+        self._follower = PathFollower(ControlConfig(), robot=robot, lidar=config.lidar, step_s=config.step_s)
 
     def __call__(self, path: Array, executed: Floats, observation: dict[str, Any], belief: Belief) -> Floats:
         """Return the action ``(3,)``.

@@ -51,9 +51,9 @@ class PlanNetwork(nn.Module):
     log price of a metre along each of the four steps that a pixel owns, and the log odds of a goal.
     """
 
-    def __init__(self, width: int = 8) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.local, self.overview = _stack(width, 2), _stack(width, 5)
+        self.local, self.overview = _stack(2), _stack(5)
 
     def forward(self, map_local: Tensor, map_global: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return local prices ``(b, n, m)`` and goals, global prices ``(b, 4, n, m)`` and goals, as logarithms."""
@@ -66,7 +66,8 @@ def _scaled(maps: Tensor) -> Tensor:
     return (maps.float() / 128.0 - 1.0).contiguous(memory_format=torch.channels_last)
 
 
-def _stack(width: int, out: int) -> nn.Sequential:
+def _stack(out: int) -> nn.Sequential:
+    width = 8
     return nn.Sequential(
         nn.Conv2d(3, width, 5, padding=2), nn.ReLU(),
         nn.Conv2d(width, width, 3, padding=1), nn.ReLU(),
@@ -78,24 +79,21 @@ def _stack(width: int, out: int) -> nn.Sequential:
 class ControlNetwork(nn.Module):
     """The twist, from the scan in sectors, the landmarks as a set, and the way among the other numbers."""
 
-    def __init__(self, *, numbers: int = NUMBERS, width: int = 128, out: int = 3) -> None:
+    def __init__(self, *, out: int = 3) -> None:
         super().__init__()
+        width = 128
         self.scan = nn.Sequential(
             nn.Conv1d(1, 8, 5, stride=2, padding=2, padding_mode="circular"), nn.ReLU(),
             nn.Conv1d(8, 16, 5, stride=2, padding=2, padding_mode="circular"), nn.ReLU(),
         )  # fmt: skip
         self.landmark = nn.Sequential(nn.Linear(5, 16), nn.ReLU(), nn.Linear(16, 16))
         self.head = nn.Sequential(
-            nn.Linear(16 * SECTORS // 4 + 16 + numbers, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
+            nn.Linear(16 * SECTORS // 4 + 16 + NUMBERS, width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(),
             nn.Linear(width, out),
         )  # fmt: skip
 
     def forward(self, scan: Tensor, landmarks: Tensor, numbers: Tensor) -> Tensor:
         """Return the twists ``(b, 3)`` as fractions of the limits, before they are cut off at ±1."""
-        return cast("Tensor", self.head(self.summary(scan, landmarks, numbers)))
-
-    def summary(self, scan: Tensor, landmarks: Tensor, numbers: Tensor) -> Tensor:
-        """Return what the head is given ``(b, …)``."""
         present = landmarks[..., 4:]
-        each = self.landmark(landmarks) * present + (present - 1.0) * 1e3
-        return torch.cat([self.scan(scan[:, None]).flatten(1), torch.relu(each.amax(dim=1)), numbers], dim=1)
+        each = torch.relu((self.landmark(landmarks) * present + (present - 1.0) * 1e3).amax(dim=1))
+        return cast("Tensor", self.head(torch.cat([self.scan(scan[:, None]).flatten(1), each, numbers], dim=1)))

@@ -2,52 +2,37 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, cast
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.spaces.utils import flatten_space
 from numpy.typing import NDArray
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
 from stable_baselines3.common.policies import MultiInputActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, PlanSettings
-from mecanum_env import rooms as room_registry
+from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork
 from mecanum_env.env import ExploreEnv
+from training.learning.choice_world import Families
 from training.learning.end_to_end.config import DriveConfig, DriveWorldConfig
 from training.learning.end_to_end.networks import ControlNetwork
-from training.learning.networks import PassedOn
-from training.runs.campaign import start_worker
 
-__all__ = ["DrivePolicy", "DriveWorld", "make_drive_world", "make_model"]
+__all__ = ["DrivePolicy", "DriveWorld", "make_model"]
 
 LANDMARKS = 32
 
 
-class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """``Explore-v0`` over families of rooms, seen as the control network sees it."""
-
-    env: ExploreEnv
+class DriveWorld(Families):
+    """``Explore-v0`` over families of rooms, seen as the control network sees it; the time limit truncates."""
 
     def __init__(self, world: DriveWorldConfig, network: DriveNetwork) -> None:
-        rewards = {
-            "area": world.area_1_m2, "pose_entropy": 0.0, "map_entropy": 0.0, "collision": world.collision,
-            "effort": 0.0, "time": world.time_1_s,
-        }  # fmt: skip
-        super().__init__(
-            ExploreEnv(
-                slam=world.slam, noise=world.noise, reward=rewards, config={"time_limit_s": world.time_limit_s}
-            )
-        )
-        self._world, self._network = world, network
-        self._rng = np.random.default_rng(0)
+        limit = {"time_limit_s": world.time_limit_s}
+        super().__init__(ExploreEnv(slam=world.slam, noise=world.noise, reward=world.reward, config=limit), world)
+        self._network = network
         free = {"scan": (SECTORS,), "landmarks": (LANDMARKS, 5), "numbers": (NUMBERS,)}
         self.observation_space = spaces.Dict(
             {key: spaces.Box(-np.inf, np.inf, shape, np.float32) for key, shape in free.items()}
@@ -56,17 +41,12 @@ class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in rooms of the next draw; a seed is where the drawing starts."""
-        if seed is not None:
-            self._rng = np.random.default_rng(seed)
-        low, high = self._world.seeds
-        name = str(self._rng.choice(list(self._world.rooms)))
-        plan = room_registry.make(name, seed=int(self._rng.integers(low, high + 1)))
-        observation, info = self.env.reset(seed=int(self._rng.integers(2**31)), options={"floor_plan": plan})
+        """Start an episode in rooms of the next draw."""
+        observation, info = super().reset(seed=seed, options=options)
         return self._inputs(observation), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Drive for one step; the time limit truncates."""
+        """Drive for one step."""
         observation, reward, terminated, _, info = self.env.step(action)
         late = info["time_s"] >= self._world.time_limit_s - 1e-9
         return self._inputs(observation), reward, terminated, late and not terminated, info
@@ -75,19 +55,11 @@ class DriveWorld(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._network.inputs(observation, self._network.plan(observation))._asdict()
 
 
-def make_drive_world(
-    config: DriveConfig, weights: dict[str, NDArray[np.float32]], settings: PlanSettings
-) -> DriveWorld:
-    """Make an environment in a process of its own."""
-    start_worker()
-    return DriveWorld(config.world, DriveNetwork(weights, settings, uncertainty=config.uncertainty))
-
-
 class DrivePolicy(MultiInputActorCriticPolicy):
     """:class:`ControlNetwork` as the mean of a Gaussian, and another for the value."""
 
     def _build(self, lr_schedule: Schedule) -> None:
-        self.mlp_extractor = PassedOn(self.features_dim)  # type: ignore[assignment]
+        self._build_mlp_extractor()
         self.action_net, self.value_net = _Flat(3), _Flat(1)  # type: ignore[assignment]
         self.log_std = nn.Parameter(torch.full((3,), self.log_std_init))
         make: Any = self.optimizer_class
@@ -116,15 +88,10 @@ class _Flat(nn.Module):
         return cast("Tensor", self.network(scan, landmarks.reshape(-1, LANDMARKS, 5), numbers))
 
 
-def make_model(config: DriveConfig, env: VecEnv, folder: Path, *, log_std: float = -2.0) -> PPO:
-    """Return PPO with :class:`DrivePolicy`, its log in a folder."""
-    ppo = config.ppo
+def make_model(config: DriveConfig, env: VecEnv) -> PPO:
+    """Return PPO with :class:`DrivePolicy`."""
     assert flatten_space(env.observation_space).shape == (LANDMARKS * 5 + NUMBERS + SECTORS,)
-    model = PPO(
-        DrivePolicy, env, n_steps=ppo.n_steps, batch_size=ppo.batch_size, n_epochs=ppo.n_epochs,
-        learning_rate=ppo.learning_rate, gamma=ppo.gamma, gae_lambda=ppo.gae_lambda, ent_coef=ppo.ent_coef,
-        clip_range=ppo.clip_range, target_kl=ppo.target_kl, device="cpu", seed=config.seed,
-        policy_kwargs={"log_std_init": log_std},
+    return PPO(
+        DrivePolicy, env, **config.ppo.settings, device="cpu", seed=config.seed,
+        policy_kwargs={"log_std_init": -2.0, "net_arch": []},
     )  # fmt: skip
-    model.set_logger(configure(str(folder / "log"), ["tensorboard"]))
-    return model

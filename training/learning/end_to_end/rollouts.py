@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,12 +43,9 @@ class Episode:
     shaken: float = 0.1  # share of the time, about, that whoever drives is disturbed
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How an episode went."""
 
-    coverage: float
-    time_s: float
     time_to_90_s: float | None
     collisions: int
 
@@ -93,37 +90,49 @@ def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
     return _stacked(scene.maps), _stacked(rows), scene.outcome
 
 
-class _Scene:
-    """An episode under way: what is seen, what was noted, and the disturbances."""
+class _Drive:
+    """An episode under way: what is seen, and how it goes."""
 
     def __init__(self, episode: Episode) -> None:
-        self.env, self.rng, self._episode = _env(episode), np.random.default_rng(episode.seed), episode
-        observation, self._info = self.env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
+        self._episode = episode
+        self.env = ExploreEnv(
+            rooms=episode.rooms, slam=episode.slam, noise=episode.noise,
+            config={"time_limit_s": episode.time_limit_s},
+        )  # fmt: skip
+        observation, _ = self.env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
         self.observation: dict[str, Any] = dict(observation)
-        config = self.env.config
-        self.guide = agents.make(episode.teacher, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-        self.guide.reset(self.env.belief, episode.seed)
-        self.action: NDArray[np.float32] = np.zeros(3, np.float32)
-        self.maps: list[dict[str, Any]] = []
-        self.time_s, self._maps_at = 0.0, 0.0
-        self._reached: float | None = None
-        self._shake, self._shake_end = np.zeros(3), 0.0
-        self._shake_at = float(self.rng.exponential(_PAUSE_S))
-        self._terminated = False
+        self.time_s, self._terminated = 0.0, False
+        self.outcome = Outcome(None, 0)
 
     @property
     def over(self) -> bool:
         """Whether it has come to its end."""
         return self._terminated or self.time_s >= self._episode.time_limit_s - 1e-9
 
-    @property
-    def outcome(self) -> Outcome:
-        """How it went."""
-        info = self._info
-        return Outcome(
-            coverage=info["coverage"], time_s=self.time_s, time_to_90_s=self._reached,
-            collisions=info["collisions"],
-        )  # fmt: skip
+    def step(self, action: NDArray[np.float32]) -> None:
+        """Act."""
+        observation, _, self._terminated, _, info = self.env.step(action)
+        self.observation, self.time_s = dict(observation), info["time_s"]
+        reached = self.outcome.time_to_90_s
+        if reached is None and info["coverage"] >= 0.9:
+            reached = self.time_s
+        self.outcome = Outcome(reached, info["collisions"])
+
+
+class _Scene(_Drive):
+    """An episode to learn from: what was noted, and the disturbances."""
+
+    def __init__(self, episode: Episode) -> None:
+        super().__init__(episode)
+        self.rng = np.random.default_rng(episode.seed)
+        config = self.env.config
+        self.guide = agents.make(episode.teacher, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        self.guide.reset(self.env.belief, episode.seed)
+        self.action: NDArray[np.float32] = np.zeros(3, np.float32)
+        self.maps: list[dict[str, Any]] = []
+        self._maps_at = 0.0
+        self._shake, self._shake_end = np.zeros(3), 0.0
+        self._shake_at = float(self.rng.exponential(_PAUSE_S))
 
     def note_maps(self) -> None:
         """Keep a lesson on the maps, if one is due."""
@@ -142,31 +151,16 @@ class _Scene:
             self._shake = self.rng.uniform(-1.0, 1.0, 3) * _SHAKE
         if self.time_s < self._shake_end:
             action = np.clip(0.5 * action + self._shake, -1.0, 1.0).astype(np.float32)
-        observation, _, self._terminated, _, self._info = self.env.step(action)
-        self.action, self.observation, self.time_s = action, dict(observation), self._info["time_s"]
-        if self._reached is None and self._info["coverage"] >= 0.9:
-            self._reached = self.time_s
+        self.action = action
+        super().step(action)
 
 
 def judge(episode: Episode) -> Outcome:
     """Drive an episode by the network alone, and return how it went."""
-    env, network = _env(episode), _network(episode)
-    observation, info = env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
-    terminated, reached = False, None
-    while not terminated and info["time_s"] < episode.time_limit_s - 1e-9:
-        action = network.twist(network.inputs(observation, network.plan(observation)))
-        observation, _, terminated, _, info = env.step(action)
-        if reached is None and info["coverage"] >= 0.9:
-            reached = info["time_s"]
-    return Outcome(
-        coverage=info["coverage"], time_s=info["time_s"], time_to_90_s=reached, collisions=info["collisions"]
-    )
-
-
-def _env(episode: Episode) -> ExploreEnv:
-    return ExploreEnv(
-        rooms=episode.rooms, slam=episode.slam, noise=episode.noise, config={"time_limit_s": episode.time_limit_s}
-    )
+    drive, network = _Drive(episode), _network(episode)
+    while not drive.over:
+        drive.step(network.twist(network.inputs(drive.observation, network.plan(drive.observation))))
+    return drive.outcome
 
 
 def _network(episode: Episode) -> DriveNetwork:

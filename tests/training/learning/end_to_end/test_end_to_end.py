@@ -18,7 +18,7 @@ from safetensors.numpy import load_file  # noqa: E402
 
 import agents  # noqa: E402
 import mecanum_env  # noqa: E402
-from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, control, sectors, stack  # noqa: E402
+from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, Inputs, sectors  # noqa: E402
 from agents.ppo import load_drive_policy  # noqa: E402
 from slam.settings import from_mapping  # noqa: E402
 from training.learning.end_to_end.config import DriveConfig  # noqa: E402
@@ -50,9 +50,10 @@ def test_numpy_and_torch_agree():
     maps = rng.integers(0, 256, (2, 3, 64, 64)).astype(np.uint8)
     with torch.no_grad():
         price, goal, steps, far = plan(*torch.from_numpy(maps[:, None]))
-    near = stack(arrays(plan), "local", maps[0])
+    light = DriveNetwork(arrays(plan) | arrays(steer))
+    near = light.of_map("local", maps[0])
     np.testing.assert_allclose(near, torch.cat([price, goal]).numpy(), atol=1e-4)
-    overview = stack(arrays(plan), "overview", maps[1])
+    overview = light.of_map("overview", maps[1])
     np.testing.assert_allclose(overview, torch.cat([steps[0], far]).numpy(), atol=1e-4)
     scan = sectors(rng.uniform(size=360).astype(np.float32))
     rows = rng.normal(size=(32, 5)).astype(np.float32)
@@ -62,7 +63,7 @@ def test_numpy_and_torch_agree():
         rest = rng.normal(size=NUMBERS).astype(np.float32)
         with torch.no_grad():
             wanted = steer(*(torch.from_numpy(v)[None] for v in (scan, landmarks, rest)))[0].numpy()
-        np.testing.assert_allclose(control(arrays(steer), scan, landmarks, rest), wanted, atol=1e-4)
+        np.testing.assert_allclose(light.control(Inputs(scan, landmarks, rest)), wanted, atol=1e-4)
     assert scan.shape == (SECTORS,)
 
 
@@ -126,10 +127,9 @@ def run(out: Path, *, kill_at: str = "", **changes) -> None:
 
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, monkeypatch):
-    monkeypatch.setattr("training.learning.end_to_end.run.worker_pool", no_workers)
-    monkeypatch.setattr("training.learning.end_to_end.ppo.start_worker", lambda: None)
+    monkeypatch.setattr("training.learning.folder.worker_pool", no_workers)
     run(tmp_path / "whole")
-    for moment in ("round 1: lessons", "round 1 of 2 done", "chunk 1 of 2"):
+    for moment in ("round 1: lessons", "round 1 of 2 done", "ppo, chunk 1 of 2"):
         with pytest.raises(Killed):
             run(tmp_path / "parts", kill_at=moment)
     run(tmp_path / "parts")

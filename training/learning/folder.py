@@ -1,0 +1,165 @@
+"""What every training run does: keep to a folder, learn in chunks of rollouts, note trials, go on after a kill.
+
+Each chunk begins with fresh episodes and random numbers that follow from the run's seed and the chunk's number
+alone, so that a run that was killed and resumed is the one that was not, bit for bit.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from slam.formats import atomic_write, replacing
+from slam.settings import to_mapping
+from training.learning.config import PpoConfig
+from training.runs.campaign import worker_pool
+
+__all__ = ["FIRST_VALIDATION_SEED", "FolderRun", "save_model", "seed_of", "words"]
+
+FIRST_VALIDATION_SEED = 1000
+
+
+class FolderRun:
+    """A training run in a folder: begun there, or gone on with.
+
+    The folder gets ``progress.json``, where ``command`` is noted for the policies that are exported;
+    ``curve.jsonl`` with a line per evaluation; of stable-baselines3 ``checkpoint.zip``, of TensorBoard ``log``.
+
+    Raises
+    ------
+    ValueError
+        Where the folder holds a run with another configuration.
+    """
+
+    seeds_from = 0
+    """Number of the first chunk's seed."""
+
+    def __init__(
+        self, config: Any, out: Path, *, workers: int, log: Callable[[str], None], command: str = ""
+    ) -> None:
+        self.config, self.out, self._workers, self._log = config, out, workers, log
+        settings = json.loads(json.dumps(to_mapping(config)))
+        self._progress: dict[str, Any] = {
+            "config": settings, "command": command, "round": 0, "chunk": 0, "steps": 0, "best": None,
+            "best_in": "", "wall_s": 0.0, "done": False,
+        }  # fmt: skip
+        path = out / "progress.json"
+        if path.exists():
+            self._progress |= json.loads(path.read_text(encoding="utf-8"))
+        if self._progress["config"] != settings:
+            raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+
+    def train(self) -> None:
+        """Train to the end; a run broken off anywhere goes on from its last checkpoint, a finished one is left."""
+        if self._progress["done"]:
+            return
+        torch.set_num_threads(1)
+        self.out.mkdir(parents=True, exist_ok=True)
+        self._began = time.perf_counter() - self._progress["wall_s"]
+        self._keep()
+        with worker_pool(self._workers) as pool:
+            self._train(pool)
+        self._keep(done=True)
+
+    def _train(self, pool: ProcessPoolExecutor) -> None:
+        raise NotImplementedError
+
+    def _learn(
+        self, model: OnPolicyAlgorithm, env: VecEnv, ppo: PpoConfig, *, every: int, try_out: Callable[[], None],
+        stage: str = "ppo", first: int = 0, prepare: Callable[[int], BaseCallback | None],
+    ) -> None:  # fmt: skip
+        """Go through what is left of a stage, from the last checkpoint if there is one.
+
+        Parameters
+        ----------
+        model, env, ppo
+            What learns, where, and how.
+        every, try_out
+            What is done before the first of every so many chunks, and at the end.
+        stage, first
+            Name of the stage, and number of its first chunk.
+        prepare
+            Called with a chunk's number before it is learned; returns what stable-baselines3 calls back.
+        """
+        progress, checkpoint = self._progress, self.out / "checkpoint.zip"
+        model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
+        model.num_timesteps = progress["steps"]
+        if progress["chunk"] > first:
+            model.set_parameters(str(checkpoint), device="cpu")
+        while (done := progress["chunk"] - first) < ppo.chunks:
+            if done % every == 0:
+                try_out()
+            seed = seed_of(self.config.seed, self.seeds_from + progress["chunk"])
+            model.set_random_seed(seed)
+            env.seed(seed)
+            model._last_obs = None  # fresh episodes
+            model.lr_schedule = FloatSchedule(ppo.learning_rate * (1.0 - done / ppo.chunks))
+            model.learn(ppo.size, callback=prepare(progress["chunk"]), reset_num_timesteps=False)
+            save_model(model, checkpoint)
+            self._keep(chunk=progress["chunk"] + 1, steps=model.num_timesteps)
+            self._say(f"{stage}, chunk {done + 1} of {ppo.chunks}: " + words(_recent(model)))
+        try_out()
+
+    def _note_trial(
+        self, at: dict[str, Any], result: dict[str, Any], cost: float, save: Callable[[], None]
+    ) -> None:
+        """Add a trial to the curve, and ``save`` the weights where none in this stage cost less so far."""
+        path = self.out / "curve.jsonl"
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        # A run killed after a trial repeats it: one line of it is enough.
+        kept = [line for line in map(json.loads, lines) if not at.items() <= line.items()]
+        line = at | result | {"wall_s": time.perf_counter() - self._began}
+        atomic_write(path, "".join(json.dumps(each) + "\n" for each in [*kept, line]))
+        self._say("evaluation: " + words(at | result))
+        stage, best = at.get("stage", ""), self._progress["best"]
+        # Seconds of a rehearsal are not those of the whole environment.
+        if best is None or self._progress["best_in"] != stage or cost < best:
+            save()
+            self._keep(best=cost, best_in=stage)
+
+    def _keep(self, **progress: Any) -> None:
+        self._progress |= progress | {"wall_s": time.perf_counter() - self._began}
+        atomic_write(self.out / "progress.json", json.dumps(self._progress))
+
+    def _say(self, text: str) -> None:
+        self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
+
+
+def seed_of(*numbers: int) -> int:
+    """Return a seed that follows from several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0] % 2**31)
+
+
+def save_model(model: OnPolicyAlgorithm, path: Path) -> None:
+    """Write a zip of stable-baselines3, whole or not at all."""
+    with replacing(path) as new:
+        model.save(new)
+
+
+def words(values: dict[str, Any]) -> str:
+    """Return values as a line of the log says them."""
+    return ", ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
+
+
+def _recent(model: OnPolicyAlgorithm) -> dict[str, float]:
+    """Return what the last rollouts were like: an episode's return and steps, and how learning went."""
+    episodes = list(model.ep_info_buffer or [])
+    found = {
+        name: float(np.mean([e[key] for e in episodes])) if episodes else float("nan")
+        for name, key in (("return", "r"), ("steps", "l"))
+    }
+    names = ("approx_kl", "explained_variance", "entropy_loss", "std")
+    values = {name: model.logger.name_to_value.get(f"train/{name}") for name in names}
+    return found | {name: float(value) for name, value in values.items() if value is not None}
