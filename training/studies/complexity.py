@@ -24,7 +24,7 @@ from slam.formats import atomic_write
 from slam.geometry import wrap
 from slam.motion import move
 from slam.types import Observations, Odometry
-from training.figures.charts import Axis, Line, draw_chart, png
+from training.figures.charts import chart, label, png
 from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
 from training.runs.errors import BadInput, bad_input
 
@@ -228,7 +228,11 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
         result[name] = {"times": rows, "exponent": exponent(plan.landmarks, times)}
     result["config"] = settings
     atomic_write(out / "complexity.json", json.dumps(result, indent=1) + "\n")
-    atomic_write(out / "complexity.png", png(_chart(plan, result)))
+    figure, (axes,) = chart()
+    for name in (*plan.backends, REFERENCE):
+        axes.plot(plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], "o-", label=name)
+    label(axes, f"Time per step: predict, and observe {SEEN} of n landmarks", "landmarks n", "µs", log="xy")
+    atomic_write(out / "complexity.png", png(figure))
     return result
 
 
@@ -287,12 +291,3 @@ def table(result: dict[str, Any]) -> str:
 
 def _cells(values: Sequence[float]) -> str:
     return "".join(f"{v:>9.1f}" for v in values)
-
-
-def _chart(plan: Plan, result: dict[str, Any]) -> NDArray[np.uint8]:
-    lines = [
-        Line(name, plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], dots=True)
-        for name in (*plan.backends, REFERENCE)
-    ]
-    title = f"Time per step: predict, and observe {SEEN} of n landmarks"
-    return draw_chart(lines, title=title, x=Axis("landmarks n", log=True), y=Axis("µs", log=True))

@@ -15,20 +15,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import slam
 from mecanum_env import MAX_EPISODE_STEPS
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS, NoiseConfig
+from mecanum_env.env import ExploreEnv
 from slam.backend import Backend
 from slam.formats import atomic_write, replacing
 from slam.metrics.measures import anees, nees_band
 from slam.settings import unknown_name
-from training.figures.charts import Axis, Line, draw_chart, png
+from training.figures.charts import COLOURS, chart, label, png
 from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
 from training.runs.errors import BadInput, bad_input
 from training.studies.circle_world import WORLDS, drive
+from training.studies.exploring import AGENT, exploring
 
 __all__ = ["Plan", "Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
 
@@ -37,7 +40,6 @@ Job = tuple[str, str, int, int, float]  # backend, rooms, seed, steps, noise
 Record = dict[str, Array]  # of each step (steps,): "nees", "nis", "dof"
 
 FILES = ("consistency.json", "consistency.png")
-AGENT = "nearest-frontier"
 _RUNS = "runs"  # the folder of what each run left
 _IDLE_STEPS = 20  # an agent without a goal for so long has nothing left to do
 _SCALED = ("range_sigma_m", "dropout", "encoder", "radius_error", "base_error", "slip")
@@ -123,30 +125,14 @@ def _in_world(name: str, rooms: str, seed: int, steps: int, noise: float) -> lis
 
 def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> list[tuple[float, float, float]]:
     """Explore until the agent has nothing left to do, or the steps are used up."""
-    import gymnasium
-
-    import agents
-    from mecanum_env.env import ExploreEnv
-
-    wrapped = gymnasium.make(
-        "mecanum_env:mecanum_env/Explore-v0", rooms=rooms, slam=name,
-        noise=dataclasses.asdict(scaled_noise(noise)), config={"coverage_target": 1.0}, max_episode_steps=steps,
-        disable_env_checker=True,
-    )  # fmt: skip
-    observation, _ = wrapped.reset(seed=seed)
-    env = wrapped.unwrapped
-    assert isinstance(env, ExploreEnv)
-    config = env.config
-    agent = agents.make(AGENT, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-    agent.reset(env.belief, seed)
-    rows, idle, done = [], 0, False
-    while not done and idle < _IDLE_STEPS:
-        action = agent.act(observation, env.belief)
-        idle = idle + 1 if agent.goal is None else 0
-        observation, _, terminated, truncated, info = wrapped.step(action)
-        done = terminated or truncated
+    env = ExploreEnv(
+        rooms=rooms, slam=name, noise=dataclasses.asdict(scaled_noise(noise)), config={"coverage_target": 1.0}
+    )
+    rows = []
+    for info, idle in exploring(env, seed=seed, steps=steps):
         rows.append(_row(env.backend, info["true_pose"]))
-    wrapped.close()
+        if idle >= _IDLE_STEPS:
+            break
     return rows
 
 
@@ -274,13 +260,17 @@ def table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _chart(plan: Plan, groups: dict[str, list[Record]]) -> NDArray[np.uint8]:
-    averages = {name: _averages(group)[0] for name, group in groups.items()}
-    highest = max(float(np.max(v[np.isfinite(v)], initial=0.0)) for v in averages.values())
+def _chart(plan: Plan, groups: dict[str, list[Record]]) -> Figure:
+    figure, (axes,) = chart()
+    axes.axhspan(*nees_band(3, plan.runs), color=COLOURS[2], alpha=0.2, linewidth=0, label="95 % band")
+    highest = 0.0
+    for name, group in groups.items():
+        average = _averages(group)[0]
+        axes.plot(np.arange(1, len(average) + 1), average, linewidth=1, label=name)
+        highest = max(highest, float(np.max(average[np.isfinite(average)], initial=0.0)))
     title = f"Pose NEES / 3, average of {plan.runs} runs: {plan.rooms}, noise × {plan.noise:g}"
-    axis = Axis("1 is consistent, above it too sure; green: 95 % band", log=True) if highest > 10 else Axis(
-        "1 is consistent, above it too sure; green: 95 % band", low=0.0
-    )  # fmt: skip
-    lines = [Line(name, np.arange(1, len(v) + 1), v, px=1) for name, v in averages.items()]
-    last = max(len(v) for v in averages.values())
-    return draw_chart(lines, title=title, x=Axis("step", low=0.0, high=last), y=axis, band=nees_band(3, plan.runs))
+    label(axes, title, "step", "1 is consistent, above it too sure", log="y" if highest > 10 else "")
+    if highest <= 10:
+        axes.set_ylim(bottom=0.0)
+    axes.set_xlim(left=0.0)
+    return figure

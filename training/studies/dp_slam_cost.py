@@ -27,7 +27,7 @@ from slam.formats import atomic_write
 from slam.particles.shared_grid import SharedGrid
 from slam.settings import from_mapping
 from slam.types import Odometry, Scan
-from training.figures.charts import Axis, Line, draw_chart, png
+from training.figures.charts import INK, chart, label, png
 from training.runs.errors import BadInput, bad_input, check_writable
 
 __all__ = ["cost", "record", "study"]
@@ -141,18 +141,17 @@ def _numbers(text: str) -> list[int]:
 def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:
     x = [row["particles"] for row in rows]
     out.mkdir(parents=True, exist_ok=True)
-    for name, key, label in (("memory", "mb", "MB"), ("time", "ms_per_update", "ms")):
-        lines = [
-            Line(kind, x, [np.nan if row[kind] is None else row[kind][key] for row in rows], dots=True)
-            for kind in _KINDS
-        ]
+    for name, key, title, unit in (
+        ("memory", "mb", "memory", "MB"),
+        ("time", "ms_per_update", "time per update", "ms"),
+    ):
+        figure, (axes,) = chart()
+        for kind in _KINDS:
+            axes.plot(x, [np.nan if row[kind] is None else row[kind][key] for row in rows], "o-", label=kind)
         if key == "mb":
-            lines.append(Line("copies, computed", x, [row["copies_mb"] for row in rows], px=1))
-        chart = draw_chart(
-            lines, title=f"Maps of the particles: {'memory' if key == 'mb' else 'time per update'}",
-            x=Axis("particles", log=True), y=Axis(label, log=True),
-        )  # fmt: skip
-        atomic_write(out / f"{name}.png", png(chart))
+            axes.plot(x, [row["copies_mb"] for row in rows], "--", color=INK, label="copies, computed")
+        label(axes, f"Maps of the particles: {title}", "particles", unit, log="xy")
+        atomic_write(out / f"{name}.png", png(figure))
     atomic_write(out / "dp_slam_cost.json", json.dumps({"run": run, "rows": rows}, indent=1) + "\n")
 
 

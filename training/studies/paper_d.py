@@ -16,12 +16,14 @@ from typing import Annotated, Any
 
 import typer
 
+from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import PAPER_D
 from slam.formats import atomic_write
 from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
 from training.runs.errors import bad_input
 from training.runs.options import Workers
+from training.studies.exploring import exploring
 
 __all__ = ["PAPER_MEAN_MAX_M", "run_job", "study", "summarise"]
 
@@ -41,29 +43,13 @@ Row = dict[str, Any]
 
 def run_job(job: Job) -> Row:
     """Explore one map; return the metrics at the end."""
-    import agents
-    from mecanum_env.env import ExploreEnv
-
     number, backend, seed = job
     env = ExploreEnv(
         robot="cavity", rooms={"name": "corridors", "map": number}, slam=backend, config={"coverage_target": 1.0}
     )
     # In corridors this narrow what lies round a corner is not seen from afar: look from near by.
-    agent = agents.make(
-        "nearest-frontier",
-        config={"frontiers": {"view_range_m": 1.0}},
-        robot=env.config.robot,
-        lidar=env.config.lidar,
-    )
-    observation, _ = env.reset(seed=seed)
-    agent.reset(env.belief, seed=seed)
-    idle = 0
-    for _ in range(MAX_STEPS):
-        action = agent.act(observation, env.belief)
-        observation, _, terminated, _, _ = env.step(action)
-        idle = idle + 1 if agent.goal is None else 0
-        if terminated or idle > 20:
-            break
+    for _ in exploring(env, seed=seed, steps=MAX_STEPS, config={"frontiers": {"view_range_m": 1.0}}):
+        pass
     metrics = env.episode_metrics()
     return {key: metrics[key] for key in _KEYS}
 
