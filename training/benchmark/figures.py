@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.benchmark.episode import EpisodeRow, Key
-from training.benchmark.evaluate import consistency_figures
+from training.figures.consistency import consistency_figures
 from training.figures.statistics import (
     Comparison,
     Estimate,
@@ -108,7 +108,7 @@ class Group:
 
     def consistency(self) -> dict[str, Any]:
         """Return ``nees_over_3_mean``, ``nees_band_95`` and ``fraction_in_band`` over all episodes' seconds."""
-        return consistency_figures([row.nees.tolist() for row in self.rows])
+        return consistency_figures([row.nees for row in self.rows])
 
     def values(self, metric: Metric) -> Array:
         """Return every episode's value ``(n,)``, nan where it has none."""

@@ -121,10 +121,10 @@ def write_settings(out: Path, settings: Mapping[str, Any]) -> None:
 
 
 def run_all(
-    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int, keep: Callable[[Job, Result], None],
-    what: str = "runs", apart: bool = False,
+    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int | None,
+    keep: Callable[[Job, Result], None], what: str = "runs", apart: bool = False,
 ) -> None:  # fmt: skip
-    """Do every job, in ``workers`` processes, and keep each result as it comes.
+    """Do every job, in ``workers`` processes (None: one a core), and keep each result as it comes.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def run_all(
     """
     progress = _Progress(len(jobs), what)
     try:
-        with closing(_results(jobs, work, min(workers, len(jobs)), apart)) as results:
+        with closing(_results(jobs, work, min(workers or os.cpu_count() or 1, len(jobs)), apart)) as results:
             for job, result in results:
                 keep(job, result)
                 progress.step()

@@ -25,8 +25,10 @@ from slam.geometry import wrap
 from slam.motion import move
 from slam.types import Observations, Odometry
 from training.figures.charts import chart, label, png
-from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
+from training.figures.tables import number, text_table
+from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
 from training.runs.errors import BadInput, bad_input
+from training.runs.rows import resume
 
 __all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
 
@@ -40,7 +42,7 @@ SEEN = 10
 REFERENCE = "blas"
 """For comparison: P − WᵀW of a W of 2 · SEEN rows by BLAS, P of the size of the joint covariance, float64."""
 REPEATS = 10
-_POINTS = "points"
+STORE = "points.jsonl"  # what was measured
 _MOST_LANDMARKS = 2000  # the joint covariance of so many takes 130 MB
 _DT, _SPEED, _TURN = 0.1, 0.3, 0.2
 _SIGMAS = np.array([0.02, math.radians(1.0)])
@@ -207,20 +209,7 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
     for name in plan.backends:
         _check_observes(name)
     write_settings(out, settings)
-    folder = out / _POINTS
-    folder.mkdir(exist_ok=True)
-    points: dict[Job, Point] = {}
-    for job in plan.jobs():
-        kept = _load(_file(folder, job))
-        if kept is not None:
-            points[job] = kept
-
-    def keep(job: Job, point: Point) -> None:
-        atomic_write(_file(folder, job), json.dumps(point) + "\n")
-        points[job] = point
-
-    missing = [job for job in plan.jobs() if job not in points]
-    run_all(missing, run_job, workers=1, keep=keep, what="points", apart=True)
+    points = resume(out / STORE, plan.jobs(), run_job, workers=1, what="points", apart=True)
     result: dict[str, Any] = {}
     for name in (*plan.backends, REFERENCE):
         rows = [{"landmarks": n, **points[name, n, plan.steps]} for n in plan.landmarks]
@@ -243,22 +232,6 @@ def exponent(landmarks: Sequence[int], times: Sequence[float]) -> float | None:
     return float(np.polyfit(np.log(landmarks), np.log(times), 1)[0])
 
 
-def _file(folder: Path, job: Job) -> Path:
-    return folder / f"{job[0]}-{job[1]}.json"
-
-
-def _load(path: Path) -> Point | None:
-    """Return a point as it was kept; None where it is not there or damaged, and so to be measured again."""
-    try:
-        point = json.loads(path.read_text("utf-8"))
-        return {name: None if point[name] is None else float(point[name]) for name in _KEYS}
-    except (OSError, ValueError, TypeError, KeyError):
-        return None
-
-
-_KEYS = ("us_per_step", "us_predict", "us_correction")
-
-
 def _check_observes(name: str) -> None:
     """Refuse a backend that takes scans only."""
     backend = slam.make(name, config={"lidar_offset_m": 0.0})
@@ -276,18 +249,17 @@ def table(result: dict[str, Any]) -> str:
     """Return the times per step [µs] as a table, and the EKFs' corrections against the reference."""
     rows = {name: row for name, row in result.items() if name != "config"}
     sizes = [point["landmarks"] for point in rows[REFERENCE]["times"]]
-    lines = [f"{'µs per step, landmarks':<26}" + "".join(f"{n:>9}" for n in sizes) + f"{'exponent':>10}"]
+    head = ["µs per step, landmarks", *(str(n) for n in sizes), "exponent"]
+    lines = []
     for name, row in rows.items():
-        fit = row["exponent"]
-        ends = f"{'-' if fit is None else f'{fit:.2f}':>10}"
-        lines.append(f"{name:<26}" + _cells([p["us_per_step"] for p in row["times"]]) + ends)
+        lines.append([name, *_cells([p["us_per_step"] for p in row["times"]]), number(row["exponent"], 2, "-")])
         corrections = [p["us_correction"] for p in row["times"]]
         if all(corrections):
             ratios = [c / p["us_per_step"] for c, p in zip(corrections, rows[REFERENCE]["times"], strict=True)]
-            lines.append(f"{'  its stacked update':<26}" + _cells(corrections))
-            lines.append(f"{'  that over ' + REFERENCE:<26}" + _cells(ratios))
-    return "\n".join(lines)
+            lines.append(["  its stacked update", *_cells(corrections), ""])
+            lines.append([f"  that over {REFERENCE}", *_cells(ratios), ""])
+    return text_table(head, lines)
 
 
-def _cells(values: Sequence[float]) -> str:
-    return "".join(f"{v:>9.1f}" for v in values)
+def _cells(values: Sequence[float]) -> list[str]:
+    return [f"{v:.1f}" for v in values]

@@ -28,7 +28,9 @@ from slam.particles.shared_grid import SharedGrid
 from slam.settings import from_mapping
 from slam.types import Odometry, Scan
 from training.figures.charts import INK, chart, label, png
+from training.figures.tables import text_table
 from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.options import Seed
 
 __all__ = ["cost", "record", "study"]
 
@@ -113,7 +115,7 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/dp_slam_cost"),
     particles: Annotated[str, typer.Option(help="Numbers, separated by commas.")] = "50,100,200,500,1000",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     steps: Annotated[int, typer.Option(min=1, help="Of the drive.")] = 120,
     limit_mb: Annotated[float, typer.Option(help="Copies that need more are left out.")] = 1000.0,
 ) -> None:
@@ -157,13 +159,12 @@ def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the figures as a table."""
-    lines = [f"{'particles':>9}{'nodes':>8}{'shared MB':>12}{'copies MB':>12}{'shared ms':>12}{'copies ms':>12}"]
+    lines = []
     for row in rows:
         shared, copied = row["shared"], row["copies"]
-        copies_mb = f"{copied['mb']:.0f}" if copied else f"({row['copies_mb']:.0f})"
-        copies_ms = f"{copied['ms_per_update']:.1f}" if copied else "-"
-        lines.append(
-            f"{row['particles']:>9}{shared['nodes']:>8}{shared['mb']:>12.1f}{copies_mb:>12}"
-            f"{shared['ms_per_update']:>12.1f}{copies_ms:>12}"
-        )
-    return "\n".join(lines)
+        lines.append([
+            str(row["particles"]), str(shared["nodes"]), f"{shared['mb']:.1f}",
+            f"{copied['mb']:.0f}" if copied else f"({row['copies_mb']:.0f})", f"{shared['ms_per_update']:.1f}",
+            f"{copied['ms_per_update']:.1f}" if copied else "-",
+        ])  # fmt: skip
+    return text_table(["particles", "nodes", "shared MB", "copies MB", "shared ms", "copies ms"], lines)

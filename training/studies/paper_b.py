@@ -24,6 +24,7 @@ from slam.backend import Backend
 from slam.formats import atomic_write
 from training.figures.charts import COLOURS, chart, label, png
 from training.runs.errors import BadInput, check_writable
+from training.runs.options import Seed
 from training.studies.circle_world import WORLDS, LandmarkWorld, drive
 
 __all__ = ["floor_of", "follow_filter", "follow_particles", "paper_b", "study"]
@@ -206,7 +207,7 @@ def _draw_particles(axes: Axes, particles: dict[str, dict[str, Array]]) -> None:
 
 def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_b"),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of the run.")] = None,
 ) -> None:
     """Repeat paper B's claims as plots, in the circle world."""

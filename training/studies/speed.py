@@ -18,6 +18,7 @@ import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
+from training.figures.tables import text_table
 from training.studies import peers
 
 __all__ = ["REPEATS", "measure", "run"]
@@ -222,9 +223,9 @@ def run(
         f"{result['landmarks_mean']:.0f} landmarks on average; {result['rss_mb_before']:.0f} MB before, "
         f"{result['rss_mb']:.0f} MB after)"
     )
-    print(f"{'stage':<14}{'median µs':>10}{'mean µs':>10}")
-    for name, median in sorted(result["stages_us"].items(), key=lambda item: -item[1]):
-        print(f"{name:<14}{median:>10.1f}{result['stages_us_mean'][name]:>10.1f}")
+    stages = sorted(result["stages_us"].items(), key=lambda item: -item[1])
+    rows = [[name, f"{median:.1f}", f"{result['stages_us_mean'][name]:.1f}"] for name, median in stages]
+    print(text_table(["stage", "median µs", "mean µs"], rows))
     if peer is not None:
         print(_against(result["peer"]))
     return result

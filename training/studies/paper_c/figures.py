@@ -26,6 +26,7 @@ from slam.odometry.riccati import RECOVERIES, Tolerances
 from slam.odometry.transform_filter import KalmanBucyFilter
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.runs.errors import check_writable
+from training.runs.options import Seed
 from training.runs.running import versions
 from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
@@ -276,7 +277,7 @@ def _summary(result: dict[str, Any]) -> dict[str, Any]:
 
 def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     runs: Annotated[int, typer.Option(min=1, help="Of the filter, for its errors.")] = 200,
     episodes: Annotated[int, typer.Option(min=1, help="Drives of the accelerating robot.")] = 20,
     explorations: Annotated[int, typer.Option(min=0, help="Episodes with filtered odometry.")] = 20,

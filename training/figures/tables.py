@@ -1,0 +1,40 @@
+"""Tables as text: aligned for a terminal, in Markdown, as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+__all__ = ["csv_table", "markdown_table", "number", "text_table"]
+
+
+def number(value: float | None, digits: int, missing: str = "–") -> str:
+    """Return a number with so many digits after the point, or what stands for none."""
+    return missing if value is None else f"{value:.{digits}f}"
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return columns of one width each, the first to the left, the others to the right."""
+    cells = [head, *rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return "\n".join(
+        "  ".join([row[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(row[1:], widths[1:], strict=True))])
+        for row in cells
+    )
+
+
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table in Markdown."""
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
+
+
+def csv_table(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
+    """Return rows as CSV with the first columns and every other that a row has; empty where there is no value."""
+    file = io.StringIO()
+    columns = dict.fromkeys((*first, *(name for row in rows for name in row)))
+    writer = csv.DictWriter(file, list(columns), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()
