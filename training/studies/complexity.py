@@ -27,8 +27,10 @@ from slam.types import Observations, Odometry
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
-from training.runs.errors import BadInput, bad_input
+from training.runs.errors import bad_input
+from training.runs.options import whole_numbers
 from training.runs.rows import resume
+from training.studies.circle_world import check_observes
 
 __all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
 
@@ -61,12 +63,7 @@ class Plan:
         """Check options as typed; :class:`BadInput` says what is allowed."""
         with bad_input():
             backends = tuple(backend_names(slam))
-            words = [word.strip() for word in landmarks.split(",")]
-            sizes = sorted({int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 9})
-            if not all(w.isascii() and w.isdigit() for w in words):
-                raise ValueError(f"--landmarks {landmarks!r} are no numbers; give for instance 25,50,100")
-            if not sizes or sizes[0] < SEEN or sizes[-1] > _MOST_LANDMARKS or any(len(w) > 8 for w in words):
-                raise ValueError(f"--landmarks must each be in {SEEN} … {_MOST_LANDMARKS}, got {landmarks!r}")
+        sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
         return cls(backends=backends, landmarks=tuple(sizes), steps=steps)
 
     def settings(self) -> dict[str, Any]:
@@ -207,7 +204,7 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
     settings = plan.settings()
     check_settings(out, settings, FILES)
     for name in plan.backends:
-        _check_observes(name)
+        check_observes(name)
     write_settings(out, settings)
     points = resume(out / STORE, plan.jobs(), run_job, workers=1, what="points", apart=True)
     result: dict[str, Any] = {}
@@ -230,16 +227,6 @@ def exponent(landmarks: Sequence[int], times: Sequence[float]) -> float | None:
     if len(landmarks) < 2:
         return None
     return float(np.polyfit(np.log(landmarks), np.log(times), 1)[0])
-
-
-def _check_observes(name: str) -> None:
-    """Refuse a backend that takes scans only."""
-    backend = slam.make(name, config={"lidar_offset_m": 0.0})
-    world = _landmarks(SEEN)
-    try:
-        _map_everything(backend, world, np.zeros(3))
-    except (NotImplementedError, TypeError, ValueError) as error:
-        raise BadInput(f"--slam {name} takes no landmark observations ({error}); leave it out") from error
 
 
 # ---- what the user sees ----------------------------------------------------------------------------------------

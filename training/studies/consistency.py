@@ -31,9 +31,9 @@ from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
-from training.runs.errors import BadInput, bad_input
+from training.runs.errors import bad_input
 from training.runs.rows import resume
-from training.studies.circle_world import WORLDS, drive
+from training.studies.circle_world import WORLDS, check_observes, drive
 from training.studies.exploring import AGENT, exploring
 
 __all__ = ["Plan", "Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
@@ -155,7 +155,7 @@ def consistency(plan: Plan, *, out: Path, workers: int | None) -> dict[str, Any]
     check_settings(out, settings, FILES)
     if plan.rooms in WORLDS:
         for name in plan.backends:
-            _check_observes(name, plan.rooms)
+            check_observes(name)
     write_settings(out, settings)
     rows = resume(out / STORE, plan.jobs(), run_job, workers=workers)
     groups = {name: [_record(row) for job, row in rows.items() if job[0] == name] for name in plan.backends}
@@ -186,18 +186,6 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
         "steps": len(averages),
         "band": [low, high],
     }
-
-
-def _check_observes(name: str, rooms: str) -> None:
-    """Refuse a backend that takes scans only where there are none."""
-    world = WORLDS[rooms]
-    try:
-        for _ in drive(world, slam.make(name, config=world.backend_settings()), 0, 2):
-            pass
-    except (NotImplementedError, TypeError, ValueError) as error:
-        raise BadInput(
-            f"--slam {name} takes no landmark observations ({error}); give --rooms {room_registry.names()[0]}"
-        ) from error
 
 
 # ---- what the user sees ----------------------------------------------------------------------------------------

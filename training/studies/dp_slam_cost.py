@@ -29,8 +29,8 @@ from slam.settings import from_mapping
 from slam.types import Odometry, Scan
 from training.figures.charts import INK, chart, label, png
 from training.figures.tables import text_table
-from training.runs.errors import BadInput, bad_input, check_writable
-from training.runs.options import Seed
+from training.runs.errors import bad_input, check_writable
+from training.runs.options import Seed, whole_numbers
 
 __all__ = ["cost", "record", "study"]
 
@@ -120,7 +120,7 @@ def study(
     limit_mb: Annotated[float, typer.Option(help="Copies that need more are left out.")] = 1000.0,
 ) -> None:
     """Measure what the maps of DP-SLAM's particles cost: one shared grid, or a copy each."""
-    numbers = _numbers(particles)
+    numbers = whole_numbers("--particles", particles, low=1, high=100_000)
     with bad_input():
         room_registry.check(rooms)
     check_writable(out, _FILES)
@@ -128,16 +128,6 @@ def study(
     rows = cost(drive, settings, numbers, limit_mb=limit_mb, seed=seed)
     _write(out, rows, {"rooms": rooms, "seed": seed, "steps": len(drive) - 1})
     print(table(rows))
-
-
-def _numbers(text: str) -> list[int]:
-    try:
-        found = sorted({int(part) for part in text.split(",")})
-    except ValueError:
-        found = []
-    if not found or found[0] < 1:
-        raise BadInput(f"--particles takes whole numbers from 1 on, separated by commas; got {text!r}")
-    return found
 
 
 def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:

@@ -31,7 +31,7 @@ from training.runs.running import versions
 from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
 
-__all__ = ["covariances", "estimates", "paper_c", "run_of", "study"]
+__all__ = ["covariances", "estimates", "run_of", "study"]
 
 Array = NDArray[np.float64]
 
@@ -236,22 +236,16 @@ def _odometry_chart(rows: list[dict[str, Any]]) -> Figure:
 # ---- all of it -------------------------------------------------------------------------------------------------
 
 
-def paper_c(
-    out: Path, *, seed: int = 0, runs: int = 200, episodes: int = 20, explorations: int = 20,
-    steps: int = 1000, workers: int = 1,
-) -> dict[str, Any]:  # fmt: skip
-    """Make every figure, write the charts and ``paper_c.json``, and return the latter's contents.
-
-    Parameters
-    ----------
-    seed, runs
-        Of the measurement noise in Fig. 3, whose first run is drawn.
-    episodes
-        Drives per noise preset and set of seeds.
-    explorations, steps, workers
-        Explored apartments per noise preset, filter and set of seeds (0: none), the steps of each at most, and the
-        processes for them.
-    """
+def study(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
+    seed: Seed = 0,
+    runs: Annotated[int, typer.Option(min=1, help="Of the filter, for its errors.")] = 200,
+    episodes: Annotated[int, typer.Option(min=1, help="Drives of a noise preset and a set of seeds.")] = 20,
+    explorations: Annotated[int, typer.Option(min=0, help="Explored apartments, with and without.")] = 20,
+    steps: Annotated[int, typer.Option(min=1, help="Of an exploration, at most.")] = 1000,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+) -> None:
+    """Repeat paper C's figures: a filter by differential transforms, its cost, its use on board."""
     check_writable(out, _FILES)
     charts: dict[str, Figure] = {}
     result: dict[str, Any] = {
@@ -265,28 +259,7 @@ def paper_c(
     for name, figure in charts.items():
         atomic_write(out / name, png(figure))
     atomic_write(out / "paper_c.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
-    return result
-
-
-def _summary(result: dict[str, Any]) -> dict[str, Any]:
-    """Return what fits on a screen."""
+    # What fits on a screen.
     work = {name: result["work"][name]["cheapest_within_goal"] for name in _WORK_MODELS}
     told = {key: value for key, value in result["odometry"].items() if key != "training"}
-    return {"covariance": result["covariance"], "estimate": result["estimate"], "work": work, "odometry": told}
-
-
-def study(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
-    seed: Seed = 0,
-    runs: Annotated[int, typer.Option(min=1, help="Of the filter, for its errors.")] = 200,
-    episodes: Annotated[int, typer.Option(min=1, help="Drives of the accelerating robot.")] = 20,
-    explorations: Annotated[int, typer.Option(min=0, help="Episodes with filtered odometry.")] = 20,
-    steps: Annotated[int, typer.Option(min=1, help="Of a drive.")] = 1000,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
-) -> None:
-    """Repeat paper C's figures: a filter by differential transforms, its cost, its use on board."""
-    result = paper_c(
-        out, seed=seed, runs=runs, episodes=episodes, explorations=explorations, steps=steps,
-        workers=workers,
-    )  # fmt: skip
-    print(json.dumps(_summary(result), indent=1, ensure_ascii=False))
+    print(json.dumps(result | {"work": work, "odometry": told}, indent=1, ensure_ascii=False))
