@@ -17,11 +17,8 @@ from typing import Annotated, Any
 import typer
 
 import agents
-from mecanum_env.config import NOISE_PRESETS
-from mecanum_env.rooms.registry import check as check_rooms
+from mecanum_env.arguments import make_config
 from slam.formats import atomic_write
-from slam.registry import config_type
-from slam.settings import unknown_name
 from training.episodes.explore import ExploreOptions, prepare, run
 from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
@@ -114,17 +111,6 @@ def _shown(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
-def _check_names(kinds: list[str], backends: list[str], agent: str, noise: str) -> None:
-    """Raise ``ValueError`` for a name that is not registered, before any episode is run."""
-    for kind in kinds:
-        check_rooms(kind)
-    for backend in backends:
-        config_type(backend)
-    agents.check(agent)
-    if noise not in NOISE_PRESETS:
-        raise unknown_name("noise preset", noise, NOISE_PRESETS)
-
-
 def study(
     rooms: Annotated[
         str, typer.Option(help="Generators of rooms, separated by commas.")
@@ -138,7 +124,10 @@ def study(
 ) -> None:
     """Explore over seeds, rooms and backends: one row each, and their medians."""
     with bad_input():
-        _check_names(rooms.split(","), slam.split(","), agent, noise)
+        agents.check(agent)
+        for kind in rooms.split(","):
+            for backend in slam.split(","):
+                make_config(rooms=kind, slam=backend, noise=noise)
         jobs = [
             (r, b, s, agent, noise) for s in parse_seeds(seeds) for r in rooms.split(",") for b in slam.split(",")
         ]
