@@ -43,7 +43,7 @@ def tables(summary: Summary) -> str:
         for together, found in summary.get("comparison", {}).items()
     }
     parts = ["### Time to 95 % coverage [s], IQM\n"]
-    parts += [markdown(table) for table in overview(suites, versus, config["baseline"])]
+    parts += [markdown(table) for table in overview(suites, versus, config["baseline"], limits=False)]
     for suite, found in suites.items():
         seeds = config["seeds"][suite]
         parts.append(f"### {suite}\n\nSeeds {min(seeds)} to {max(seeds)}.\n")

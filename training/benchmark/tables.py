@@ -124,9 +124,7 @@ def figures_table(
         for metric in shown_metrics:
             key = metric.key
             cell = _figure(metric, figures.get(key, NONE), limits=limits is None or key in limits)
-            is_best = cell.text == best[key] and not _is_bound(name)
-            note = notes[name][key] if notes else ""
-            cells.append(replace(cell, note=note, tone="best" if is_best else ""))
+            cells.append(_toned(replace(cell, note=notes[name][key] if notes else ""), name, best[key]))
         rows.append((name, tuple(cells)))
     return Table(("agent", *(["episodes"] if episodes else []), *map(_heading, shown_metrics)), tuple(rows))
 
@@ -137,7 +135,8 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
     for name, against in found.items():
         cells = []
         for key in AGAINST:
-            note = f"better in {_plain(_share(against[key].probability))}"
+            share = _plain(_share(against[key].probability))
+            note = "" if math.isnan(against[key].probability.value) else f"better in {share}"
             cells.append(_change(BY_KEY[key], against[key].ratio, note))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))
@@ -146,11 +145,13 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
 
 
 def overview(
-    suites: Mapping[str, Mapping[str, Intervals]], versus: Mapping[str, Intervals], baseline: str | None
-) -> list[Table]:
+    suites: Mapping[str, Mapping[str, Intervals]], versus: Mapping[str, Intervals], baseline: str | None, *,
+    limits: bool = True,
+) -> list[Table]:  # fmt: skip
     """Return time to 95 % of every agent on every suite, the quickest first: nominal suites, slippery ones.
 
-    ``versus`` has the ratios of that time to the baseline's over all suites of a noise, by agent.
+    ``versus`` has the ratios of that time to the baseline's over all suites of a noise, by agent; without
+    ``limits`` the times' intervals are left out.
     """
     metric, tables = BY_KEY[_TIME], []
     for together, slippery in (("all-nominal", False), ("all-slippery", True)):
@@ -160,12 +161,15 @@ def overview(
         ratios = versus.get(together, {})
         times = {
             name: [suites[suite].get(name, {}).get(_TIME, NONE) for suite in columns]
-            for name in ranked({name: found for suite in columns for name, found in suites[suite].items()})
+            for name in sorted({name for suite in columns for name in suites[suite]})
         }
-        order = sorted(times, key=lambda name: _mean([time.value for time in times[name]]))
+        best = [_best(metric, suites[suite]) for suite in columns]
         rows = []
-        for name in order:
-            cells = [_figure(metric, time, limits=False) for time in times[name]]
+        for name in sorted(times, key=lambda name: _mean([time.value for time in times[name]])):
+            cells = [
+                _toned(_figure(metric, time, limits=limits), name, least)
+                for time, least in zip(times[name], best, strict=True)
+            ]
             if ratios:
                 cells.append(_change(metric, ratios[name]) if name in ratios else Cell(""))
             rows.append((name, tuple(cells)))
@@ -190,6 +194,10 @@ def _best(metric: Metric, found: Mapping[str, Intervals]) -> str | None:
     if not metric.better or len(values) < 2:
         return None
     return shown(metric, min(values) if metric.better == "low" else max(values))
+
+
+def _toned(cell: Cell, name: str, best: str | None) -> Cell:
+    return replace(cell, tone="best") if cell.text == best and not _is_bound(name) else cell
 
 
 def _is_bound(name: str) -> bool:
