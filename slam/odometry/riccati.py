@@ -19,16 +19,9 @@ from slam.odometry.differential_transform import fill_model, fit_pade
 from slam.settings import require, unknown_name
 
 __all__ = [
-    "MOST_EXPANSIONS",
-    "RECOVERIES",
-    "Tolerances",
-    "Workspace",
-    "advance",
-    "covariance_spectrum",
-    "estimate_spectrum",
-    "expand",
-    "recover",
-]
+    "MOST_EXPANSIONS", "RECOVERIES", "Tolerances", "Workspace", "advance", "covariance_spectrum",
+    "estimate_spectrum", "expand", "recover",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Rules = tuple[float, float, bool]  # relative and absolute error of an expansion, whether fractions are tried

@@ -11,20 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from slam.formats import atomic_write
+from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
 from training.benchmark.output import Entry, Report, centres
 from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent
-from training.benchmark.tables import (
-    BY_KEY,
-    HEADLINE,
-    Cell,
-    Table,
-    against_table,
-    figures_table,
-    html,
-    overview,
-    shown,
-)
 from training.episodes.explore import ENDINGS
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.figures.page_style import STYLE
@@ -89,7 +79,7 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
     parts = [
         f'<h2 id="{_anchor(name)}">{escape(name)}</h2>',
         f'<p class="soft">{episodes} episodes an agent, {escape(backends)}</p>',
-        _figures(entries, HEADLINE, colours),
+        _figures(entries, tables.HEADLINE, colours),
         _against(
             {entry.name: entry.against for entry in entries if entry.against},
             report.baseline,
@@ -105,7 +95,7 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
         "then the others, the largest trajectory error first.</p>",
         *(_cases(entry) for entry in entries),
         "<details><summary>All metrics</summary>",
-        _figures(entries, list(BY_KEY), colours, medians=True),
+        _figures(entries, list(tables.BY_KEY), colours, medians=True),
         "</details>",
     ]
     return "\n".join(parts)
@@ -118,13 +108,14 @@ def _figures(
     if medians:
         notes = {
             e.name: {
-                key: f"median {shown(BY_KEY[key], f.averages.median.value)}, n {f.averages.n}"
+                key: f"median {tables.shown(tables.BY_KEY[key], f.averages.median.value)}, n {f.averages.n}"
                 for key, f in e.figures.items()
             }
             for e in entries
         }
-    return html(
-        figures_table(centres(entries), metrics, notes=notes), {e.name: _key(colours[e.name]) for e in entries}
+    return tables.html(
+        tables.figures_table(centres(entries), metrics, notes=notes),
+        {e.name: _key(colours[e.name]) for e in entries},
     )
 
 
@@ -136,7 +127,7 @@ def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None
         f"<h3>{escape(f'Against {baseline}, {where}')}</h3>"
         '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
         "change; below, in what share of the episodes it did better, ties counted half.</p>"
-        + html(against_table(found, baseline))
+        + tables.html(tables.against_table(found, baseline))
     )
 
 
@@ -159,9 +150,11 @@ def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
 def _ends_table(entries: Sequence[Entry]) -> str:
     ends = {entry.name: entry.group.ends() for entry in entries}
     kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
-    rows = tuple((name, tuple(Cell(str(found.get(kind, "–"))) for kind in kinds)) for name, found in ends.items())
+    rows = tuple(
+        (name, tuple(tables.Cell(str(found.get(kind, "–"))) for kind in kinds)) for name, found in ends.items()
+    )
     means = "; ".join(f"{kind}: {ENDINGS[kind]}" for kind in kinds if kind in ENDINGS)
-    return f'{html(Table(("agent", *kinds), rows))}<p class="soft">{escape(means)}</p>'
+    return f'{tables.html(tables.Table(("agent", *kinds), rows))}<p class="soft">{escape(means)}</p>'
 
 
 def _consistency_table(entries: Sequence[Entry]) -> str:
@@ -171,9 +164,11 @@ def _consistency_table(entries: Sequence[Entry]) -> str:
         mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
         average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
         share = f"{100 * found['fraction_in_band']:.0f} %"
-        rows.append((entry.name, (Cell(average), Cell(f"{low:.2f} … {high:.2f}"), Cell(share))))
+        rows.append(
+            (entry.name, (tables.Cell(average), tables.Cell(f"{low:.2f} … {high:.2f}"), tables.Cell(share)))
+        )
     head = ("agent", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it")
-    return html(Table(head, tuple(rows)))
+    return tables.html(tables.Table(head, tuple(rows)))
 
 
 def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
@@ -228,7 +223,9 @@ def _overview(report: Report, suites: dict[str, list[Entry]]) -> str:
         for together, found in report.overall.items()
     }
     found = {suite: centres(entries) for suite, entries in suites.items()}
-    return "<h3>Time to 95 % coverage [s]</h3>" + "".join(map(html, overview(found, ratios, report.baseline)))
+    return "<h3>Time to 95 % coverage [s]</h3>" + "".join(
+        map(tables.html, tables.overview(found, ratios, report.baseline))
+    )
 
 
 def _made(config: dict[str, Any], config_text: str) -> str:

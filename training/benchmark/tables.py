@@ -53,6 +53,11 @@ class Table:
     head: tuple[str, ...]
     rows: tuple[tuple[str, tuple[Cell, ...]], ...]  # an agent's name, and its cells
 
+    @classmethod
+    def of_words(cls, head: Sequence[str], rows: Mapping[str, Sequence[str]]) -> Table:
+        """Return a table of name → what stands in its cells."""
+        return cls(tuple(head), tuple((name, tuple(map(Cell, words))) for name, words in rows.items()))
+
 
 # ---- cells -----------------------------------------------------------------------------------------------------
 
