@@ -150,25 +150,21 @@ def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
 def _ends_table(entries: Sequence[Entry]) -> str:
     ends = {entry.name: entry.group.ends() for entry in entries}
     kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
-    rows = tuple(
-        (name, tuple(tables.Cell(str(found.get(kind, "–"))) for kind in kinds)) for name, found in ends.items()
-    )
+    rows = {name: [str(found.get(kind, "–")) for kind in kinds] for name, found in ends.items()}
     means = "; ".join(f"{kind}: {ENDINGS[kind]}" for kind in kinds if kind in ENDINGS)
-    return f'{tables.html(tables.Table(("agent", *kinds), rows))}<p class="soft">{escape(means)}</p>'
+    return f'{tables.html(tables.Table.of_words(["agent", *kinds], rows))}<p class="soft">{escape(means)}</p>'
 
 
 def _consistency_table(entries: Sequence[Entry]) -> str:
-    rows = []
+    rows: dict[str, list[str]] = {}
     for entry in entries:
         found = entry.group.consistency()
         mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
         average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
         share = f"{100 * found['fraction_in_band']:.0f} %"
-        rows.append(
-            (entry.name, (tables.Cell(average), tables.Cell(f"{low:.2f} … {high:.2f}"), tables.Cell(share)))
-        )
-    head = ("agent", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it")
-    return tables.html(tables.Table(head, tuple(rows)))
+        rows[entry.name] = [average, f"{low:.2f} … {high:.2f}", share]
+    head = ["agent", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]
+    return tables.html(tables.Table.of_words(head, rows))
 
 
 def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
