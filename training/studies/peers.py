@@ -90,10 +90,8 @@ def peer_setup(config: EnvConfig) -> dict[str, Any]:
     }
 
 
-def compare(
-    peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float], rounds: int = ROUNDS
-) -> dict[str, Any]:
-    """Measure ours and the peer in turn; every round drives all of ``drives``, ours first.
+def compare(peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float]) -> dict[str, Any]:
+    """Measure ours and the peer in turn, :data:`ROUNDS` times; every round drives all of ``drives``, ours first.
 
     Parameters
     ----------
@@ -105,8 +103,6 @@ def compare(
         The rooms, and the steps in each.
     ours : callable
         Drives them once in our environment and returns its complete steps per second.
-    rounds : int
-        How often.
 
     Returns
     -------
@@ -125,7 +121,7 @@ def compare(
     setup = peer_setup(config)
     measured: list[dict[str, float]] = []
     with PeerProcess(setup, drives) as process:
-        for _ in range(rounds):
+        for _ in range(ROUNDS):
             our_rate = ours()
             measured.append({"ours": our_rate, "theirs": process.steps_per_second()})
         ready = process.ready
