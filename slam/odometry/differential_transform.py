@@ -19,22 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from slam.settings import require, unknown_name
 
 __all__ = [
-    "MODELS",
-    "Model",
-    "PowerModel",
-    "SpectrumModel",
-    "constant",
-    "derivative",
-    "evaluate",
-    "fit_pade",
-    "integral",
-    "make_model",
-    "pade",
-    "power",
-    "product",
-    "quotient",
-    "rescale",
-]
+    "MODELS", "Model", "PowerModel", "SpectrumModel", "constant", "derivative", "evaluate", "fit_pade",
+    "integral", "make_model", "pade", "power", "product", "quotient", "rescale",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 Compiled = TypeVar("Compiled", bound=Callable[..., object])

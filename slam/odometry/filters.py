@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import make_model
-from slam.odometry.riccati import Tolerances, Workspace, advance
+from slam.odometry.riccati import Rules, Tolerances, Workspace, advance
 from slam.settings import from_mapping, require, unknown_name
 from slam.types import Odometry
 
@@ -67,19 +67,18 @@ class OdometryFilter:
         self.config = config = config or OdometryFilterConfig()
         model, n = make_model(config.model), make_model(config.model).size
         tolerances = Tolerances(relative=1e-4)  # of tenths of a millimetre: far below what any sensor can tell
-        work = Workspace(n, tolerances.order)
         drive = np.outer(model.drive, model.drive)
         process = (config.process_linear, config.process_linear, config.process_turn)
         measured = (config.measurement_m2_s, config.measurement_m2_s, config.measurement_rad2_s)
-        self._eta, self._x = np.stack([work.eta] * 3), np.stack([work.x] * 3)
+        x, y, theta = (Workspace.of(n, tolerances.order) for _ in measured)
+        self._work = x, y, theta
         self._poses = np.zeros((3, 3))  # rows: reckoned, filtered, where the filters started; θ unwrapped
         self._clock = np.zeros(1)  # [s] of the models
         self._start_cov = np.diag(np.array(config.start_sigmas[:n]) ** 2)
         self._fixed = (
             model.powers, model.matrices, np.array([q * drive for q in process]), 1.0 / np.array(measured),
             self._start_cov, config.rest_speed_m_s, config.rest_turn_rate_rad_s,
-            self._poses, self._clock, self._eta, self._x, work.f, work.z, work.column, tolerances.relative,
-            tolerances.absolute, work.system, work.below, work.is_fraction,
+            self._poses, self._clock, self._work, tolerances.rules,
         )  # fmt: skip
         self.reset()
 
@@ -87,8 +86,8 @@ class OdometryFilter:
         """Begin at rest, at the origin."""
         self._poses[:] = 0.0
         self._clock[0] = _START_S
-        self._x[:, 0] = 0.0
-        self._eta[:, 0] = self._start_cov
+        for work in self._work:
+            work.x[0], work.eta[0] = 0.0, self._start_cov
 
     def filter(self, odometry: Odometry) -> Odometry:
         """Return the twist between the filtered poses before and after a step; over no time, the twist given.
@@ -107,9 +106,8 @@ class OdometryFilter:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _filter(
     vx: float, vy: float, omega: float, dt: float, powers: Array, matrices: Array, noise: Array, inverse_r: Array,
-    start_cov: Array, rest_speed: float, rest_turn: float, poses: Array, clock: Array, eta: Array, x: Array,
-    f: Array, z: Array, column: Array, relative: float, absolute: float, system: Array, below: Array,
-    is_fraction: NDArray[np.bool_], out: Array,
+    start_cov: Array, rest_speed: float, rest_turn: float, poses: Array, clock: Array,
+    works: tuple[Workspace, Workspace, Workspace], rules: Rules, out: Array,
 ) -> bool:  # fmt: skip
     """Reckon on, filter each coordinate, and write the twist that leads from filtered pose to filtered pose."""
     reckoned, filtered, origin = poses[0], poses[1], poses[2]
@@ -122,20 +120,18 @@ def _filter(
     resting = math.hypot(vx, vy) < rest_speed and abs(omega) < rest_turn
     for k in range(3):
         if not resting:
-            z[0], z[1] = reckoned[k] - origin[k], change[k]
-            count = advance(
-                powers, matrices, noise[k], inverse_r[k], clock[0], dt, f, eta[k], x[k], z, column, relative,
-                absolute, True, system, below, is_fraction,
-            )  # fmt: skip
-            filtered[k] = origin[k] + x[k, 0, 0]
+            work = works[k]
+            work.z[0], work.z[1] = reckoned[k] - origin[k], change[k]
+            count = advance(powers, matrices, noise[k], inverse_r[k], clock[0], dt, work, rules)
+            filtered[k] = origin[k] + work.x[0, 0]
             resting = count < 0 or not math.isfinite(filtered[k])  # never seen; then as after a rest
         reckoned[k] += change[k]
     clock[0] += dt
     if resting:
         for k in range(3):
             filtered[k] = origin[k] = reckoned[k]
-            x[k, 0, :] = 0.0
-            eta[k, 0] = start_cov
+            works[k].x[0, :] = 0.0
+            works[k].eta[0] = start_cov
         clock[0] = _START_S
     turn = filtered[2] - old_theta
     middle = old_theta + 0.5 * turn

@@ -3,13 +3,13 @@
     η' = F η + η Fᵀ - η Hᵀ H η / R + G Q Gᵀ,    x̂' = F x̂ + K (z - H x̂),    K = η Hᵀ / R,    H = [1, 0, …]
 
 Where the step would leave what the spectra can tell, it ends there and they are taken anew about its end
-(:func:`advance`). The kernels know no numbers' type: as plain Python they run on numbers that count what is done
-with them, too. Equations and figures: ``docs/reference/differential_transform.md``.
+(:func:`advance`). Equations and figures: ``docs/reference/differential_transform.md``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,18 +19,12 @@ from slam.odometry.differential_transform import fill_model, fit_pade
 from slam.settings import require, unknown_name
 
 __all__ = [
-    "MOST_EXPANSIONS",
-    "RECOVERIES",
-    "Tolerances",
-    "Workspace",
-    "advance",
-    "covariance_spectrum",
-    "estimate_spectrum",
-    "expand",
-    "recover",
-]
+    "MOST_EXPANSIONS", "RECOVERIES", "Tolerances", "Workspace", "advance", "covariance_spectrum",
+    "estimate_spectrum", "expand", "recover",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Rules = tuple[float, float, bool]  # relative and absolute error of an expansion, whether fractions are tried
 
 RECOVERIES = ("pade", "series")
 _SAFETY = 0.9  # of the step that the error estimate allows
@@ -59,30 +53,36 @@ class Tolerances:
         require(0 < self.relative < 1, "Tolerances.relative must be in (0, 1)")
         require(self.absolute > 0, "Tolerances.absolute must be > 0")
 
+    @property
+    def rules(self) -> Rules:
+        """What the kernels are told."""
+        return self.relative, self.absolute, self.recovery == "pade"
 
-class Workspace:
-    """Room for the spectra of one filter, so that no kernel allocates.
 
-    Attributes
-    ----------
-    f, eta, x
-        Spectra of F ``(K, n, n)``, η ``(K, n, n)`` and x̂ ``(K, n)``, K = order + 2: one discrete more than is used
-        tells of the error. ``eta[0]`` and ``x[0]`` are the values now. Without an ``estimate`` ``x`` is
-        ``(K, 0)``, and the covariance alone is solved for.
-    z
-        ``(2,)``: the measurement now, and its change over what is left of the step.
+class Workspace(NamedTuple):
+    """Room for the spectra of one filter, so that no kernel allocates; K = order + 2.
+
+    One discrete more than is used tells of the error. ``eta[0]`` and ``x[0]`` are the values now.
     """
 
-    def __init__(self, n: int, order: int, *, dtype: type = np.float64, estimate: bool = True) -> None:
+    f: Array  # (K, n, n), spectra of F
+    eta: Array  # (K, n, n), of η
+    x: Array  # (K, n), of x̂
+    z: Array  # (2,): the measurement now, and its change over what is left of the step
+    column: Array  # (K,)
+    system: Array  # (order / 2, order / 2 + 1), of a fraction's denominator
+    below: Array  # (entries, order / 2), every entry's denominator
+    is_fraction: NDArray[np.bool_]  # (entries,): which are recovered by a fraction
+
+    @classmethod
+    def of(cls, n: int, order: int) -> Workspace:
+        """Return room for n states."""
         count, half, entries = order + 2, order // 2, n * (n + 1) // 2 + n
-        self.f: Array = np.zeros((count, n, n), dtype)
-        self.eta: Array = np.zeros((count, n, n), dtype)
-        self.x: Array = np.zeros((count, n if estimate else 0), dtype)
-        self.z: Array = np.zeros(2, dtype)
-        self.column: Array = np.zeros(count, dtype)
-        self.system: Array = np.zeros((half, half + 1), dtype)
-        self.below: Array = np.zeros((entries, half), dtype)
-        self.is_fraction = np.zeros(entries, np.bool_)
+        square, fractions = (count, n, n), np.zeros(entries, np.bool_)
+        return cls(
+            np.zeros(square), np.zeros(square), np.zeros((count, n)), np.zeros(2), np.zeros(count),
+            np.zeros((half, half + 1)), np.zeros((entries, half)), fractions,
+        )  # fmt: skip
 
 
 # ---- kernels ---------------------------------------------------------------------------------------------------
@@ -220,52 +220,49 @@ def recover(c: Array, below: Array, is_fraction: bool, share: float) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def step_share(
-    eta: Array, x: Array, relative: float, absolute: float, try_pade: bool, system: Array, below: Array,
-    is_fraction: NDArray[np.bool_],
-) -> float:  # fmt: skip
+def step_share(work: Workspace, rules: Rules) -> float:
     """Return the share of h that every entry of η and x̂ allows; note which to recover by a fraction."""
+    eta, x = work.eta, work.x
+    relative, absolute, try_pade = rules
     n = eta.shape[1]
     share, entry = 1.0, 0
     for i in range(n):
         for j in range(i, n):
             scale = (abs(eta[0, i, i] * eta[0, j, j])) ** 0.5 + absolute / relative
-            own = _allowed_share(eta[:, i, j], relative * scale, scale, try_pade, system, below[entry])
-            is_fraction[entry] = own < 0.0
+            own = _allowed_share(eta[:, i, j], relative * scale, scale, try_pade, work.system, work.below[entry])
+            work.is_fraction[entry] = own < 0.0
             share = min(share, abs(own))
             entry += 1
-    for i in range(x.shape[1]):
+    for i in range(n):
         scale = abs(x[0, i]) + (abs(eta[0, i, i]) + absolute / relative) ** 0.5
-        own = _allowed_share(x[:, i], relative * scale, scale, try_pade, system, below[entry])
-        is_fraction[entry] = own < 0.0
+        own = _allowed_share(x[:, i], relative * scale, scale, try_pade, work.system, work.below[entry])
+        work.is_fraction[entry] = own < 0.0
         share = min(share, abs(own))
         entry += 1
     return share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def expand(
-    f: Array, noise: Array, inverse_r: float, h: float, eta: Array, x: Array, z: Array, relative: float,
-    absolute: float, try_pade: bool, system: Array, below: Array, is_fraction: NDArray[np.bool_],
-) -> float:  # fmt: skip
-    """Go as far towards t₀ + h as one expansion reaches; return which share of h that is.
+def expand(f: Array, noise: Array, inverse_r: float, h: float, work: Workspace, rules: Rules) -> float:
+    """Go as far towards t₀ + h as one expansion reaches, F's spectra being ``f``; return which share of h that is.
 
     The values at its end are then ``eta[0]`` and ``x[0]``, and ``z`` is what is left of the measurement's change.
     """
+    eta, x, z = work.eta, work.x, work.z
     n = eta.shape[1]
     covariance_spectrum(f, noise, inverse_r, h, eta)
     estimate_spectrum(f, inverse_r, h, eta, z, x)
-    share = step_share(eta, x, relative, absolute, try_pade, system, below, is_fraction)
+    share = step_share(work, rules)
     if share < 1.0:
         share = min(share * _SAFETY, 1.0)
     entry = 0
     for i in range(n):
         for j in range(i, n):
-            eta[0, i, j] = recover(eta[:, i, j], below[entry], is_fraction[entry], share)
+            eta[0, i, j] = recover(eta[:, i, j], work.below[entry], work.is_fraction[entry], share)
             eta[0, j, i] = eta[0, i, j]
             entry += 1
-    for i in range(x.shape[1]):
-        x[0, i] = recover(x[:, i], below[entry], is_fraction[entry], share)
+    for i in range(n):
+        x[0, i] = recover(x[:, i], work.below[entry], work.is_fraction[entry], share)
         entry += 1
     z[0] += z[1] * share
     z[1] *= 1.0 - share
@@ -274,19 +271,18 @@ def expand(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def advance(
-    powers: Array, matrices: Array, noise: Array, inverse_r: float, t: float, span: float, f: Array, eta: Array,
-    x: Array, z: Array, column: Array, relative: float, absolute: float, try_pade: bool, system: Array,
-    below: Array, is_fraction: NDArray[np.bool_],
+    powers: Array, matrices: Array, noise: Array, inverse_r: float, t: float, span: float, work: Workspace,
+    rules: Rules,
 ) -> int:  # fmt: skip
     """Solve from t to t + ``span`` [s] in as many expansions as it takes; return how many, -1 if they get stuck.
 
-    See :class:`Workspace` for the arrays, :class:`~slam.odometry.differential_transform.PowerModel` for the model.
+    ``powers`` and ``matrices`` are those of :class:`~slam.odometry.differential_transform.PowerModel`.
     """
     end, now = t + span, t
     for count in range(1, MOST_EXPANSIONS):
         h = end - now
-        fill_model(powers, matrices, now, h, column, f)
-        share = expand(f, noise, inverse_r, h, eta, x, z, relative, absolute, try_pade, system, below, is_fraction)
+        fill_model(powers, matrices, now, h, work.column, work.f)
+        share = expand(work.f, noise, inverse_r, h, work, rules)
         if share >= 1.0:
             return count
         now += share * h

@@ -49,7 +49,7 @@ class KalmanBucyFilter:
         self.tolerances = tolerances or Tolerances()
         self._inverse_r = 1.0 / measurement
         self._noise = process * np.outer(self.model.drive, self.model.drive)  # G Q Gᵀ
-        self._work = Workspace(self.model.size, self.tolerances.order)
+        self._work = Workspace.of(self.model.size, self.tolerances.order)
         self.expansions = 0
         self.reset()
 
@@ -108,25 +108,20 @@ class KalmanBucyFilter:
         self._last = z
 
     def _compiled(self, span: float) -> int:
-        model, work, tolerances = self.model, self._work, self.tolerances
+        model = self.model
         assert isinstance(model, PowerModel)
         return int(advance(
-            model.powers, model.matrices, self._noise, self._inverse_r, self.time, span, work.f, work.eta, work.x,
-            work.z, work.column, tolerances.relative, tolerances.absolute, tolerances.recovery == "pade",
-            work.system, work.below, work.is_fraction,
+            model.powers, model.matrices, self._noise, self._inverse_r, self.time, span, self._work,
+            self.tolerances.rules,
         ))  # fmt: skip
 
     def _expand_one_by_one(self, span: float) -> int:
         """Do what :func:`advance` does for a model that only Python can expand."""
-        work, tolerances = self._work, self.tolerances
-        now, end = self.time, self.time + span
+        now, end, rules = self.time, self.time + span, self.tolerances.rules
         for count in range(1, MOST_EXPANSIONS):
             h = end - now
-            spectra = self.model.spectrum(now, h, tolerances.order + 1)
-            share = expand(
-                spectra, self._noise, self._inverse_r, h, work.eta, work.x, work.z, tolerances.relative,
-                tolerances.absolute, tolerances.recovery == "pade", work.system, work.below, work.is_fraction,
-            )  # fmt: skip
+            spectra = self.model.spectrum(now, h, self.tolerances.order + 1)
+            share = expand(spectra, self._noise, self._inverse_r, h, self._work, rules)
             if share >= 1.0:
                 return count
             now += share * h

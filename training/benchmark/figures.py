@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.benchmark.episode import EpisodeRow, Key
-from training.benchmark.evaluate import consistency_figures
+from training.figures.consistency import consistency_figures
 from training.figures.statistics import (
     Comparison,
     Estimate,
@@ -64,7 +64,7 @@ METRICS: tuple[Metric, ...] = (
     Metric(key="time_s", label="time", unit="s", digits=1),
     Metric(key="path_length_m", label="path", unit="m", digits=1),
     Metric(
-        key="collisions_per_100_m", label="collisions", unit="per 100 m", centre="ratio",
+        key="collisions_per_100_m", label="collisions", unit="/100 m", centre="ratio",
         of=lambda row: 100 * row["collisions"] / row["path_length_m"] if row["path_length_m"] else None,
     ),
     Metric(
@@ -76,10 +76,10 @@ METRICS: tuple[Metric, ...] = (
     Metric(key="ate_rmse_m", label="ATE", unit="cm", scale=100),
     Metric(key="ate_aligned_rmse_m", label="ATE, aligned", unit="cm", scale=100),
     Metric(key="final_position_error_m", label="final position error", unit="cm", scale=100),
-    Metric(key="final_heading_error_rad", label="final heading error", unit="°", scale=180 / math.pi),
+    Metric(key="final_heading_error_rad", label="heading error", unit="°", scale=180 / math.pi, digits=3),
     Metric(key="anees", label="NEES / 3", better=""),
-    Metric(key="decision_ms_median", label="decision, median", unit="ms"),
-    Metric(key="decision_ms_p95", label="decision, 95th percentile", unit="ms"),
+    Metric(key="decision_ms_median", label="decision", unit="ms", digits=1),
+    Metric(key="decision_ms_p95", label="decision, 95th percentile", unit="ms", digits=1),
 )  # fmt: skip
 """Every metric that is reported, in the order of the tables."""
 
@@ -108,7 +108,7 @@ class Group:
 
     def consistency(self) -> dict[str, Any]:
         """Return ``nees_over_3_mean``, ``nees_band_95`` and ``fraction_in_band`` over all episodes' seconds."""
-        return consistency_figures([row.nees.tolist() for row in self.rows])
+        return consistency_figures([row.nees for row in self.rows])
 
     def values(self, metric: Metric) -> Array:
         """Return every episode's value ``(n,)``, nan where it has none."""

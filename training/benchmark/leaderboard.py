@@ -7,14 +7,16 @@ of the marks stays as it is.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from slam.formats import atomic_write
-from training.benchmark.suites import SLIPPERY
+from training.benchmark.tables import figures_table, markdown, overview, ranked
+from training.figures.statistics import Interval
 from training.runs.errors import BadInput
 
 __all__ = ["BEGIN", "END", "study", "tables", "update"]
@@ -22,34 +24,30 @@ __all__ = ["BEGIN", "END", "study", "tables", "update"]
 BEGIN, END = "<!-- leaderboard -->", "<!-- end of the leaderboard -->"
 
 _NOT_SUITES = ("comparison", "ends", "consistency", "config")
-# metric, heading, factor, digits, whether with its interval
 _COLUMNS = (
-    ("time_to_95_s", "time to 95 % [s]", 1.0, 1, True),
-    ("reached_95", "reached 95 % [%]", 100.0, 0, False),
-    ("path_length_m", "path [m]", 1.0, 1, False),
-    ("collisions_per_100_m", "collisions per 100 m", 1.0, 2, False),
-    ("map_iou", "wall IoU", 1.0, 3, False),
-    ("corner_mean_m", "corner error [cm]", 100.0, 2, True),
-    ("ate_rmse_m", "ATE [cm]", 100.0, 2, True),
-    ("final_heading_error_rad", "heading error [°]", 57.29578, 3, False),
-    ("anees", "NEES/3", 1.0, 2, False),
-    ("decision_ms_median", "decision [ms]", 1.0, 1, False),
+    "time_to_95_s", "reached_95", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
+    "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
 )  # fmt: skip
+_WITH_LIMITS = ("time_to_95_s", "corner_mean_m", "ate_rmse_m")
 _OWN = ("baseline", "split")  # of the settings, no library's version
-_BOUND = "known-map"
 
 Summary = Mapping[str, Any]
 
 
 def tables(summary: Summary) -> str:
     """Return the leaderboard in Markdown: the times of all suites side by side, then each suite's table."""
-    suites = [name for name in summary if name not in _NOT_SUITES]
+    suites = {name: _figures(found) for name, found in summary.items() if name not in _NOT_SUITES}
     config = summary["config"]
-    parts = [_overview(summary, suites)]
-    for suite in suites:
+    versus = {
+        together: {name: _interval(against["time_to_95_s"]["ratio"]) for name, against in found.items()}
+        for together, found in summary.get("comparison", {}).items()
+    }
+    parts = ["### Time to 95 % coverage [s], IQM\n"]
+    parts += [markdown(table) for table in overview(suites, versus, config["baseline"], limits=False)]
+    for suite, found in suites.items():
         seeds = config["seeds"][suite]
         parts.append(f"### {suite}\n\nSeeds {min(seeds)} to {max(seeds)}.\n")
-        parts.append(_suite(summary[suite]))
+        parts.append(markdown(figures_table(ranked(found), _COLUMNS, limits=_WITH_LIMITS)))
         ends = {agent: words for agent, words in summary["ends"][suite].items() if set(words) != {"covered"}}
         if ends:
             told = "; ".join(f"`{agent}` {_counted(words)}" for agent, words in ends.items())
@@ -65,78 +63,12 @@ def _counted(words: Mapping[str, int]) -> str:
     return ", ".join(f"{word} {count}" for word, count in words.items())
 
 
-def _overview(summary: Summary, suites: Sequence[str]) -> str:
-    """Time to 95 % coverage, an agent a row and a suite a column; and against the baseline over all suites."""
-    agents = _ranked({a: m for suite in suites for a, m in summary[suite].items()})
-    lines = ["### Time to 95 % coverage [s], IQM\n"]
-    for slippery in (False, True):
-        columns = [s for s in suites if s.endswith(SLIPPERY) == slippery]
-        if not columns:
-            continue
-        together = "all-slippery" if slippery else "all-nominal"
-        versus = summary.get("comparison", {}).get(together, {})
-        extra = [f"against `{summary['config']['baseline']}`"] if versus else []
-        lines += [_row(["agent", *columns, *extra]), _row(["---"] * (1 + len(columns) + len(extra)))]
-        rows = sorted(agents, key=lambda a: _mean_time(summary, columns, a))
-        for agent in rows:
-            cells = [_value(summary[s].get(agent), "time_to_95_s", 1.0, 1) for s in columns]
-            against = [_ratio(versus.get(agent, {}).get("time_to_95_s"))] if extra else []
-            lines.append(_row([_name(agent), *cells, *against]))
-        lines.append("")
-    return "\n".join(lines)
+def _figures(agents: Summary) -> dict[str, dict[str, Interval]]:
+    return {name: {key: _interval(figure) for key, figure in found.items()} for name, found in agents.items()}
 
 
-def _mean_time(summary: Summary, suites: Sequence[str], agent: str) -> float:
-    times = [summary[s][agent]["time_to_95_s"]["value"] for s in suites if agent in summary[s]]
-    return sum(times) / len(times) if times and None not in times else float("inf")
-
-
-def _ratio(comparison: Mapping[str, Any] | None) -> str:
-    if not comparison or not comparison.get("ratio"):
-        return ""
-    ratio = comparison["ratio"]
-    change: Callable[[float], str] = lambda v: f"{100.0 * (v - 1.0):+.1f}"  # noqa: E731
-    if ratio.get("low") is None:
-        return f"{change(ratio['value'])} %"
-    return f"{change(ratio['value'])} % [{change(ratio['low'])}, {change(ratio['high'])}]"
-
-
-def _suite(agents: Summary) -> str:
-    lines = [_row(["agent", *(heading for _, heading, *_ in _COLUMNS)]), _row(["---"] * (1 + len(_COLUMNS)))]
-    for agent in _ranked(agents):
-        cells = [
-            _value(agents[agent], key, factor, digits, interval) for key, _, factor, digits, interval in _COLUMNS
-        ]
-        lines.append(_row([_name(agent), *cells]))
-    return "\n".join(lines) + "\n"
-
-
-def _ranked(agents: Summary) -> list[str]:
-    """Return agents by their time to 95 %, those that never get there last."""
-
-    def time(agent: str) -> float:
-        value = agents[agent]["time_to_95_s"]["value"]
-        return float("inf") if value is None else float(value)
-
-    return sorted(agents, key=lambda a: (time(a), a))
-
-
-def _name(agent: str) -> str:
-    return f"*{agent}* (knows the plan, no agent)" if agent.split("@")[0] == _BOUND else f"`{agent}`"
-
-
-def _value(figures: Summary | None, key: str, factor: float, digits: int, interval: bool = False) -> str:
-    if figures is None or figures.get(key, {}).get("value") is None:
-        return "–"
-    figure = figures[key]
-    text = f"{factor * figure['value']:.{digits}f}"
-    if interval and figure.get("low") is not None and figure.get("high") is not None:
-        text += f" [{factor * figure['low']:.{digits}f}, {factor * figure['high']:.{digits}f}]"
-    return text
-
-
-def _row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def _interval(figure: Summary) -> Interval:
+    return Interval(*(math.nan if figure.get(key) is None else figure[key] for key in ("value", "low", "high")))
 
 
 def update(page: str, content: str) -> str:

@@ -1,23 +1,22 @@
-"""A benchmark's tables: as JSON, as CSV, and as text for the terminal."""
+"""What a benchmark has to tell: as JSON, as CSV, as text for the terminal, in Markdown."""
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from slam.formats import atomic_write
-from training.benchmark.figures import METRICS, Figure, Group, Metric, comparisons, figures, merged
+from training.benchmark import tables
+from training.benchmark.figures import Figure, Group, comparisons, figures, merged
 from training.benchmark.suites import SLIPPERY
 from training.figures.statistics import Comparison, Interval
+from training.figures.tables import csv_table
 from training.runs.running import plain
 
-__all__ = ["FILES", "Entry", "Report", "as_json", "shown", "table", "write_tables"]
+__all__ = ["FILES", "Entry", "Report", "as_json", "centres", "markdown", "table", "write_tables"]
 
 FILES = (
     "results.sqlite",
@@ -30,16 +29,14 @@ FILES = (
 )
 """What a benchmark writes, beside settings.json and, if asked for, report.html."""
 
-_BY_KEY = {metric.key: metric for metric in METRICS}
 _WHO_COLUMNS = ("suite", "agent", "slam")
 _KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
-# What a terminal has room for: metric, heading, whether with its interval.
+# What a terminal has room for.
 _COLUMNS = (
-    ("reached_95", "95 %", False), ("time_to_95_s", "time to 95 % [s]", True),
-    ("path_length_m", "path [m]", False), ("collisions_per_100_m", "coll/100 m", False),
-    ("map_iou", "IoU", False), ("corner_mean_m", "corner [cm]", False), ("ate_rmse_m", "ATE [cm]", True),
-    ("anees", "NEES/3", False), ("decision_ms_median", "decide [ms]", False),
+    "reached_95", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
+    "ate_rmse_m", "anees", "decision_ms_median",
 )  # fmt: skip
+_WITH_LIMITS = ("time_to_95_s", "ate_rmse_m")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,13 +104,6 @@ def _all_suites(groups: Sequence[Group]) -> list[Group]:
     return found
 
 
-def shown(metric: Metric, value: float) -> str:
-    """Return a value of a metric in the unit shown."""
-    if math.isnan(value):
-        return "–"
-    return "∞" if math.isinf(value) else f"{metric.scale * value:.{metric.digits}f}"
-
-
 # ---- JSON and CSV ----------------------------------------------------------------------------------------------
 
 
@@ -130,14 +120,14 @@ def as_json(report: Report) -> dict[str, Any]:
     ends: dict[str, Any] = {}
     consistency: dict[str, Any] = {}
     for suite, entries in report.suites().items():
-        out[suite] = {e.name: {key: _figure(_BY_KEY[key], f) for key, f in e.figures.items()} for e in entries}
+        out[suite] = {e.name: _figures(e) for e in entries}
         ends[suite] = {e.name: e.group.ends() for e in entries}
         consistency[suite] = {e.name: _plain(e.group.consistency()) for e in entries}
-        found = {e.name: {key: _compared(c) for key, c in e.against.items()} for e in entries if e.against}
+        found = {e.name: _compared(e.against) for e in entries if e.against}
         if found:
             against[suite] = found
     for suite, by_name in report.overall.items():
-        against[suite] = {name: {key: _compared(c) for key, c in found.items()} for name, found in by_name.items()}
+        against[suite] = {name: _compared(found) for name, found in by_name.items()}
     return out | {
         "comparison": against, "ends": ends, "consistency": consistency, "config": report.config,
     }  # fmt: skip
@@ -145,25 +135,44 @@ def as_json(report: Report) -> dict[str, Any]:
 
 def write_tables(out: Path, report: Report) -> None:
     """Write ``episodes.csv``, ``summary.csv``, ``comparison.csv`` and ``summary.json``."""
-    atomic_write(out / "episodes.csv", _csv(_episodes(report), _KEY_COLUMNS))
-    atomic_write(out / "summary.csv", _csv(_summary(report), _WHO_COLUMNS))
-    atomic_write(out / "comparison.csv", _csv(_comparison(report), _WHO_COLUMNS))
-    text = json.dumps(as_json(report), indent=1, ensure_ascii=False, allow_nan=False)
+    found = as_json(report)
+    episodes = [
+        dict(zip(_KEY_COLUMNS, key, strict=True)) | row.metrics
+        for entry in report.entries
+        for key, row in zip(entry.group.keys, entry.group.rows, strict=True)
+    ]
+    summary = [
+        {"suite": e.group.suite, "agent": e.group.agent, "slam": e.group.slam, "metric": key} | figure
+        for e in report.entries
+        for key, figure in _figures(e).items()
+    ]
+    atomic_write(out / "episodes.csv", csv_table(episodes, _KEY_COLUMNS))
+    atomic_write(out / "summary.csv", csv_table(summary, _WHO_COLUMNS))
+    atomic_write(out / "comparison.csv", csv_table(_comparison(report, found["comparison"]), _WHO_COLUMNS))
+    text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
     atomic_write(out / "summary.json", text + "\n")
 
 
-def _figure(metric: Metric, figure: Figure) -> dict[str, Any]:
-    a = figure.averages
-    values = {
-        "value": figure.centre.value, "low": figure.centre.low, "high": figure.centre.high, "iqm": a.iqm.value,
-        "median": a.median.value, "median_low": a.median.low, "median_high": a.median.high, "mean": a.mean.value,
+def _figures(entry: Entry) -> dict[str, dict[str, Any]]:
+    out = {}
+    for key, figure in entry.figures.items():
+        a = figure.averages
+        values = _interval(figure.centre) | _plain({
+            "iqm": a.iqm.value, "median": a.median.value, "median_low": a.median.low,
+            "median_high": a.median.high, "mean": a.mean.value,
+        })  # fmt: skip
+        out[key] = values | {"n": a.n, "value_is": tables.BY_KEY[key].centre}
+    return out
+
+
+def _compared(against: Mapping[str, Comparison]) -> dict[str, dict[str, Any]]:
+    return {
+        key: {
+            "difference": _interval(c.difference), "ratio": _interval(c.ratio),
+            "probability_of_improvement": _interval(c.probability), "n": c.n,
+        }
+        for key, c in against.items()
     }  # fmt: skip
-    return _plain(values) | {"n": a.n, "value_is": metric.centre}
-
-
-def _compared(c: Comparison) -> dict[str, Any]:
-    parts = {"difference": c.difference, "ratio": c.ratio, "probability_of_improvement": c.probability}
-    return {name: _interval(part) for name, part in parts.items()} | {"n": c.n}
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
@@ -174,54 +183,21 @@ def _interval(found: Interval) -> dict[str, Any]:
     return _plain({"value": found.value, "low": found.low, "high": found.high})
 
 
-def _episodes(report: Report) -> list[dict[str, Any]]:
+def _comparison(report: Report, found: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the rows of ``comparison.csv``: of each suite, agent and metric."""
     rows = []
-    for entry in report.entries:
-        for (suite, place, seed, agent, slam), row in zip(entry.group.keys, entry.group.rows, strict=True):
-            who = {"suite": suite, "place": place, "seed": seed, "agent": agent, "slam": slam}
-            rows.append(who | row.metrics)
-    return rows
-
-
-def _who(entry: Entry) -> dict[str, Any]:
-    return {"suite": entry.group.suite, "agent": entry.group.agent, "slam": entry.group.slam}
-
-
-def _summary(report: Report) -> list[dict[str, Any]]:
-    return [
-        _who(entry) | {"metric": key} | _figure(_BY_KEY[key], figure)
-        for entry in report.entries
-        for key, figure in entry.figures.items()
-    ]
-
-
-def _comparison(report: Report) -> list[dict[str, Any]]:
-    every = [(_who(entry), entry.against) for entry in report.entries]
-    for suite, by_name in report.overall.items():
-        for name, found in by_name.items():
+    for suite, by_name in found.items():
+        for name, against in by_name.items():
             agent, _, slam = name.partition("@")
-            slam = slam or report.entries[0].group.slam
-            every.append(({"suite": suite, "agent": agent, "slam": slam}, found))
-    rows = []
-    for who, against in every:
-        for key, c in against.items():
-            row: dict[str, Any] = who | {"baseline": report.baseline, "metric": key, "n": c.n}
-            parts = {"difference": c.difference, "ratio": c.ratio, "probability": c.probability}
-            for name, part in parts.items():
-                limits = _interval(part)
-                row |= {name: limits["value"], f"{name}_low": limits["low"], f"{name}_high": limits["high"]}
-            rows.append(row)
+            who = {"suite": suite, "agent": agent, "slam": slam or report.entries[0].group.slam}
+            for key, c in against.items():
+                row: dict[str, Any] = who | {"baseline": report.baseline, "metric": key, "n": c["n"]}
+                for part in ("difference", "ratio", "probability_of_improvement"):
+                    column = part.partition("_")[0]
+                    low, high = c[part]["low"], c[part]["high"]
+                    row |= {column: c[part]["value"], f"{column}_low": low, f"{column}_high": high}
+                rows.append(row)
     return rows
-
-
-def _csv(rows: Sequence[dict[str, Any]], first: Sequence[str]) -> str:
-    """Return rows as CSV with the first columns and every other that a row has; empty where there is no value."""
-    file = io.StringIO()
-    columns = dict.fromkeys((*first, *(name for row in rows for name in row)))
-    writer = csv.DictWriter(file, list(columns), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return file.getvalue()
 
 
 # ---- the terminal ----------------------------------------------------------------------------------------------
@@ -229,41 +205,37 @@ def _csv(rows: Sequence[dict[str, Any]], first: Sequence[str]) -> str:
 
 def table(report: Report) -> str:
     """Return the main figures of every suite as text."""
-    lines: list[str] = []
+    parts = []
     for suite, entries in report.suites().items():
-        lines += ["", *_suite_table(suite, entries)] if lines else _suite_table(suite, entries)
-        lines += _against_lines(entries, report.baseline)
-    lines.append("IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts")
-    return "\n".join(lines)
+        parts += [suite, tables.text(tables.figures_table(centres(entries), _COLUMNS, limits=_WITH_LIMITS)), ""]
+        against = {entry.name: entry.against for entry in entries if entry.against}
+        if against:
+            parts += [tables.text(tables.against_table(against, report.baseline)), ""]
+    parts.append("IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts")
+    return "\n".join(parts)
 
 
-def _suite_table(suite: str, entries: Sequence[Entry]) -> list[str]:
-    cells = [[f"{suite}", *(heading for _, heading, _ in _COLUMNS)]]
-    for entry in entries:
-        row = [entry.name]
-        for key, _, with_limits in _COLUMNS:
-            metric, centre = _BY_KEY[key], entry.figures[key].centre
-            text = shown(metric, centre.value) + (" %" if metric.unit.startswith("%") else "")
-            if with_limits and not math.isnan(centre.low):
-                text += f" [{shown(metric, centre.low)}, {shown(metric, centre.high)}]"
-            row.append(text)
-        cells.append(row)
-    widths = [max(len(row[k]) for row in cells) for k in range(len(cells[0]))]
-    return [
-        "  ".join([row[0].ljust(widths[0]), *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True))])
-        for row in cells
-    ]
+# ---- Markdown --------------------------------------------------------------------------------------------------
 
 
-def _against_lines(entries: Sequence[Entry], baseline: str | None) -> list[str]:
-    lines = []
-    for entry in entries:
-        if not entry.against:
-            continue
-        c = entry.against["time_to_95_s"]
-        text = f"  {entry.name}: time to 95 % {100 * (c.ratio.value - 1):+.1f} %"
-        if not math.isnan(c.ratio.low):
-            text += f" [{100 * (c.ratio.low - 1):+.1f} %, {100 * (c.ratio.high - 1):+.1f} %]"
-        text += f" against {baseline}, faster in {100 * c.probability.value:.0f} % of {c.n} episodes"
-        lines.append(text)
-    return lines
+def markdown(report: Report) -> str:
+    """Return a section of each suite, and of all suites of a noise together."""
+    parts = []
+    for name, found in report.overall.items():
+        parts += [f"## {name.replace('-', ' ')} suites together\n", _against(found, report.baseline)]
+    for suite, entries in report.suites().items():
+        episodes = {entry.name: len(entry.group.rows) for entry in entries}
+        main = tables.figures_table(centres(entries), tables.HEADLINE, episodes=episodes)
+        against = {entry.name: entry.against for entry in entries if entry.against}
+        parts += [f"## {suite}\n", tables.markdown(main)]
+        parts += [_against(against, report.baseline)] if against else []
+    return "\n".join(parts)
+
+
+def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None) -> str:
+    return tables.markdown(tables.against_table(found, baseline))
+
+
+def centres(entries: Sequence[Entry]) -> dict[str, dict[str, Interval]]:
+    """Return what stands in the tables of a suite: name → metric → figure."""
+    return {e.name: {key: figure.centre for key, figure in e.figures.items()} for e in entries}

@@ -16,6 +16,7 @@ import typer
 from numpy.typing import NDArray
 
 from training.figures.statistics import Interval, interval
+from training.figures.tables import markdown_table
 from training.runs.errors import BadInput
 
 __all__ = ["ratio", "study", "table"]
@@ -46,25 +47,24 @@ def table(episodes: Path, suite: str, agent: str) -> str:
     values = _read(episodes, suite)
     if agent not in values:
         raise BadInput(f"{episodes} holds no rows of {agent} on {suite}; run mecanum benchmark with both")
-    names = [name for name, _, _ in COLUMNS.values()]
-    shares = [f"`{agent}`: {name.split(' [')[0]}" for name in names]
-    lines = [f"| {' | '.join([suite, *names, *shares])} |", f"|{'---|' * (1 + 2 * len(names))}"]
+    head = [suite, *(name for name, _, _ in COLUMNS.values())]
+    head += [f"`{agent}`: {name.split(' [')[0]}" for name, _, _ in COLUMNS.values()]
+    rows = []
     for other, theirs in values.items():
         seeds = sorted(set(theirs) & set(values[agent]))
-        cells = []
+        means, shares = [], []
         for k, (_, factor, digits) in enumerate(COLUMNS.values()):
             every = np.array([row[k] for row in theirs.values()])
-            cells.append(f"{factor * np.nanmean(every):.{digits}f}" if np.isfinite(every).any() else "–")
-        for k in range(len(COLUMNS)):
+            means.append(f"{factor * np.nanmean(every):.{digits}f}" if np.isfinite(every).any() else "–")
             pairs = np.array([(values[agent][s][k], theirs[s][k]) for s in seeds])
             pairs = pairs[np.isfinite(pairs).all(axis=1)]
             if other == agent or not len(pairs):
-                cells.append("")
+                shares.append("")
                 continue
             found = ratio(pairs[:, 0], pairs[:, 1])
-            cells.append(f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]")
-        lines.append(f"| `{other}` | {' | '.join(cells)} |")
-    return "\n".join(lines)
+            shares.append(f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]")
+        rows.append([f"`{other}`", *means, *shares])
+    return markdown_table(head, rows)
 
 
 def _read(episodes: Path, suite: str) -> dict[str, dict[tuple[str, int], list[float]]]:

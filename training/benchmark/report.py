@@ -5,28 +5,26 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from slam.formats import atomic_write
+from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
-from training.benchmark.figures import METRICS, Metric
-from training.benchmark.markdown import AGAINST, HEADLINE
-from training.benchmark.output import Entry, Report, shown
+from training.benchmark.output import Entry, Report, centres
 from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent
 from training.episodes.explore import ENDINGS
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.figures.page_style import STYLE
-from training.figures.statistics import Comparison, Interval
+from training.figures.statistics import Comparison
 
 __all__ = ["FILE", "page", "worst_first", "write_report"]
 
 FILE = "report.html"
 
 _CASES = 6  # maps shown of an agent in a suite
-_BY_KEY = {metric.key: metric for metric in METRICS}
 _READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
 and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
 reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
@@ -55,7 +53,7 @@ def page(report: Report, *, config_text: str) -> str:
         _BOUND if any(entry.group.agent == KNOWN_MAP for entry in report.entries) else "",
         _overview(report, suites),
         *(
-            _against_table(found, f"Against {report.baseline}, {name.replace('-', ' ')} suites together")
+            _against(found, report.baseline, f"{name.replace('-', ' ')} suites together")
             for name, found in report.overall.items()
         ),
         *(_suite(name, entries, report, colours) for name, entries in suites.items()),
@@ -81,10 +79,11 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
     parts = [
         f'<h2 id="{_anchor(name)}">{escape(name)}</h2>',
         f'<p class="soft">{episodes} episodes an agent, {escape(backends)}</p>',
-        _figures_table(entries, [_BY_KEY[key] for key in HEADLINE], colours),
-        _against_table(
+        _figures(entries, tables.HEADLINE, colours),
+        _against(
             {entry.name: entry.against for entry in entries if entry.against},
-            f"Against {report.baseline}, on the same episodes",
+            report.baseline,
+            "on the same episodes",
         ),
         _charts(entries, colours),
         "<h3>How the episodes ended</h3>",
@@ -96,52 +95,39 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
         "then the others, the largest trajectory error first.</p>",
         *(_cases(entry) for entry in entries),
         "<details><summary>All metrics</summary>",
-        _figures_table(entries, METRICS, colours, medians=True),
+        _figures(entries, list(tables.BY_KEY), colours, medians=True),
         "</details>",
     ]
     return "\n".join(parts)
 
 
-def _figures_table(
-    entries: Sequence[Entry], metrics: Sequence[Metric], colours: dict[str, int], *, medians: bool = False
+def _figures(
+    entries: Sequence[Entry], metrics: Sequence[str], colours: dict[str, int], *, medians: bool = False
 ) -> str:
-    head = ["", *(_heading(m) + (f"<br>[{_unbroken(m.unit)}]" if m.unit else "") for m in metrics)]
-    best = {metric.key: _best(metric, entries) for metric in metrics}
-    rows = []
-    for entry in entries:
-        cells = [f"{_key(colours[entry.name])}{escape(entry.name)}"]
-        for metric in metrics:
-            figure = entry.figures[metric.key]
-            value = shown(metric, figure.centre.value)
-            if value == best[metric.key] and entry.group.agent != KNOWN_MAP:
-                value = f'<span class="best">{value}</span>'
-            text = f"{value}<small>{_limits(metric, figure.centre)}</small>"
-            if medians:
-                text += (
-                    f"<small>median {shown(metric, figure.averages.median.value)}, n {figure.averages.n}</small>"
-                )
-            cells.append(text)
-        rows.append(cells)
-    return _table(head, rows)
+    notes = None
+    if medians:
+        notes = {
+            e.name: {
+                key: f"median {tables.shown(tables.BY_KEY[key], f.averages.median.value)}, n {f.averages.n}"
+                for key, f in e.figures.items()
+            }
+            for e in entries
+        }
+    return tables.html(
+        tables.figures_table(centres(entries), metrics, notes=notes),
+        {e.name: _key(colours[e.name]) for e in entries},
+    )
 
 
-def _against_table(against: Mapping[str, Mapping[str, Comparison]], title: str) -> str:
+def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None, where: str) -> str:
     """Return a table of name → metric → comparison, nothing where there is none."""
-    metrics = [_BY_KEY[key] for key in AGAINST]
-    rows = []
-    for name, found in against.items():
-        cells = [escape(name)]
-        for metric in metrics:
-            c = found[metric.key]
-            cells.append(f"{_change(metric, c.ratio)}<small>{_better(c.probability)}</small>")
-        rows.append([*cells, str(found["time_to_95_s"].n)])
-    if not rows:
+    if not found:
         return ""
-    head = ["", *map(_heading, metrics), "episodes"]
     return (
-        f"<h3>{escape(title)}</h3>"
+        f"<h3>{escape(f'Against {baseline}, {where}')}</h3>"
         '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
-        "change; below, in what share of the episodes it did better, ties counted half.</p>" + _table(head, rows)
+        "change; below, in what share of the episodes it did better, ties counted half.</p>"
+        + tables.html(tables.against_table(found, baseline))
     )
 
 
@@ -164,22 +150,21 @@ def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
 def _ends_table(entries: Sequence[Entry]) -> str:
     ends = {entry.name: entry.group.ends() for entry in entries}
     kinds = list(dict.fromkeys(kind for found in ends.values() for kind in found))
-    rows = [[escape(name), *(str(found.get(kind, "–")) for kind in kinds)] for name, found in ends.items()]
+    rows = {name: [str(found.get(kind, "–")) for kind in kinds] for name, found in ends.items()}
     means = "; ".join(f"{kind}: {ENDINGS[kind]}" for kind in kinds if kind in ENDINGS)
-    return f'{_table(["", *map(escape, kinds)], rows)}<p class="soft">{escape(means)}</p>'
+    return f'{tables.html(tables.Table.of_words(["agent", *kinds], rows))}<p class="soft">{escape(means)}</p>'
 
 
 def _consistency_table(entries: Sequence[Entry]) -> str:
-    rows = []
+    rows: dict[str, list[str]] = {}
     for entry in entries:
         found = entry.group.consistency()
         mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
         average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
-        rows.append([
-            escape(entry.name), average, f"{low:.2f} … {high:.2f}", f"{100 * found['fraction_in_band']:.0f} %"
-        ])  # fmt: skip
-    head = ["", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]
-    return _table(head, rows)
+        share = f"{100 * found['fraction_in_band']:.0f} %"
+        rows[entry.name] = [average, f"{low:.2f} … {high:.2f}", share]
+    head = ["agent", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]
+    return tables.html(tables.Table.of_words(head, rows))
 
 
 def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[Key, EpisodeRow]]:
@@ -229,25 +214,14 @@ def _overview(report: Report, suites: dict[str, list[Entry]]) -> str:
     """Return time to 95 % of every agent on every suite, where there is more than one."""
     if len(suites) < 2:
         return ""
-    metric = _BY_KEY["time_to_95_s"]
-    names = dict.fromkeys(entry.name for entry in report.entries)
-    by_name = {(suite, e.name): e for suite, entries in suites.items() for e in entries}
-    best = {suite: _best(metric, entries) for suite, entries in suites.items()}
-    rows = []
-    for name in names:
-        cells = [escape(name)]
-        for suite in suites:
-            entry = by_name.get((suite, name))
-            if entry is None:
-                cells.append("–")
-                continue
-            centre = entry.figures[metric.key].centre
-            value = shown(metric, centre.value)
-            value = f'<span class="best">{value}</span>' if value == best[suite] else value
-            cells.append(f"{value}<small>{_limits(metric, centre)}</small>")
-        rows.append(cells)
-    head = ["", *(f'<a href="#{_anchor(suite)}">{escape(suite)}</a>' for suite in suites)]
-    return f"<h3>Time to 95 % coverage [s]</h3>{_table(head, rows)}"
+    ratios = {
+        together: {name: against["time_to_95_s"].ratio for name, against in found.items()}
+        for together, found in report.overall.items()
+    }
+    found = {suite: centres(entries) for suite, entries in suites.items()}
+    return "<h3>Time to 95 % coverage [s]</h3>" + "".join(
+        map(tables.html, tables.overview(found, ratios, report.baseline))
+    )
 
 
 def _made(config: dict[str, Any], config_text: str) -> str:
@@ -262,58 +236,6 @@ def _made(config: dict[str, Any], config_text: str) -> str:
 
 
 # ---- small pieces ----------------------------------------------------------------------------------------------
-
-
-def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table that scrolls sideways; cells are HTML."""
-    lines = [
-        '<div class="wide"><table><thead><tr>',
-        *(f"<th>{cell}</th>" for cell in head),
-        "</tr></thead><tbody>",
-    ]
-    for row in rows:
-        lines.append(f"<tr><th>{row[0]}</th>" + "".join(f"<td>{cell}</td>" for cell in row[1:]) + "</tr>")
-    return "".join([*lines, "</tbody></table></div>"])
-
-
-def _heading(metric: Metric) -> str:
-    return escape(metric.label.replace(" %", "\u00a0%"))
-
-
-def _unbroken(text: str) -> str:
-    return escape(text.replace(" ", "\u00a0"))
-
-
-def _best(metric: Metric, entries: Sequence[Entry]) -> str | None:
-    """Return the agents' best value as shown, None where there is nothing to choose between."""
-    values = [e.figures[metric.key].centre.value for e in entries if e.group.agent != KNOWN_MAP]
-    values = [v for v in values if not math.isnan(v)]
-    if not metric.better or len(values) < 2:
-        return None
-    return shown(metric, min(values) if metric.better == "low" else max(values))
-
-
-def _limits(metric: Metric, found: Interval) -> str:
-    return "" if math.isnan(found.low) else f"{shown(metric, found.low)} … {shown(metric, found.high)}"
-
-
-def _change(metric: Metric, ratio: Interval) -> str:
-    if math.isnan(ratio.value):
-        return "–"
-    text = f"{100 * (ratio.value - 1):+.1f} %"
-    if math.isnan(ratio.low):
-        return text
-    if not ratio.low <= 1.0 <= ratio.high:
-        good = (ratio.value < 1.0) == (metric.better == "low")
-        text = f'<span class="{"better" if good else "worse"}">{text}</span>'
-    return f"{text}<small>{100 * (ratio.low - 1):+.1f} … {100 * (ratio.high - 1):+.1f}</small>"
-
-
-def _better(p: Interval) -> str:
-    if math.isnan(p.value):
-        return "–"
-    limits = "" if math.isnan(p.low) else f" [{100 * p.low:.0f}, {100 * p.high:.0f}]"
-    return f"better in {100 * p.value:.0f} %{limits}"
 
 
 def _key(colour: int) -> str:

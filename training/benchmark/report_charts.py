@@ -8,10 +8,10 @@ from html import escape
 from typing import Literal
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from training.benchmark.figures import Group
-from training.figures.charts import Axis, ticks
 
 __all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent"]
 
@@ -80,7 +80,8 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
         f'aria-label="Coverage against {escape(_LABELS[along])}: {escape(names)}">'
     ]
-    for tick in ticks(Axis(""), (0.0, last)):
+    ticks = np.asarray(MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(0.0, last))
+    for tick in ticks[ticks <= last].tolist():
         at = _to_x(tick, last)
         parts.append(f'<line class="grid" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{bottom}"/>')
         parts.append(f'<text class="tick" x="{at:.1f}" y="{bottom + 16}" text-anchor="middle">{tick:g}</text>')

@@ -21,8 +21,7 @@ from training.benchmark import store as benchmark_store
 from training.benchmark import suites
 from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, run_job
 from training.benchmark.figures import Group, group_rows
-from training.benchmark.markdown import markdown
-from training.benchmark.output import FILES, Report, write_tables
+from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import SPLITS, Place, Suite
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.known_map import NAME as KNOWN_MAP

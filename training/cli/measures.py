@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from training.runs.errors import bad_input
-from training.runs.options import Json
+from training.runs.options import Backends, Json, Workers
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -46,7 +45,7 @@ def speed(
 
 
 def consistency(
-    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
+    slam: Backends = "ekf",
     rooms: Annotated[
         str, typer.Option(help="A world of landmarks (circle, room), or a generator of rooms.")
     ] = "circle",
@@ -56,7 +55,7 @@ def consistency(
     ] = None,
     noise: Annotated[float, typer.Option(help="Times the noise, told to the backends.")] = 1.0,
     seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
-    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")] = None,
+    workers: Workers = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/consistency"),
     as_json: Json = False,
 ) -> None:
@@ -75,12 +74,12 @@ def consistency(
     from training.studies.consistency import consistency as measure
 
     plan = Plan.parse(slam=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0)
-    result = measure(plan, out=out, workers=workers or os.cpu_count() or 1)
+    result = measure(plan, out=out, workers=workers)
     print(json.dumps(result) if as_json else table(result))
 
 
 def complexity(
-    slam: Annotated[str, typer.Option(help="SLAM backends, separated by commas.")] = "ekf",
+    slam: Backends = "ekf",
     landmarks: Annotated[
         str, typer.Option(help="Sizes of the map, separated by commas.")
     ] = "25,50,100,200,400,800",

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
-    "CONFIDENCE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval", "iqm",
-    "mean_interval", "median", "ratio_of_sums", "resampled_indices",
+    "CONFIDENCE", "NONE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval",
+    "iqm", "mean_interval", "median", "ratio_of_sums", "resampled_indices",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Interval:
     high: float
 
 
-_NONE = Interval(np.nan, np.nan, np.nan)
+NONE = Interval(np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def interval(statistic: Callable[[Indices], Array], strata: Sequence[Hashable]) 
     it is not defined in one of them, or a stratum has but one episode, neither are the limits.
     """
     if not len(strata):
-        return _NONE
+        return NONE
     return _limits(float(statistic(np.arange(len(strata))[None])[0]), statistic(resampled_indices(strata)), strata)
 
 
@@ -196,7 +196,7 @@ def compare(
     better = (rank_a < rank_b) if lower_is_better else (rank_a > rank_b)
     won = better + 0.5 * (rank_a == rank_b)
     if not len(a):
-        return Comparison(_NONE, _NONE, _NONE, 0)
+        return Comparison(NONE, NONE, NONE, 0)
     names = list(dict.fromkeys(strata))
     # A resample keeps each stratum's episodes at that stratum's places.
     places = [np.array([k for k, s in enumerate(strata) if s == name], np.intp) for name in names]

@@ -23,6 +23,7 @@ from slam.landmarks.database import write_landmark_map
 from slam.logs import ScanLog
 from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
+from training.figures.charts import png
 from training.replay.picture import draw_belief, draw_replay
 from training.replay.run import FILES, Replay
 from training.replay.scans import scan_metrics
@@ -118,7 +119,7 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
     surveyed = surveyed_places(replay, belief.landmark_ids)
     atomic_write(folder / "landmarks.csv", _landmarks_csv(belief, seen, surveyed))
     reckoned = log.dead_reckoning()[log.odometry_times <= replay.time_s]
-    picture = draw_replay(
+    figure = draw_replay(
         reference=_broken_at_gaps(times, true, log.reference_gap_s), reckoned=reckoned, estimate=estimates,
         landmarks=belief.landmarks,
         surveyed=surveyed if log.landmarks is None else log.landmarks,
@@ -128,7 +129,7 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
         write_map_server(folder / "map", belief.grid)
         title = f"{log.name}   {replay.config.slam}"
         atomic_write(folder / "map.png", cv2.imencode(".png", draw_belief(belief, estimates, title))[1].tobytes())
-    atomic_write(folder / "trajectory.png", cv2.imencode(".png", picture)[1].tobytes())
+    atomic_write(folder / "trajectory.png", png(figure))
     atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": _run_values(replay)}))
     found = metrics(replay)
     atomic_write(folder / "metrics.json", json.dumps(found, indent=2, ensure_ascii=False) + "\n")

@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
+from training.runs.errors import BadInput
+
 __all__ = [
     "Backends", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Robot", "RoomSeed",
-    "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers",
+    "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers", "whole_numbers",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
@@ -37,3 +39,13 @@ Seed = Annotated[int, typer.Option(min=0)]
 Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
 Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
+
+
+def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
+    """Return the numbers of ``25,50,100``, as typed for an option, each once and in order."""
+    words = [word.strip() for word in text.split(",")]
+    if all(word.isascii() and word.isdigit() and len(word) < 9 for word in words):
+        numbers = sorted(set(map(int, words)))
+        if low <= numbers[0] and numbers[-1] <= high:
+            return numbers
+    raise BadInput(f"{option} {text!r} must be whole numbers in {low} … {high}, for instance 25,50,100")

@@ -18,8 +18,9 @@ from mecanum_env.sensing.calibration import odometry_noise
 from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit
 from slam.motion import OdometryNoise
 from slam.settings import unknown_name
+from training.figures.tables import text_table
 from training.runs.errors import bad_input
-from training.runs.options import Json
+from training.runs.options import Json, Seed
 
 __all__ = ["compare", "study", "table"]
 
@@ -59,24 +60,24 @@ def _terms(noise: OdometryNoise) -> dict[str, float]:
 
 def table(results: dict[str, dict[str, Any]]) -> str:
     """Return the comparison as a table; speeds in m/s, turn rates in rad/s."""
-    head = f"{'':<30}{'v floor':>9}{'v share':>9}{'ω floor':>9}{'ω share':>9}{'drift² v':>10}{'drift² ω':>10}"
-    lines = [head]
+    head = ["", "v floor", "v share", "ω floor", "ω share", "drift² v", "drift² ω"]
+    rows, lines = [], []
     for preset, result in results.items():
         for kind in ("white", "declared_white", "lasting", "lasting_without_gain", "declared"):
-            row = "".join(f"{result[kind][name]:>9.4f}" for name in _TERMS)
             ratios = result.get(f"drift_ratio_{kind}")
-            row += "" if ratios is None else "".join(f"{ratio:>10.2f}" for ratio in ratios)
-            lines.append(f"{preset:<9} {kind.replace('_', ' '):<20}{row}")
+            drifts = ["", ""] if ratios is None else [f"{ratio:.2f}" for ratio in ratios]
+            values = [f"{result[kind][name]:.4f}" for name in _TERMS]
+            rows.append([f"{preset} {kind.replace('_', ' ')}", *values, *drifts])
         gains = ", ".join(f"{100 * share:+.1f} %" for share in result["gain"])
-        lines.append(f"{preset:<9} the wheels claim more than was driven: vx, vy, ω {gains}")
-    return "\n".join(lines)
+        lines.append(f"{preset}: the wheels claim more than was driven: vx, vy, ω {gains}")
+    return "\n".join([text_table(head, rows), *lines])
 
 
 def study(
     noise: Annotated[str, typer.Option(help="Noise presets, separated by commas.")] = "nominal,slippery,cavity",
     episodes: Annotated[int, typer.Option(min=1, help="Drives of a preset.")] = 60,
     steps: Annotated[int, typer.Option(min=10, help="Of a drive.")] = 400,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
     """Calibrate odometry: V as the simulated robot has it, beside V as its estimators are told."""

@@ -16,12 +16,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import slam
 from slam.backend import Backend
 from slam.geometry import wrap
 from slam.motion import move, twist_between
 from slam.types import Observations, Odometry
+from training.runs.errors import BadInput
 
-__all__ = ["WORLDS", "LandmarkWorld", "Step", "drive", "simulate"]
+__all__ = ["WORLDS", "LandmarkWorld", "Step", "check_observes", "drive", "simulate"]
 
 Array = NDArray[np.float64]
 
@@ -181,3 +183,13 @@ _ROOM = LandmarkWorld(
 
 WORLDS: dict[str, LandmarkWorld] = {world.name: world for world in (_CIRCLE, _ROOM)}
 """Fixed: their figures are compared from one version to the next."""
+
+
+def check_observes(name: str) -> None:
+    """Raise :class:`BadInput` for a backend that takes scans only: there are none here."""
+    world = WORLDS["circle"]
+    try:
+        for _ in drive(world, slam.make(name, config=world.backend_settings()), 0, 2):
+            pass
+    except (NotImplementedError, TypeError, ValueError) as error:
+        raise BadInput(f"--slam {name} takes no landmark observations ({error}); leave it out") from error

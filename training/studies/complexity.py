@@ -24,9 +24,13 @@ from slam.formats import atomic_write
 from slam.geometry import wrap
 from slam.motion import move
 from slam.types import Observations, Odometry
-from training.figures.charts import Axis, Line, draw_chart, png
-from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
-from training.runs.errors import BadInput, bad_input
+from training.figures.charts import chart, label, png
+from training.figures.tables import number, text_table
+from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
+from training.runs.errors import bad_input
+from training.runs.options import whole_numbers
+from training.runs.rows import resume
+from training.studies.circle_world import check_observes
 
 __all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
 
@@ -40,7 +44,7 @@ SEEN = 10
 REFERENCE = "blas"
 """For comparison: P − WᵀW of a W of 2 · SEEN rows by BLAS, P of the size of the joint covariance, float64."""
 REPEATS = 10
-_POINTS = "points"
+STORE = "points.jsonl"  # what was measured
 _MOST_LANDMARKS = 2000  # the joint covariance of so many takes 130 MB
 _DT, _SPEED, _TURN = 0.1, 0.3, 0.2
 _SIGMAS = np.array([0.02, math.radians(1.0)])
@@ -59,12 +63,7 @@ class Plan:
         """Check options as typed; :class:`BadInput` says what is allowed."""
         with bad_input():
             backends = tuple(backend_names(slam))
-            words = [word.strip() for word in landmarks.split(",")]
-            sizes = sorted({int(word) for word in words if word.isascii() and word.isdigit() and len(word) < 9})
-            if not all(w.isascii() and w.isdigit() for w in words):
-                raise ValueError(f"--landmarks {landmarks!r} are no numbers; give for instance 25,50,100")
-            if not sizes or sizes[0] < SEEN or sizes[-1] > _MOST_LANDMARKS or any(len(w) > 8 for w in words):
-                raise ValueError(f"--landmarks must each be in {SEEN} … {_MOST_LANDMARKS}, got {landmarks!r}")
+        sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
         return cls(backends=backends, landmarks=tuple(sizes), steps=steps)
 
     def settings(self) -> dict[str, Any]:
@@ -205,22 +204,9 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
     settings = plan.settings()
     check_settings(out, settings, FILES)
     for name in plan.backends:
-        _check_observes(name)
+        check_observes(name)
     write_settings(out, settings)
-    folder = out / _POINTS
-    folder.mkdir(exist_ok=True)
-    points: dict[Job, Point] = {}
-    for job in plan.jobs():
-        kept = _load(_file(folder, job))
-        if kept is not None:
-            points[job] = kept
-
-    def keep(job: Job, point: Point) -> None:
-        atomic_write(_file(folder, job), json.dumps(point) + "\n")
-        points[job] = point
-
-    missing = [job for job in plan.jobs() if job not in points]
-    run_all(missing, run_job, workers=1, keep=keep, what="points", apart=True)
+    points = resume(out / STORE, plan.jobs(), run_job, workers=1, what="points", apart=True)
     result: dict[str, Any] = {}
     for name in (*plan.backends, REFERENCE):
         rows = [{"landmarks": n, **points[name, n, plan.steps]} for n in plan.landmarks]
@@ -228,7 +214,11 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
         result[name] = {"times": rows, "exponent": exponent(plan.landmarks, times)}
     result["config"] = settings
     atomic_write(out / "complexity.json", json.dumps(result, indent=1) + "\n")
-    atomic_write(out / "complexity.png", png(_chart(plan, result)))
+    figure, (axes,) = chart()
+    for name in (*plan.backends, REFERENCE):
+        axes.plot(plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], "o-", label=name)
+    label(axes, f"Time per step: predict, and observe {SEEN} of n landmarks", "landmarks n", "µs", log="xy")
+    atomic_write(out / "complexity.png", png(figure))
     return result
 
 
@@ -239,32 +229,6 @@ def exponent(landmarks: Sequence[int], times: Sequence[float]) -> float | None:
     return float(np.polyfit(np.log(landmarks), np.log(times), 1)[0])
 
 
-def _file(folder: Path, job: Job) -> Path:
-    return folder / f"{job[0]}-{job[1]}.json"
-
-
-def _load(path: Path) -> Point | None:
-    """Return a point as it was kept; None where it is not there or damaged, and so to be measured again."""
-    try:
-        point = json.loads(path.read_text("utf-8"))
-        return {name: None if point[name] is None else float(point[name]) for name in _KEYS}
-    except (OSError, ValueError, TypeError, KeyError):
-        return None
-
-
-_KEYS = ("us_per_step", "us_predict", "us_correction")
-
-
-def _check_observes(name: str) -> None:
-    """Refuse a backend that takes scans only."""
-    backend = slam.make(name, config={"lidar_offset_m": 0.0})
-    world = _landmarks(SEEN)
-    try:
-        _map_everything(backend, world, np.zeros(3))
-    except (NotImplementedError, TypeError, ValueError) as error:
-        raise BadInput(f"--slam {name} takes no landmark observations ({error}); leave it out") from error
-
-
 # ---- what the user sees ----------------------------------------------------------------------------------------
 
 
@@ -272,27 +236,17 @@ def table(result: dict[str, Any]) -> str:
     """Return the times per step [µs] as a table, and the EKFs' corrections against the reference."""
     rows = {name: row for name, row in result.items() if name != "config"}
     sizes = [point["landmarks"] for point in rows[REFERENCE]["times"]]
-    lines = [f"{'µs per step, landmarks':<26}" + "".join(f"{n:>9}" for n in sizes) + f"{'exponent':>10}"]
+    head = ["µs per step, landmarks", *(str(n) for n in sizes), "exponent"]
+    lines = []
     for name, row in rows.items():
-        fit = row["exponent"]
-        ends = f"{'-' if fit is None else f'{fit:.2f}':>10}"
-        lines.append(f"{name:<26}" + _cells([p["us_per_step"] for p in row["times"]]) + ends)
+        lines.append([name, *_cells([p["us_per_step"] for p in row["times"]]), number(row["exponent"], 2, "-")])
         corrections = [p["us_correction"] for p in row["times"]]
         if all(corrections):
             ratios = [c / p["us_per_step"] for c, p in zip(corrections, rows[REFERENCE]["times"], strict=True)]
-            lines.append(f"{'  its stacked update':<26}" + _cells(corrections))
-            lines.append(f"{'  that over ' + REFERENCE:<26}" + _cells(ratios))
-    return "\n".join(lines)
+            lines.append(["  its stacked update", *_cells(corrections), ""])
+            lines.append([f"  that over {REFERENCE}", *_cells(ratios), ""])
+    return text_table(head, lines)
 
 
-def _cells(values: Sequence[float]) -> str:
-    return "".join(f"{v:>9.1f}" for v in values)
-
-
-def _chart(plan: Plan, result: dict[str, Any]) -> NDArray[np.uint8]:
-    lines = [
-        Line(name, plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], dots=True)
-        for name in (*plan.backends, REFERENCE)
-    ]
-    title = f"Time per step: predict, and observe {SEEN} of n landmarks"
-    return draw_chart(lines, title=title, x=Axis("landmarks n", log=True), y=Axis("µs", log=True))
+def _cells(values: Sequence[float]) -> list[str]:
+    return [f"{v:.1f}" for v in values]

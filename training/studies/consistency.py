@@ -15,30 +15,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import slam
 from mecanum_env import MAX_EPISODE_STEPS
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS, NoiseConfig
+from mecanum_env.env import ExploreEnv
 from slam.backend import Backend
-from slam.formats import atomic_write, replacing
-from slam.metrics.measures import anees, nees_band
+from slam.formats import atomic_write
+from slam.metrics.measures import nees_band
 from slam.settings import unknown_name
-from training.figures.charts import Axis, Line, draw_chart, png
-from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
-from training.runs.errors import BadInput, bad_input
-from training.studies.circle_world import WORLDS, drive
+from training.figures.charts import COLOURS, chart, label, png
+from training.figures.consistency import step_averages
+from training.figures.tables import number, text_table
+from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
+from training.runs.errors import bad_input
+from training.runs.rows import resume
+from training.studies.circle_world import WORLDS, check_observes, drive
+from training.studies.exploring import AGENT, exploring
 
 __all__ = ["Plan", "Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
 
 Array = NDArray[np.float64]
 Job = tuple[str, str, int, int, float]  # backend, rooms, seed, steps, noise
-Record = dict[str, Array]  # of each step (steps,): "nees", "nis", "dof"
+Row = list[tuple[float, float, float]]  # a run: NEES, NIS and its degrees of freedom at each step
+Record = dict[str, Array]  # the same as columns (steps,): "nees", "nis", "dof"
 
 FILES = ("consistency.json", "consistency.png")
-AGENT = "nearest-frontier"
-_RUNS = "runs"  # the folder of what each run left
+STORE = "runs.jsonl"  # what each run left
 _IDLE_STEPS = 20  # an agent without a goal for so long has nothing left to do
 _SCALED = ("range_sigma_m", "dropout", "encoder", "radius_error", "base_error", "slip")
 _NOT_HERE = {"truth": "is given the pose, so there is nothing to be consistent about"}
@@ -94,66 +100,48 @@ def scaled_noise(scale: float) -> NoiseConfig:
 # ---- one run ---------------------------------------------------------------------------------------------------
 
 
-def run_job(job: Job) -> Record:
-    """Do one run; return its NEES, its NIS and the NIS's degrees of freedom at each step ``(steps,)``.
-
-    NIS is nan for a backend that has none.
-    """
-    name, rooms, seed, steps, noise = job
-    rows = _in_world(name, rooms, seed, steps, noise) if rooms in WORLDS else _in_rooms(*job)
-    values = np.array(rows, np.float64).reshape(-1, 3)
-    return {"nees": values[:, 0], "nis": values[:, 1], "dof": values[:, 2]}
+def run_job(job: Job) -> Row:
+    """Do one run; NIS is nan for a backend that has none."""
+    return _in_world(*job) if job[1] in WORLDS else _in_rooms(*job)
 
 
-def _row(backend: Backend, true_pose: Array) -> tuple[float, float, float]:
+def _record(row: Row) -> Record:
+    return dict(zip(("nees", "nis", "dof"), np.array(row, np.float64).reshape(-1, 3).T, strict=True))
+
+
+def _of_step(backend: Backend, true_pose: Array) -> tuple[float, float, float]:
     dof = float(getattr(backend, "nis_dof", 0))
     return backend.pose_nees(true_pose), float(getattr(backend, "nis", math.nan)) if dof else math.nan, dof
 
 
-def _in_world(name: str, rooms: str, seed: int, steps: int, noise: float) -> list[tuple[float, float, float]]:
+def _in_world(name: str, rooms: str, seed: int, steps: int, noise: float) -> Row:
     world = WORLDS[rooms].scaled(noise)
     backend = slam.make(name, config=world.backend_settings())
     rows = []
     for step in drive(world, backend, seed, steps):
-        nees, nis, dof = _row(backend, step.true_pose)
+        nees, nis, dof = _of_step(backend, step.true_pose)
         # The backend still tells of its last observation where there was none in this step.
         rows.append((nees, nis, dof) if len(step.observations.range_bearing) else (nees, math.nan, 0.0))
     return rows
 
 
-def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> list[tuple[float, float, float]]:
+def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> Row:
     """Explore until the agent has nothing left to do, or the steps are used up."""
-    import gymnasium
-
-    import agents
-    from mecanum_env.env import ExploreEnv
-
-    wrapped = gymnasium.make(
-        "mecanum_env:mecanum_env/Explore-v0", rooms=rooms, slam=name,
-        noise=dataclasses.asdict(scaled_noise(noise)), config={"coverage_target": 1.0}, max_episode_steps=steps,
-        disable_env_checker=True,
-    )  # fmt: skip
-    observation, _ = wrapped.reset(seed=seed)
-    env = wrapped.unwrapped
-    assert isinstance(env, ExploreEnv)
-    config = env.config
-    agent = agents.make(AGENT, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-    agent.reset(env.belief, seed)
-    rows, idle, done = [], 0, False
-    while not done and idle < _IDLE_STEPS:
-        action = agent.act(observation, env.belief)
-        idle = idle + 1 if agent.goal is None else 0
-        observation, _, terminated, truncated, info = wrapped.step(action)
-        done = terminated or truncated
-        rows.append(_row(env.backend, info["true_pose"]))
-    wrapped.close()
+    env = ExploreEnv(
+        rooms=rooms, slam=name, noise=dataclasses.asdict(scaled_noise(noise)), config={"coverage_target": 1.0}
+    )
+    rows = []
+    for info, idle in exploring(env, seed=seed, steps=steps):
+        rows.append(_of_step(env.backend, info["true_pose"]))
+        if idle >= _IDLE_STEPS:
+            break
     return rows
 
 
 # ---- all of them -----------------------------------------------------------------------------------------------
 
 
-def consistency(plan: Plan, *, out: Path, workers: int) -> dict[str, Any]:
+def consistency(plan: Plan, *, out: Path, workers: int | None) -> dict[str, Any]:
     """Do the runs that ``out`` does not hold yet, write ``consistency.json`` and ``.png``, return the former.
 
     Raises
@@ -167,23 +155,10 @@ def consistency(plan: Plan, *, out: Path, workers: int) -> dict[str, Any]:
     check_settings(out, settings, FILES)
     if plan.rooms in WORLDS:
         for name in plan.backends:
-            _check_observes(name, plan.rooms)
+            check_observes(name)
     write_settings(out, settings)
-    folder = out / _RUNS
-    folder.mkdir(exist_ok=True)
-    records: dict[Job, Record] = {}
-    for job in plan.jobs():
-        kept = _load(_file(folder, job))
-        if kept is not None:
-            records[job] = kept
-
-    def keep(job: Job, record: Record) -> None:
-        with replacing(_file(folder, job)) as path, path.open("wb") as file:
-            np.savez_compressed(file, **record)  # type: ignore[arg-type]
-        records[job] = record
-
-    run_all([job for job in plan.jobs() if job not in records], run_job, workers=workers, keep=keep)
-    groups = {name: [records[job] for job in plan.jobs() if job[0] == name] for name in plan.backends}
+    rows = resume(out / STORE, plan.jobs(), run_job, workers=workers)
+    groups = {name: [_record(row) for job, row in rows.items() if job[0] == name] for name in plan.backends}
     result: dict[str, Any] = {name: summarise(group) for name, group in groups.items()}
     result["config"] = settings | {"seeds": [plan.seed0, plan.seed0 + plan.runs - 1]}
     atomic_write(out / "consistency.json", json.dumps(result, indent=1) + "\n")
@@ -198,7 +173,7 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     finite), ``fraction_in_band`` the share of the steps whose average lies in ``band``, the 95 % band of so many
     runs (at each step: of those that go on), ``nis_mean`` all NIS over all degrees of freedom (null: no NIS).
     """
-    averages, lows, highs = _averages(records)
+    averages, lows, highs = step_averages([record["nees"] for record in records])
     defined = [(float(np.nansum(r["nis"])), float(r["dof"][~np.isnan(r["nis"])].sum())) for r in records]
     nis, dof = (sum(column) for column in zip(*defined, strict=True))
     low, high = nees_band(3, len(records))
@@ -213,74 +188,36 @@ def summarise(records: Sequence[Record]) -> dict[str, Any]:
     }
 
 
-def _averages(records: Sequence[Record]) -> tuple[Array, Array, Array]:
-    """Return per step the average NEES / 3 over the runs, and its band.
-
-    Counted as long as at least half the runs go on; the others' ends would leave the average to a few.
-    """
-    lengths = [len(r["nees"]) for r in records]
-    steps = int(np.median(lengths))
-    values = np.full((len(records), steps), np.nan)
-    for row, record in zip(values, records, strict=True):
-        row[: len(record["nees"])] = record["nees"][:steps]
-    going_on = [sum(length > k for length in lengths) for k in range(steps)]
-    bands = {runs: nees_band(3, runs) for runs in set(going_on)}
-    low, high = np.array([bands[runs] for runs in going_on]).T
-    return anees(values, axis=0), low, high
-
-
-def _file(folder: Path, job: Job) -> Path:
-    return folder / f"{job[0]}-{job[2]}.npz"
-
-
-def _load(path: Path) -> Record | None:
-    """Return a run as it was kept; None where it is not there or damaged, and so to be done again."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            record = {name: np.asarray(file[name], np.float64) for name in ("nees", "nis", "dof")}
-    except Exception:  # a damaged archive can raise almost anything
-        return None
-    return record if len({r.shape for r in record.values()}) == 1 and record["nees"].ndim == 1 else None
-
-
-def _check_observes(name: str, rooms: str) -> None:
-    """Refuse a backend that takes scans only where there are none."""
-    world = WORLDS[rooms]
-    try:
-        for _ in drive(world, slam.make(name, config=world.backend_settings()), 0, 2):
-            pass
-    except (NotImplementedError, TypeError, ValueError) as error:
-        raise BadInput(
-            f"--slam {name} takes no landmark observations ({error}); give --rooms {room_registry.names()[0]}"
-        ) from error
-
-
 # ---- what the user sees ----------------------------------------------------------------------------------------
 
 
 def table(result: dict[str, Any]) -> str:
     """Return the figures as a table."""
-    lines = [f"{'backend':<16}{'NEES / 3':>10}{'in 95 % band':>14}{'NIS / dof':>11}{'runs':>6}{'steps':>7}"]
-    for name, row in result.items():
-        if name == "config":
-            continue
-        mean, nis = row["anees_pose"], row["nis_mean"]
-        lines.append(
-            f"{name:<16}{'inf' if mean is None else f'{mean:.3f}':>10}{100 * row['fraction_in_band']:>12.0f} %"
-            f"{'-' if nis is None else f'{nis:.3f}':>11}{row['runs']:>6}{row['steps']:>7}"
-        )
+    rows = [
+        [
+            name, number(row["anees_pose"], 3, "inf"), f"{100 * row['fraction_in_band']:.0f} %",
+            number(row["nis_mean"], 3, "-"), str(row["runs"]), str(row["steps"]),
+        ]
+        for name, row in result.items() if name != "config"
+    ]  # fmt: skip
     low, high = next(iter(result.values()))["band"]
-    lines.append(f"ideal 1; the average of a step lies in [{low:.2f}, {high:.2f}] with 95 % if consistent")
-    return "\n".join(lines)
+    return (
+        text_table(["backend", "NEES / 3", "in 95 % band", "NIS / dof", "runs", "steps"], rows)
+        + f"\nideal 1; the average of a step lies in [{low:.2f}, {high:.2f}] with 95 % if consistent"
+    )
 
 
-def _chart(plan: Plan, groups: dict[str, list[Record]]) -> NDArray[np.uint8]:
-    averages = {name: _averages(group)[0] for name, group in groups.items()}
-    highest = max(float(np.max(v[np.isfinite(v)], initial=0.0)) for v in averages.values())
+def _chart(plan: Plan, groups: dict[str, list[Record]]) -> Figure:
+    figure, (axes,) = chart()
+    axes.axhspan(*nees_band(3, plan.runs), color=COLOURS[2], alpha=0.2, linewidth=0, label="95 % band")
+    highest = 0.0
+    for name, group in groups.items():
+        average, _, _ = step_averages([record["nees"] for record in group])
+        axes.plot(np.arange(1, len(average) + 1), average, linewidth=1, label=name)
+        highest = max(highest, float(np.max(average[np.isfinite(average)], initial=0.0)))
     title = f"Pose NEES / 3, average of {plan.runs} runs: {plan.rooms}, noise × {plan.noise:g}"
-    axis = Axis("1 is consistent, above it too sure; green: 95 % band", log=True) if highest > 10 else Axis(
-        "1 is consistent, above it too sure; green: 95 % band", low=0.0
-    )  # fmt: skip
-    lines = [Line(name, np.arange(1, len(v) + 1), v, px=1) for name, v in averages.items()]
-    last = max(len(v) for v in averages.values())
-    return draw_chart(lines, title=title, x=Axis("step", low=0.0, high=last), y=axis, band=nees_band(3, plan.runs))
+    label(axes, title, "step", "1 is consistent, above it too sure", log="y" if highest > 10 else "")
+    if highest <= 10:
+        axes.set_ylim(bottom=0.0)
+    axes.set_xlim(left=0.0)
+    return figure

@@ -27,8 +27,10 @@ from slam.formats import atomic_write
 from slam.particles.shared_grid import SharedGrid
 from slam.settings import from_mapping
 from slam.types import Odometry, Scan
-from training.figures.charts import Axis, Line, draw_chart, png
-from training.runs.errors import BadInput, bad_input, check_writable
+from training.figures.charts import INK, chart, label, png
+from training.figures.tables import text_table
+from training.runs.errors import bad_input, check_writable
+from training.runs.options import Seed, whole_numbers
 
 __all__ = ["cost", "record", "study"]
 
@@ -113,12 +115,12 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/dp_slam_cost"),
     particles: Annotated[str, typer.Option(help="Numbers, separated by commas.")] = "50,100,200,500,1000",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     steps: Annotated[int, typer.Option(min=1, help="Of the drive.")] = 120,
     limit_mb: Annotated[float, typer.Option(help="Copies that need more are left out.")] = 1000.0,
 ) -> None:
     """Measure what the maps of DP-SLAM's particles cost: one shared grid, or a copy each."""
-    numbers = _numbers(particles)
+    numbers = whole_numbers("--particles", particles, low=1, high=100_000)
     with bad_input():
         room_registry.check(rooms)
     check_writable(out, _FILES)
@@ -128,43 +130,31 @@ def study(
     print(table(rows))
 
 
-def _numbers(text: str) -> list[int]:
-    try:
-        found = sorted({int(part) for part in text.split(",")})
-    except ValueError:
-        found = []
-    if not found or found[0] < 1:
-        raise BadInput(f"--particles takes whole numbers from 1 on, separated by commas; got {text!r}")
-    return found
-
-
 def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:
     x = [row["particles"] for row in rows]
     out.mkdir(parents=True, exist_ok=True)
-    for name, key, label in (("memory", "mb", "MB"), ("time", "ms_per_update", "ms")):
-        lines = [
-            Line(kind, x, [np.nan if row[kind] is None else row[kind][key] for row in rows], dots=True)
-            for kind in _KINDS
-        ]
+    for name, key, title, unit in (
+        ("memory", "mb", "memory", "MB"),
+        ("time", "ms_per_update", "time per update", "ms"),
+    ):
+        figure, (axes,) = chart()
+        for kind in _KINDS:
+            axes.plot(x, [np.nan if row[kind] is None else row[kind][key] for row in rows], "o-", label=kind)
         if key == "mb":
-            lines.append(Line("copies, computed", x, [row["copies_mb"] for row in rows], px=1))
-        chart = draw_chart(
-            lines, title=f"Maps of the particles: {'memory' if key == 'mb' else 'time per update'}",
-            x=Axis("particles", log=True), y=Axis(label, log=True),
-        )  # fmt: skip
-        atomic_write(out / f"{name}.png", png(chart))
+            axes.plot(x, [row["copies_mb"] for row in rows], "--", color=INK, label="copies, computed")
+        label(axes, f"Maps of the particles: {title}", "particles", unit, log="xy")
+        atomic_write(out / f"{name}.png", png(figure))
     atomic_write(out / "dp_slam_cost.json", json.dumps({"run": run, "rows": rows}, indent=1) + "\n")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the figures as a table."""
-    lines = [f"{'particles':>9}{'nodes':>8}{'shared MB':>12}{'copies MB':>12}{'shared ms':>12}{'copies ms':>12}"]
+    lines = []
     for row in rows:
         shared, copied = row["shared"], row["copies"]
-        copies_mb = f"{copied['mb']:.0f}" if copied else f"({row['copies_mb']:.0f})"
-        copies_ms = f"{copied['ms_per_update']:.1f}" if copied else "-"
-        lines.append(
-            f"{row['particles']:>9}{shared['nodes']:>8}{shared['mb']:>12.1f}{copies_mb:>12}"
-            f"{shared['ms_per_update']:>12.1f}{copies_ms:>12}"
-        )
-    return "\n".join(lines)
+        lines.append([
+            str(row["particles"]), str(shared["nodes"]), f"{shared['mb']:.1f}",
+            f"{copied['mb']:.0f}" if copied else f"({row['copies_mb']:.0f})", f"{shared['ms_per_update']:.1f}",
+            f"{copied['ms_per_update']:.1f}" if copied else "-",
+        ])  # fmt: skip
+    return text_table(["particles", "nodes", "shared MB", "copies MB", "shared ms", "copies ms"], lines)

@@ -1,8 +1,8 @@
 """Paper B's claims as plots (theory.md B, points 1, 2 and 6), in the circle world.
 
 ``mecanum study paper-b --out DIR`` follows one run of the EKFs, with the start uncertain by 10 cm,
-and one of each FastSLAM, and writes ``determinants.png``, ``variances.png``, ``correlations.png``,
-``particles.png`` and ``paper_b.json``. What the figures mean: ``docs/studies/paper-b.md``.
+and one of each FastSLAM, and writes ``paper_b.png`` and ``paper_b.json``. What the figures mean:
+``docs/studies/paper-b.md``.
 """
 
 from __future__ import annotations
@@ -10,19 +10,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
+from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 import slam
 from slam.backend import Backend
 from slam.formats import atomic_write
-from training.figures.charts import Axis, Line, draw_chart, png
+from training.figures.charts import COLOURS, chart, label, png
 from training.runs.errors import BadInput, check_writable
+from training.runs.options import Seed
 from training.studies.circle_world import WORLDS, LandmarkWorld, drive
 
 __all__ = ["floor_of", "follow_filter", "follow_particles", "paper_b", "study"]
@@ -33,7 +35,7 @@ _START_SIGMA_M = 0.1  # a start known exactly would leave landmarks no floor but
 _UNCERTAIN_HEADING = math.radians(2.0)
 _PARTICLE_BACKENDS = ("fastslam1", "fastslam2")
 _SMOOTHED = 25  # steps that N_eff is averaged over in the chart
-_FILES = ("determinants.png", "variances.png", "correlations.png", "particles.png", "paper_b.json")
+_FILES = ("paper_b.png", "paper_b.json")
 
 
 # ---- claims 1 and 2: the joint Gaussian ------------------------------------------------------------------------
@@ -146,7 +148,7 @@ def _particle_figures(rows: dict[str, Array]) -> dict[str, float | int | None]:
 
 
 def paper_b(out: Path, *, seed: int = 0, steps: int | None = None) -> dict[str, Any]:
-    """Follow every filter, write the charts and ``paper_b.json``, and return the latter's contents."""
+    """Follow every filter, write the chart and ``paper_b.json``, and return the latter's contents."""
     check_writable(out, _FILES)
     circle = WORLDS["circle"]
     steps = circle.steps if steps is None else steps
@@ -155,21 +157,18 @@ def paper_b(out: Path, *, seed: int = 0, steps: int | None = None) -> dict[str, 
     result: dict[str, Any] = {"steps": steps, "seed": seed, "start_sigma_m": _START_SIGMA_M}
     rows = follow_filter(_make("ekf", world), world, seed=seed, steps=steps)
     result["ekf"] = _figures(rows, world)
-    charts = _filter_charts(rows, world)
     for name in ("ekf", "invariant-ekf"):
-        if _registered(name):
-            followed = follow_filter(_make(name, turned), turned, seed=seed, steps=steps)
-            result[f"{name}, heading uncertain by 2°"] = _figures(followed, turned)
+        followed = follow_filter(_make(name, turned), turned, seed=seed, steps=steps)
+        result[f"{name}, heading uncertain by 2°"] = _figures(followed, turned)
     particles = {}
     for name in _PARTICLE_BACKENDS:
-        if _registered(name):
-            particles[name] = follow_particles(_make(name, circle), circle, seed=seed, steps=steps)
-            result[name] = _particle_figures(particles[name])
-    if particles:
-        charts["particles.png"] = _particle_chart(particles)
+        particles[name] = follow_particles(_make(name, circle), circle, seed=seed, steps=steps)
+        result[name] = _particle_figures(particles[name])
+    figure, panels = chart(2, 2, size=(1600, 900))
+    _draw_filter(panels[:3], rows, world)
+    _draw_particles(panels[3], particles)
     out.mkdir(parents=True, exist_ok=True)
-    for name, image in charts.items():
-        atomic_write(out / name, png(image))
+    atomic_write(out / "paper_b.png", png(figure))
     atomic_write(out / "paper_b.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     return result
 
@@ -178,60 +177,37 @@ def _make(name: str, world: LandmarkWorld) -> Backend:
     return slam.make(name, config=world.backend_settings())
 
 
-def _registered(name: str) -> bool:
-    if name in slam.names():
-        return True
-    print(f"{name} is not registered: left out", file=sys.stderr)
-    return False
-
-
-def _filter_charts(rows: dict[str, Array], world: LandmarkWorld) -> dict[str, NDArray[np.uint8]]:
+def _draw_filter(panels: Sequence[Axes], rows: dict[str, Array], world: LandmarkWorld) -> None:
     step, n = rows["step"], len(world.landmarks)
-    x = Axis("step", low=0.0, high=float(step[-1]))
     # Pairs from the nearest neighbours on the ring to those across it.
     first, second = np.triu_indices(n, 1)
     chosen = [int(np.flatnonzero((first == 0) & (second == k))[0]) for k in (1, 2, 5, 10) if k < n]
-    names = [f"pair 0, {second[k]}" for k in chosen]
-    size = 2 * n
-    determinants = [Line(f"map (per dimension, {size})", step, rows["log_det"] / size)] + [
-        Line(name, step, rows["pair_log_det"][:, k] / 4) for name, k in zip(names, chosen, strict=True)
-    ]
-    sigmas = [Line("", step, rows["sigma"][:, k], colour=0, px=1) for k in range(n)]
-    sigmas.append(Line("floor: the start's 0.1 m", step, np.full(len(step), floor_of(world).max()), colour=1))
-    correlations = [
-        Line(name, step, 1.0 - rows["correlation"][:, k]) for name, k in zip(names, chosen, strict=True)
-    ]
-    log = "log det / dimension"
-    return {
-        "determinants.png": draw_chart(
-            determinants, title="Determinants of the map and of pairs of landmarks fall", x=x, y=Axis(log)
-        ),
-        "variances.png": draw_chart(
-            sigmas, title="Landmarks' σ falls to a floor", x=x, y=Axis("σ [m]", low=0.0)
-        ),
-        "correlations.png": draw_chart(
-            correlations, title="Landmarks' correlation grows to 1", x=x, y=Axis("1 - correlation", log=True)
-        ),
-    }  # fmt: skip
+    determinants, variances, correlations = panels
+    determinants.plot(step, rows["log_det"] / (2 * n), label=f"map (per dimension, {2 * n})")
+    for k in chosen:
+        determinants.plot(step, rows["pair_log_det"][:, k] / 4, label=f"pair 0, {second[k]}")
+        correlations.plot(step, 1.0 - rows["correlation"][:, k], label=f"pair 0, {second[k]}")
+    variances.plot(step, rows["sigma"], color=COLOURS[0], linewidth=1)
+    variances.axhline(floor_of(world).max(), color=COLOURS[1], label="floor: the start's 0.1 m")
+    variances.set_ylim(bottom=0.0)
+    label(determinants, "Determinants of the map and of pairs of landmarks fall", "step", "log det / dimension")
+    label(variances, "Landmarks' σ falls to a floor", "step", "σ [m]")
+    label(correlations, "Landmarks' correlation grows to 1", "step", "1 - correlation", log="y")
 
 
-def _particle_chart(particles: dict[str, dict[str, Array]]) -> NDArray[np.uint8]:
-    lines = []
-    for k, (name, rows) in enumerate(particles.items()):
+def _draw_particles(axes: Axes, particles: dict[str, dict[str, Array]]) -> None:
+    for name, rows in particles.items():
         step = np.arange(1, len(rows["n_eff"]) + 1)
         few = min(_SMOOTHED, len(step))
         smooth = np.convolve(rows["n_eff"], np.full(few, 1.0 / few), mode="valid")
-        lines.append(Line(f"{name}: N_eff", step[few - 1 :], smooth, colour=2 * k))
-        lines.append(Line(f"{name}: ancestors", step, rows["ancestors"], colour=2 * k + 1))
-    last = float(max(len(rows["n_eff"]) for rows in particles.values()))
-    x, y = Axis("step", low=0.0, high=last), Axis(f"N_eff: mean of {_SMOOTHED} steps", log=True)
-    title = "Particles that count, and ancestors"
-    return draw_chart(lines, title=title, x=x, y=y)
+        axes.plot(step[few - 1 :], smooth, label=f"{name}: N_eff")
+        axes.plot(step, rows["ancestors"], label=f"{name}: ancestors")
+    label(axes, "Particles that count, and ancestors", "step", f"N_eff: mean of {_SMOOTHED} steps", log="y")
 
 
 def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_b"),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Of the run.")] = None,
 ) -> None:
     """Repeat paper B's claims as plots, in the circle world."""

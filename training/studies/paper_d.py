@@ -8,7 +8,6 @@ Deviations are measured without alignment: the start pose is the origin.
 from __future__ import annotations
 
 import json
-import os
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,12 +15,16 @@ from typing import Annotated, Any
 
 import typer
 
+from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import PAPER_D
 from slam.formats import atomic_write
 from training.episodes.room_pictures import parse_seeds
-from training.runs.campaign import backend_names, check_settings, installed_version, run_all, write_settings
+from training.figures.tables import markdown_table, number
+from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
 from training.runs.errors import bad_input
-from training.runs.options import Workers
+from training.runs.options import Backends, Seeds, Workers
+from training.runs.rows import resume
+from training.studies.exploring import exploring
 
 __all__ = ["PAPER_MEAN_MAX_M", "run_job", "study", "summarise"]
 
@@ -41,29 +44,16 @@ Row = dict[str, Any]
 
 def run_job(job: Job) -> Row:
     """Explore one map; return the metrics at the end."""
-    import agents
-    from mecanum_env.env import ExploreEnv
-
-    number, backend, seed = job
+    map_number, backend, seed = job
     env = ExploreEnv(
-        robot="cavity", rooms={"name": "corridors", "map": number}, slam=backend, config={"coverage_target": 1.0}
+        robot="cavity",
+        rooms={"name": "corridors", "map": map_number},
+        slam=backend,
+        config={"coverage_target": 1.0},
     )
     # In corridors this narrow what lies round a corner is not seen from afar: look from near by.
-    agent = agents.make(
-        "nearest-frontier",
-        config={"frontiers": {"view_range_m": 1.0}},
-        robot=env.config.robot,
-        lidar=env.config.lidar,
-    )
-    observation, _ = env.reset(seed=seed)
-    agent.reset(env.belief, seed=seed)
-    idle = 0
-    for _ in range(MAX_STEPS):
-        action = agent.act(observation, env.belief)
-        observation, _, terminated, _, _ = env.step(action)
-        idle = idle + 1 if agent.goal is None else 0
-        if terminated or idle > 20:
-            break
+    for _ in exploring(env, seed=seed, steps=MAX_STEPS, config={"frontiers": {"view_range_m": 1.0}}):
+        pass
     metrics = env.episode_metrics()
     return {key: metrics[key] for key in _KEYS}
 
@@ -71,14 +61,14 @@ def run_job(job: Job) -> Row:
 def summarise(rows: dict[Job, Row], backends: Sequence[str]) -> list[Row]:
     """Return one summary per map and backend, over the seeds."""
     out = []
-    for number, (mean_paper, max_paper) in PAPER_MEAN_MAX_M.items():
+    for map_number, (mean_paper, max_paper) in PAPER_MEAN_MAX_M.items():
         for backend in backends:
-            group = [row for (m, b, _), row in sorted(rows.items()) if (m, b) == (number, backend)]
+            group = [row for (m, b, _), row in sorted(rows.items()) if (m, b) == (map_number, backend)]
             means = [row["corner_mean_m"] for row in group if row["corner_mean_m"] is not None]
             most = [row["corner_max_m"] for row in group if row["corner_max_m"] is not None]
             out.append(
                 {
-                    "map": number,
+                    "map": map_number,
                     "slam": backend,
                     "episodes": len(group),
                     "corner_mean_m": statistics.fmean(means) if means else None,
@@ -95,28 +85,25 @@ def summarise(rows: dict[Job, Row], backends: Sequence[str]) -> list[Row]:
 
 
 def _table(summaries: list[Row]) -> str:
-    lines = [
-        "| map | backend | mean deviation: mean, median of the seeds [m] | largest: median, worst seed [m] "
-        "| paper: mean, max [m] | coverage, median | collisions |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = [
+        "map", "backend", "mean deviation: mean, median of the seeds [m]", "largest: median, worst seed [m]",
+        "paper: mean, max [m]", "coverage, median", "collisions",
+    ]  # fmt: skip
+    rows = []
     for s in summaries:
         total, longest = PAPER_D[s["map"]]
-        lines.append(
-            f"| {s['map']} ({total} m, {longest} m) | `{s['slam']}` | {_m(s['corner_mean_m'])}, "
-            f"{_m(s['corner_mean_median_m'])} | {_m(s['corner_max_median_m'])}, {_m(s['corner_max_m'])} "
-            f"| {s['paper_mean_m']}, {s['paper_max_m']} | {s['coverage_median']:.2f} | {s['collisions']} |"
-        )
-    return "\n".join(lines)
-
-
-def _m(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3f}"
+        rows.append([
+            f"{s['map']} ({total} m, {longest} m)", f"`{s['slam']}`",
+            f"{number(s['corner_mean_m'], 3)}, {number(s['corner_mean_median_m'], 3)}",
+            f"{number(s['corner_max_median_m'], 3)}, {number(s['corner_max_m'], 3)}",
+            f"{s['paper_mean_m']}, {s['paper_max_m']}", f"{s['coverage_median']:.2f}", str(s["collisions"]),
+        ])  # fmt: skip
+    return markdown_table(head, rows)
 
 
 def study(
-    slam: Annotated[str, typer.Option(help="SLAM backends.")] = "ekf,invariant-ekf,fastslam1,fastslam2",
-    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")] = "10000:10019",
+    slam: Backends = "ekf,invariant-ekf,fastslam1,fastslam2",
+    seeds: Seeds = "10000:10019",
     workers: Workers = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper-d"),
 ) -> None:
@@ -127,31 +114,8 @@ def study(
         settings = {"version": installed_version(), "max_steps": MAX_STEPS}
         check_settings(out, settings, FILES)
     write_settings(out, settings)
-    store = out / "episodes.jsonl"
-    rows = _read(store)
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
-
-    with store.open("a", encoding="utf-8") as file:
-
-        def keep(job: Job, row: Row) -> None:
-            rows[job] = row
-            file.write(json.dumps([*job, row]) + "\n")
-            file.flush()
-
-        missing = [job for job in jobs if job not in rows]
-        run_all(missing, run_job, workers=workers or os.cpu_count() or 1, keep=keep, what="episodes")
-    summaries = summarise({job: rows[job] for job in jobs}, backends)
+    rows = resume(out / "episodes.jsonl", jobs, run_job, workers=workers, what="episodes")
+    summaries = summarise(rows, backends)
     atomic_write(out / "paper_d.json", json.dumps({**settings, "summaries": summaries}, indent=1) + "\n")
     print(_table(summaries))
-
-
-def _read(store: Path) -> dict[Job, Row]:
-    """Return the rows that are there; a line that was cut off is run again."""
-    rows: dict[Job, Row] = {}
-    for line in store.read_text(encoding="utf-8").splitlines() if store.exists() else ():
-        try:
-            number, backend, seed, row = json.loads(line)
-        except ValueError:
-            continue
-        rows[(number, backend, seed)] = row
-    return rows

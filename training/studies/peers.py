@@ -1,7 +1,7 @@
 """Other simulators under the same load, for ``mecanum speed --peer``: the same walls, beams and step, in turn.
 
-The peer runs in a process of its own (this module, started with ``-m``), which waits while our environment is
-timed and is timed while ours waits: whatever else the machine does slows both alike. It talks in lines of JSON.
+The peer runs in a process of its own, which waits while our environment is timed and is timed while ours waits:
+whatever else the machine does slows both alike.
 
 navground (https://idsia-robotics.github.io/navground) has mecanum kinematics, walls, noisy lidar and odometry,
 and a local grid map; it has neither the dynamics of wheels and motors nor SLAM, and its robot is a disc.
@@ -9,22 +9,21 @@ and a local grid map; it has neither the dynamics of wheels and motors nor SLAM,
 
 from __future__ import annotations
 
+import atexit
 import importlib
-import json
+import multiprocessing
 import os
 import statistics
-import subprocess
-import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
 from slam.settings import unknown_name
+from training.runs.campaign import start_worker
+from training.runs.errors import one_line
 
 if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig
@@ -91,10 +90,8 @@ def peer_setup(config: EnvConfig) -> dict[str, Any]:
     }
 
 
-def compare(
-    peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float], rounds: int = ROUNDS
-) -> dict[str, Any]:
-    """Measure ours and the peer in turn; every round drives all of ``drives``, ours first.
+def compare(peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float]) -> dict[str, Any]:
+    """Measure ours and the peer in turn, :data:`ROUNDS` times; every round drives all of ``drives``, ours first.
 
     Parameters
     ----------
@@ -106,8 +103,6 @@ def compare(
         The rooms, and the steps in each.
     ours : callable
         Drives them once in our environment and returns its complete steps per second.
-    rounds : int
-        How often.
 
     Returns
     -------
@@ -126,7 +121,7 @@ def compare(
     setup = peer_setup(config)
     measured: list[dict[str, float]] = []
     with PeerProcess(setup, drives) as process:
-        for _ in range(rounds):
+        for _ in range(ROUNDS):
             our_rate = ours()
             measured.append({"ours": our_rate, "theirs": process.steps_per_second()})
         ready = process.ready
@@ -160,92 +155,55 @@ class PeerProcess:
     """
 
     def __init__(self, setup: dict[str, Any], drives: Sequence[Drive]) -> None:
-        episodes = [
-            {
-                "seed": drive.seed,
-                "steps": drive.steps,
-                "segments": drive.plan.segments.tolist(),
-                "circles": drive.plan.circles.tolist(),
-                "start": list(drive.plan.start),
-            }
-            for drive in drives
-        ]
-        self._load = {"setup": setup, "episodes": episodes}
+        self._load = setup, drives
 
     def __enter__(self) -> PeerProcess:
-        # The child must find this very package, wherever it was started from.
-        root = str(Path(__file__).resolve().parents[2])
-        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "training.studies.peers"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            text=True,
-            encoding="utf-8",
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        )
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=start_worker)
         try:
-            self.ready = self._ask(self._load)
+            self.ready = self._ask(_get_ready, *self._load)
         except BaseException:
             self.__exit__()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        # It waits for a line and holds nothing worth keeping.
-        self._process.kill()
-        self._process.wait()
-        for stream in (self._process.stdin, self._process.stdout):
-            if stream is not None:
-                with suppress(BrokenPipeError):
-                    stream.close()
-        self._errors.close()
+        self._pool.shutdown()
 
     def steps_per_second(self) -> float:
         """Let the peer drive one round; return its complete steps per second."""
-        answer = self._ask("drive")
+        answer = self._ask(_drive_round)
         return float(answer["steps"] / answer["seconds"])
 
-    def _ask(self, message: object) -> dict[str, Any]:
-        stdin, stdout = self._process.stdin, self._process.stdout
-        assert stdin is not None and stdout is not None
-        with suppress(BrokenPipeError):  # it has ended: the empty answer below tells
-            stdin.write(json.dumps(message) + "\n")
-            stdin.flush()
-        line = stdout.readline()
-        if not line:
-            self._process.wait()
-            self._errors.seek(0)
-            said = [text.strip() for text in self._errors if text.strip()] or ["no message"]
-            raise RuntimeError(f"the peer's process ended with code {self._process.returncode}: {said[-1]}")
-        answer: dict[str, Any] = json.loads(line)
-        return answer
+    def _ask(self, what: Callable[..., dict[str, Any]], *load: Any) -> dict[str, Any]:
+        try:
+            return self._pool.submit(what, *load).result()
+        except Exception as error:
+            raise RuntimeError(f"the peer broke down: {type(error).__name__}: {one_line(error)}") from error
 
 
 # ---- in the peer's process ---------------------------------------------------------------------------------
 
 
-def _navground_env(setup: dict[str, Any], episodes: list[dict[str, Any]]) -> Any:
+def _navground_env(setup: dict[str, Any], drives: Sequence[Drive]) -> Any:
     """Return navground_learning's Gymnasium environment: the rooms by seed, one mecanum robot, its sensors."""
     import gymnasium
 
     core, sim = (importlib.import_module(f"navground.{name}") for name in ("core", "sim"))
     importlib.import_module("navground.learning.env")
     learning = importlib.import_module("navground.learning.config")
-    rooms = {episode["seed"]: episode for episode in episodes}
+    rooms = {drive.seed: drive.plan for drive in drives}
 
     def build(world: Any, seed: int | None) -> None:
-        room = rooms.get(seed, episodes[0])
-        for x1, y1, x2, y2 in room["segments"]:
+        plan = rooms.get(drives[0].seed if seed is None else seed, drives[0].plan)
+        for x1, y1, x2, y2 in plan.segments.tolist():
             world.add_wall(sim.Wall((x1, y1), (x2, y2)))
-        for x, y, radius in room["circles"]:
+        for x, y, radius in plan.circles.tolist():
             world.add_obstacle(sim.Obstacle((x, y), radius))
         kinematics = core.kinematics.FourWheelsOmniDriveKinematics(setup["max_speed_m_s"], setup["lever_m"])
         behavior = core.behaviors.DummyBehavior(kinematics, setup["radius_m"])
         agent = sim.Agent(setup["radius_m"], behavior, kinematics, control_period=setup["step_s"])
-        agent.position, agent.orientation = room["start"][:2], room["start"][2]
+        agent.position, agent.orientation = plan.start[:2], plan.start[2]
         world.add_agent(agent)
 
     scenario = sim.Scenario()
@@ -262,7 +220,7 @@ def _navground_env(setup: dict[str, Any], episodes: list[dict[str, Any]]) -> Any
         time_step=setup["step_s"],
         terminate_if_idle=False,  # with no target to go to, the robot always counts as idle
         include_action=False,  # the action of navground's own controller, which ours has no like of
-        max_episode_steps=max(episode["steps"] for episode in episodes) + 1,
+        max_episode_steps=max(drive.steps for drive in drives) + 1,
     )
 
 
@@ -297,14 +255,14 @@ def _navground_sensors(setup: dict[str, Any]) -> list[dict[str, Any]]:
     return [lidar, odometry, grid_map]  # in the order in which each feeds on those before
 
 
-def _drive(env: Any, episodes: list[dict[str, Any]]) -> dict[str, Any]:
+def _drive(env: Any, drives: Sequence[Drive]) -> dict[str, Any]:
     """Drive every episode with random actions; return the steps and the seconds spent within them."""
     clock = time.perf_counter
     steps, seconds = 0, 0.0
-    for episode in episodes:
-        env.reset(seed=episode["seed"])
-        env.action_space.seed(episode["seed"])
-        for action in [env.action_space.sample() for _ in range(episode["steps"])]:
+    for drive in drives:
+        env.reset(seed=drive.seed)
+        env.action_space.seed(drive.seed)
+        for action in [env.action_space.sample() for _ in range(drive.steps)]:
             start = clock()
             _, _, terminated, truncated, _ = env.step(action)
             seconds += clock() - start
@@ -314,36 +272,22 @@ def _drive(env: Any, episodes: list[dict[str, Any]]) -> dict[str, Any]:
     return {"steps": steps, "seconds": seconds}
 
 
-def _serve(requests: IO[str], answers: IO[str]) -> None:
-    """Answer line by line: first the load, then a round for each further line."""
-    load = json.loads(requests.readline())
-    episodes = load["episodes"]
-    env = _navground_env(load["setup"], episodes)
-    first = episodes[0]
-    observation, _ = env.reset(seed=first["seed"])
+_load: list[Any] = []  # of this process: the environment, and what every round drives
+
+
+def _get_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> dict[str, Any]:
+    """Make the environment and warm it up; return what stands in the first room."""
+    os.dup2(2, 1)  # what libraries print goes to standard error
+    atexit.register(os._exit, 0)  # navground's library may crash while the interpreter takes itself down
+    env, first = _navground_env(setup, drives), drives[0]
+    observation, _ = env.reset(seed=first.seed)
     world = env.unwrapped._world  # no public way to look at what stands in it
-    answer: dict[str, Any] = {
-        "walls": len(world.walls),
-        "discs": len(world.obstacles),
-        "scan": observation["lidar/range"].tolist(),
-    }
-    _drive(env, [first | {"steps": min(_WARM_UP_STEPS, first["steps"])}])
-    print(json.dumps(answer), file=answers, flush=True)
-    for _ in requests:
-        print(json.dumps(_drive(env, episodes)), file=answers, flush=True)
+    scan = observation["lidar/range"].tolist()
+    answer = {"walls": len(world.walls), "discs": len(world.obstacles), "scan": scan}
+    _drive(env, [replace(first, steps=min(_WARM_UP_STEPS, first.steps))])
+    _load[:] = env, drives
+    return answer
 
 
-def _main() -> None:
-    # Answers go to the real standard output; what libraries print there goes to standard error.
-    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)
-    try:
-        _serve(sys.stdin, answers)
-    except BaseException as error:
-        print(f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
-        os._exit(1)
-    os._exit(0)  # navground's library may crash while the interpreter takes itself down
-
-
-if __name__ == "__main__":
-    _main()
+def _drive_round() -> dict[str, Any]:
+    return _drive(*_load)

@@ -19,6 +19,7 @@ from training.episodes import explore
 from training.episodes.recording import Recorder
 from training.episodes.room_pictures import parse_seeds
 from training.runs.errors import Interrupted, bad_input
+from training.runs.options import Seeds
 from training.views.report_page import episode_page
 
 __all__ = ["measure", "study"]
@@ -47,7 +48,7 @@ def measure(options: explore.ExploreOptions) -> dict[str, Any]:
 
 
 def study(
-    seeds: Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")] = "0:9",
+    seeds: Seeds = "0:9",
     agent: Annotated[str, typer.Option(help="Who explores.")] = "nearest-frontier",
     rooms: Annotated[str | None, typer.Option(help="Generator of the rooms.")] = None,
     floor_plan: Annotated[Path | None, typer.Option(metavar="FILE", help="A real plan instead.")] = None,

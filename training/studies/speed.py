@@ -18,6 +18,7 @@ import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
+from training.figures.tables import text_table
 from training.studies import peers
 
 __all__ = ["REPEATS", "measure", "run"]
@@ -90,8 +91,7 @@ class _Stopwatch:
 
 def _record(env: gymnasium.Env[Observation, Any], steps: int, seed: int) -> list[tuple[int, list[Any]]]:
     """Explore until there are ``steps`` actions; return them by episode, with its seed."""
-    inner = env.unwrapped
-    assert isinstance(inner, ExploreEnv)
+    inner = _unwrapped(env)
     agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
     episodes: list[tuple[int, list[Any]]] = []
     total = 0
@@ -114,8 +114,7 @@ def _replay(
     env: gymnasium.Env[Observation, Any], episodes: list[tuple[int, list[Any]]], watch: _Stopwatch | None
 ) -> tuple[list[float], list[int]]:
     """Drive recorded episodes again; return the time of each step [s] and the landmarks at each."""
-    inner = env.unwrapped
-    assert isinstance(inner, ExploreEnv)
+    inner = _unwrapped(env)
     times: list[float] = []
     landmarks: list[int] = []
     clock = time.perf_counter
@@ -142,6 +141,12 @@ def _make_env(rooms: str, slam: str, beams: int) -> gymnasium.Env[Observation, A
     )  # fmt: skip
 
 
+def _unwrapped(env: gymnasium.Env[Observation, Any]) -> ExploreEnv:
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    return inner
+
+
 def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
     """Return ``steps_per_second``, ``stages_us``, ``landmarks_mean``, ``rss_mb`` and ``config``.
 
@@ -163,8 +168,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
     rss_after = _rss_mb()
     watch = _Stopwatch()
     timed, _ = _replay(env, episodes, watch)
-    inner = env.unwrapped
-    assert isinstance(inner, ExploreEnv)
+    inner = _unwrapped(env)
     # Rates of a tenth of the steps each: their median stands up to what else the machine is doing.
     parts = [part for part in np.array_split(np.array(times), 10) if len(part)]
     return {
@@ -188,8 +192,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
 def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
     """Measure ours and a peer in turn, over one exploration's rooms (``training.studies.peers.compare``)."""
     env = _make_env(rooms, slam, beams)
-    inner = env.unwrapped
-    assert isinstance(inner, ExploreEnv)
+    inner = _unwrapped(env)
     episodes = _record(env, min(max(steps // peers.ROUNDS, 1), 20_000), seed)
     drives = []
     for episode_seed, actions in episodes:
@@ -222,9 +225,9 @@ def run(
         f"{result['landmarks_mean']:.0f} landmarks on average; {result['rss_mb_before']:.0f} MB before, "
         f"{result['rss_mb']:.0f} MB after)"
     )
-    print(f"{'stage':<14}{'median µs':>10}{'mean µs':>10}")
-    for name, median in sorted(result["stages_us"].items(), key=lambda item: -item[1]):
-        print(f"{name:<14}{median:>10.1f}{result['stages_us_mean'][name]:>10.1f}")
+    stages = sorted(result["stages_us"].items(), key=lambda item: -item[1])
+    rows = [[name, f"{median:.1f}", f"{result['stages_us_mean'][name]:.1f}"] for name, median in stages]
+    print(text_table(["stage", "median µs", "mean µs"], rows))
     if peer is not None:
         print(_against(result["peer"]))
     return result

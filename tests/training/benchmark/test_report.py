@@ -12,8 +12,7 @@ import pytest
 
 from tests.training.benchmark.test_benchmark import made_up_group
 from training.benchmark.figures import Group
-from training.benchmark.markdown import markdown
-from training.benchmark.output import Report, as_json, table, write_tables
+from training.benchmark.output import Report, as_json, markdown, table, write_tables
 from training.benchmark.report import page, worst_first, write_report
 from training.benchmark.report_charts import band, coverage_chart, extent
 

@@ -115,7 +115,7 @@ def test_peer_that_breaks_down_says_why() -> None:
     del setup["beams"]
     drive = peers.Drive(seed=0, steps=20, plan=rooms.make("rectangular", seed=0))
     with (
-        pytest.raises(RuntimeError, match="ended with code 1: KeyError: 'beams'"),
+        pytest.raises(RuntimeError, match="broke down: KeyError: 'beams'"),
         peers.PeerProcess(setup, [drive]),
     ):
         pass

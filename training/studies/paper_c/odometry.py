@@ -15,16 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
+from mecanum_env.env import ExploreEnv
 from mecanum_env.sensing.odometry_calibration import Drives, drive
 from slam.motion import move
 from slam.odometry.differential_transform import MODELS
 from slam.odometry.filters import OdometryFilter, OdometryFilterConfig
 from slam.types import Odometry
 from training.runs.campaign import run_all
+from training.studies.exploring import exploring
 
 __all__ = [
-    "NOISES", "TEST_SEED", "TRAINING_SEED", "TURN_PROCESS", "accelerating", "best", "drives", "errors", "explore",
-    "filtered", "scan_process", "step_time_us",
+    "NOISES", "PROCESS", "TEST_SEED", "TRAINING_SEED", "TURN_PROCESS", "accelerating", "best", "drives", "errors",
+    "explore", "filtered", "scan_process", "step_time_us",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -37,9 +39,8 @@ FASTER_M_S2 = 0.3  # change of the wheels' speed from which the robot accelerate
 _SHORTEST = 4  # steps of a stretch
 TURN_PROCESS = 10.0  # Q of θ over Q of x and y, as R of θ over R of x and y
 _DRIVE_STEPS = 300
-_PROCESS = {name: np.logspace(-3, 2, 11) for name in MODELS} | {"wiener_acceleration": np.logspace(-1, 5, 13)}
-_BACKEND = "ekf"
-_IDLE_STEPS = 20
+PROCESS = {name: np.logspace(-3, 2, 11) for name in MODELS} | {"wiener_acceleration": np.logspace(-1, 5, 13)}
+"""Model → the Q tried on board."""
 
 
 # ---- drives over an open floor ---------------------------------------------------------------------------------
@@ -97,14 +98,14 @@ def _drift(twists: Array, true: Array, dt: float) -> float:
     return math.hypot(here[0] - there[0], here[1] - there[1])
 
 
-def scan_process(driven: dict[str, Drives], *, models: Sequence[str] = tuple(MODELS)) -> list[Row]:
+def scan_process(driven: dict[str, Drives]) -> list[Row]:
     """Return per noise, model and Q the errors, beside those of the unfiltered odometry (model None)."""
     rows: list[Row] = []
     for noise, one in driven.items():
         stretches = accelerating(one)
         rows.append({"noise": noise, "model": None, "process": None, **errors(one, one.measured, stretches)})
-        for model in models:
-            for q in _PROCESS[model]:
+        for model, tried in PROCESS.items():
+            for q in tried:
                 config = OdometryFilterConfig(
                     model=model, process_linear=float(q), process_turn=float(TURN_PROCESS * q)
                 )
@@ -148,14 +149,14 @@ def step_time_us(driven: Drives, config: OdometryFilterConfig) -> float:
 # ---- in rooms, with a backend that believes what it is given ---------------------------------------------------
 
 
-def explore(*, seed: int, episodes: int, steps: int, workers: int, noises: Sequence[str] = NOISES) -> list[Row]:
+def explore(*, seed: int, episodes: int, steps: int, workers: int) -> list[Row]:
     """Let the EKF explore apartments with and without the filter; return NEES and errors per noise and filter."""
     names = ("none", "differential-transform")
-    jobs = [(noise, name, s, steps) for s in range(seed, seed + episodes) for noise in noises for name in names]
+    jobs = [(noise, name, s, steps) for s in range(seed, seed + episodes) for noise in NOISES for name in names]
     results: dict[Job, Row] = {}
     run_all(jobs, explore_once, workers=workers, keep=results.__setitem__, what="episodes")
     rows = []
-    for noise in noises:
+    for noise in NOISES:
         for name in names:
             group = [results[job] for job in jobs if job[:2] == (noise, name)]
             rows.append({
@@ -171,21 +172,11 @@ def explore(*, seed: int, episodes: int, steps: int, workers: int, noises: Seque
 
 def explore_once(job: Job) -> Row:
     """Explore one apartment by nearest-frontier; return the metrics at the end."""
-    import agents
-    from mecanum_env.env import ExploreEnv
-
     noise, name, seed, steps = job
     env = ExploreEnv(
-        rooms="apartment", slam=_BACKEND, noise=noise, odometry_filter=name, config={"coverage_target": 1.0}
+        rooms="apartment", slam="ekf", noise=noise, odometry_filter=name, config={"coverage_target": 1.0}
     )
-    agent = agents.make("nearest-frontier", robot=env.config.robot, lidar=env.config.lidar)
-    observation, _ = env.reset(seed=seed)
-    agent.reset(env.belief, seed=seed)
-    idle = 0
-    for _ in range(steps):
-        observation, _, terminated, *_ = env.step(agent.act(observation, env.belief))
-        idle = idle + 1 if agent.goal is None else 0
-        if terminated or idle > _IDLE_STEPS:
-            break
+    for _ in exploring(env, seed=seed, steps=steps):
+        pass
     metrics = env.episode_metrics()
     return {key: metrics[key] for key in ("anees", "ate_rmse_m", "final_position_error_m")}

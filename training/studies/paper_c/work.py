@@ -1,25 +1,29 @@
-"""What paper C's filter costs: operations and time against how exact the covariance is, method by method."""
+"""What paper C's filter costs: steps and multiplications against how exact the covariance is, method by method.
+
+Beside the transforms stand SciPy's RK45 and two ways with its matrix exponential: Van Loan's, with the discrete
+filter's update, and that of the Hamiltonian matrix (Davison and Maki), which solves the Riccati equation itself
+while F stays as it is.
+"""
 
 from __future__ import annotations
 
-import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
+from scipy.integrate import RK45, solve_ivp
+from scipy.linalg import expm
 
-from slam.odometry.differential_transform import Model, PowerModel
-from slam.odometry.riccati import Tolerances, Workspace, advance
-from training.studies.paper_c.peers import Counted, as_python, hamiltonian, rk45, van_loan
+from slam.odometry.differential_transform import PowerModel
+from slam.odometry.riccati import Tolerances
+from slam.odometry.transform_filter import KalmanBucyFilter
 
-__all__ = ["METHODS", "Run", "cheapest", "measure", "reference", "relative_deviation", "solve"]
+__all__ = ["METHODS", "Run", "cheapest", "measure", "multiplications", "reference", "relative_deviation", "solve"]
 
 Array = NDArray[np.float64]
-Go = Callable[[Any, Any], int]
 
 METHODS: dict[str, Sequence[float]] = {
     "Padé [3/3]": tuple(10.0**-k for k in range(3, 12)),
@@ -33,8 +37,8 @@ METHODS: dict[str, Sequence[float]] = {
 
 _TRANSFORMS = {"Padé [3/3]": (6, "pade"), "series, 6": (6, "series"), "Padé [6/6]": (12, "pade")}
 _CHECKPOINTS = 20  # at which a run is held against the stiff solver
-_COUNTED_STEPS = 100  # equal steps all cost the same: so many are counted, and scaled
 _ABSOLUTE = 1e-6  # of the relative tolerance [m², …]
+_EXPONENTIAL = 6  # products of matrices that an exponential takes (Higham 2005, the highest fraction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,31 +57,29 @@ class Run:
         """G Q Gᵀ ``(n, n)``."""
         return np.asarray(self.process * np.outer(self.model.drive, self.model.drive))
 
+    def matrix(self, t: float) -> Array:
+        """Return F(t) ``(n, n)``."""
+        return np.asarray(np.einsum("j,jab->ab", t**self.model.powers, self.model.matrices))
+
+    def slope(self, t: float, y: Array) -> Array:
+        """Return η' ``(n²,)`` of η ``(n²,)``."""
+        p = y.reshape(self.cov.shape)
+        moved = self.matrix(t) @ p
+        return np.asarray((moved + moved.T - np.outer(p[:, 0], p[0]) / self.measurement + self.noise).ravel())
+
 
 # ---- how exact -------------------------------------------------------------------------------------------------
 
 
-def reference(run: Run, times: Array, *, method: str = "Radau", relative: float = 1e-12) -> Array:
+def reference(run: Run, times: Array, *, relative: float = 1e-12) -> Array:
     """Return the covariance ``(k, n, n)`` at ``times`` ``(k,)`` by SciPy's stiff solver."""
-    n, noise = run.model.size, run.noise
-
-    def slope(t: float, y: Array) -> Array:
-        p = y.reshape(n, n)
-        moved = _matrix(run.model, t) @ p
-        return np.asarray((moved + moved.T - np.outer(p[:, 0], p[0]) / run.measurement + noise).ravel())
-
     solved = solve_ivp(
-        slope, (run.t0, run.t1), run.cov.ravel(), method=method, t_eval=times, rtol=relative, atol=relative * 1e-5
-    )
+        run.slope, (run.t0, run.t1), run.cov.ravel(), method="Radau", t_eval=times, rtol=relative,
+        atol=relative * 1e-5,
+    )  # fmt: skip
     if not solved.success:
         raise ArithmeticError(f"the stiff solver failed on {run.model.name}: {solved.message}")
-    return np.asarray(solved.y.T.reshape(-1, n, n))
-
-
-def _matrix(model: Model, t: float) -> Array:
-    if not isinstance(model, PowerModel):
-        return model.matrix(t)
-    return np.asarray(sum(m * t**p for m, p in zip(model.matrices, model.powers, strict=True)))
+    return np.asarray(solved.y.T.reshape(-1, *run.cov.shape))
 
 
 def relative_deviation(cov: Array, true: Array) -> Array:
@@ -92,136 +94,100 @@ def relative_deviation(cov: Array, true: Array) -> Array:
 # ---- each method -----------------------------------------------------------------------------------------------
 
 
-def solve(method: str, setting: float, run: Run, *, counted: bool = False, pieces: int = 1) -> Array:
-    """Return the covariance ``(pieces, n, n)`` at the end of each of so many equal pieces.
-
-    With ``counted`` the numbers are :class:`~training.studies.paper_c.peers.Counted` and the kernels run as plain
-    Python.
-    """
-    go, cov = _prepare(method, setting / pieces if setting >= 1 else setting, run, counted)
-    span, out = (run.t1 - run.t0) / pieces, []
-    for k in range(pieces):
-        now = run.t0 + k * span
-        go(Counted(now) if counted else now, Counted(span) if counted else span)
-        out.append([[float(v) for v in row] for row in cov])
-    return np.array(out)
-
-
-def _prepare(method: str, setting: float, run: Run, counted: bool) -> tuple[Go, Array]:
-    """Return what goes on from a time [s] by a span [s], and the covariance ``(n, n)`` that it changes."""
-    prepare = _transform if method in _TRANSFORMS else _runge_kutta if method == "RK45" else _equal_steps
-    return prepare(method, setting, run, counted)
-
-
-def _transform(method: str, setting: float, run: Run, counted: bool) -> tuple[Go, Array]:
-    order, recovery = _TRANSFORMS[method]
-    rules = Tolerances(recovery=recovery, order=order, relative=setting, absolute=_ABSOLUTE * setting)
-    model, kernel, room = run.model, *_kernel(advance, counted, run, order)
-    room.eta[0] = _numbers(run.cov, counted)
-
-    def go(t: Any, span: Any) -> int:
-        return int(kernel(
-            model.powers, model.matrices, run.noise, 1.0 / run.measurement, t, span, room.f, room.eta, room.x,
-            room.z, room.column, rules.relative, rules.absolute, recovery == "pade", room.system, room.below,
-            room.is_fraction,
-        ))  # fmt: skip
-
-    return go, room.eta[0]
+def solve(method: str, setting: float, run: Run, *, pieces: int = 1) -> tuple[Array, int]:
+    """Return the covariance ``(pieces, n, n)`` at the end of each of so many equal pieces, and the steps tried."""
+    ends, cov, out, steps = np.linspace(run.t0, run.t1, pieces + 1).tolist(), run.cov, [], 0
+    if method in _TRANSFORMS:
+        order, recovery = _TRANSFORMS[method]
+        rules = Tolerances(recovery=recovery, order=order, relative=setting, absolute=_ABSOLUTE * setting)
+        kalman = KalmanBucyFilter(run.model, measurement=run.measurement, process=run.process, tolerances=rules)
+        kalman.reset(time=run.t0, cov=cov)
+    for begin, end in pairwise(ends):
+        if method in _TRANSFORMS:
+            kalman.advance(end - begin)
+            cov, steps = kalman.cov, kalman.expansions
+        elif method == "RK45":
+            solved = solve_ivp(
+                run.slope, (begin, end), cov.ravel(), rtol=setting, atol=_ABSOLUTE * setting, t_eval=[end]
+            )
+            # Two evaluations begin a solution; of the seven of a step one is the last step's.
+            cov, steps = solved.y[:, -1].reshape(cov.shape), steps + (solved.nfev - 2) // 6
+        else:
+            count = max(round(setting / pieces), 1)
+            cov, steps = _equal_steps(method, run, begin, end, count, cov), steps + count
+        out.append(cov)
+    return np.array(out), steps
 
 
-def _kernel(kernel: Any, counted: bool, run: Run, order: int) -> tuple[Any, Workspace]:
-    room = Workspace(run.model.size, order, dtype=object if counted else np.float64, estimate=False)
-    return (as_python(kernel) if counted else kernel), room
-
-
-def _runge_kutta(method: str, setting: float, run: Run, counted: bool) -> tuple[Go, Array]:
-    del method
-    n, model = run.model.size, run.model
-    kernel = as_python(rk45) if counted else rk45
-    cov, room = _numbers(run.cov, counted), np.zeros((9, n, n), object if counted else np.float64)
-    step = np.array([1e-3])
-
-    def go(t: Any, span: Any) -> int:
-        return int(kernel(
-            model.powers, model.matrices, run.noise, 1.0 / run.measurement, t, span, cov, setting,
-            _ABSOLUTE * setting, step, room,
-        ))  # fmt: skip
-
-    return go, cov
-
-
-def _equal_steps(method: str, setting: float, run: Run, counted: bool) -> tuple[Go, Array]:
-    n, model, steps = run.model.size, run.model, max(round(setting), 1)
-    compiled = van_loan if method == "Van Loan" else hamiltonian
-    kernel = as_python(compiled) if counted else compiled
-    cov = _numbers(run.cov, counted)
-    room = np.zeros((5, 2 * n, 2 * n), object if counted else np.float64)
-
-    def go(t: Any, span: Any) -> int:
-        kernel(model.powers, model.matrices, run.noise, 1.0 / run.measurement, t, span, steps, cov, room)
-        return steps
-
-    return go, cov
-
-
-def _numbers(values: Array, counted: bool) -> Array:
-    """Return a copy ``(n, n)``, of numbers that count if asked."""
-    out = np.array(values, object if counted else np.float64)
-    if counted:
-        for index, value in np.ndenumerate(values):
-            out[index] = Counted(value)
-    return out
+def _equal_steps(method: str, run: Run, begin: float, end: float, count: int, cov: Array) -> Array:
+    """Go ``count`` equal steps, with F as it is in the middle of each."""
+    n, h = len(cov), (end - begin) / count
+    f = np.array([run.matrix(begin + (k + 0.5) * h) for k in range(count)])
+    a, inverse_r = np.zeros((count, 2 * n, 2 * n)), 1.0 / run.measurement
+    if method == "Van Loan":
+        a[:, :n, :n], a[:, :n, n:], a[:, n:, n:] = -f, run.noise, f.swapaxes(1, 2)
+    else:
+        a[:, :n, :n], a[:, n:, :n], a[:, n:, n:] = -f.swapaxes(1, 2), run.noise, f
+        a[:, 0, n] = inverse_r
+    for e in expm(h * a):
+        if method == "Van Loan":
+            moved = e[n:, n:].T @ (cov @ e[n:, n:] + e[:n, n:])
+            cov = moved - np.outer(moved[:, 0], moved[0]) / (moved[0, 0] + run.measurement / h)
+        else:  # η = (E₂₁ + E₂₂ η)(E₁₁ + E₁₂ η)⁻¹
+            cov = np.linalg.solve((e[:n, :n] + e[:n, n:] @ cov).T, (e[n:, :n] + e[n:, n:] @ cov).T)
+    return cov
 
 
 # ---- what it costs ---------------------------------------------------------------------------------------------
 
 
-def count(method: str, setting: float, run: Run) -> dict[str, float]:
-    """Return how many operations of each kind solving takes; F, step choice and all."""
-    scale = 1.0
-    if method not in _TRANSFORMS and method != "RK45" and setting > _COUNTED_STEPS:
-        scale = setting / _COUNTED_STEPS
-        run = Run(
-            model=run.model, measurement=run.measurement, process=run.process, cov=run.cov, t0=run.t0,
-            t1=run.t0 + (run.t1 - run.t0) / scale,
-        )  # fmt: skip
-        setting = _COUNTED_STEPS
-    Counted.start()
-    solve(method, setting, run, counted=True)
-    return {name: scale * number for name, number in Counted.done.items()}
+def multiplications(method: str, model: PowerModel) -> int:
+    """Return how many multiplications a step takes: the leading terms, without products by F's zeros."""
+    n, entries = model.size, model.size * (model.size + 1) // 2
+    constant, varying = (_products(model.matrices[model.powers == 0.0 if still else model.powers != 0.0])
+                         for still in (True, False))  # fmt: skip
+    if method in _TRANSFORMS:
+        order, recovery = _TRANSFORMS[method]
+        half, discretes = order // 2, order + 1
+        # The convolutions Σ_l η(l) η(k - l) and Σ_l F(l) η(k - l), k = 0 … order; elimination for the fractions.
+        recurrence = discretes * (discretes + 1) // 2 * (entries + varying) + discretes * (constant + 2 * entries)
+        fraction = entries * (half * (half**2 - 1) // 3 + half * (half - 1) // 2)
+        return recurrence + (fraction if recovery == "pade" else 0)
+    if method == "RK45":
+        weights = sum(np.count_nonzero(part) for part in (RK45.A, RK45.B, RK45.E))
+        return int(6 * (constant + varying + 2 * entries) + weights * entries)
+    return int(_EXPONENTIAL * (2 * n) ** 3 + (2 * n**3 if method == "Van Loan" else 10 * n**3 // 3))
 
 
-def measure(run: Run, *, repeats: int) -> list[dict[str, Any]]:
-    """Return per method and setting the deviation, the operations, and the median time of ``repeats`` solutions.
+def _products(matrices: Array) -> int:
+    """Return the products that the upper triangle of F η + η Fᵀ takes; on the diagonal both are the same."""
+    filled = np.count_nonzero(np.any(matrices != 0.0, axis=0), axis=1) if len(matrices) else np.zeros(1, np.intp)
+    return int(len(filled) * filled.sum())
 
-    The deviation is the largest at 20 times; operations and time are those of going to the end at once.
+
+def measure(run: Run) -> list[dict[str, Any]]:
+    """Return per method and setting the deviation, the steps, and the multiplications.
+
+    The deviation is the largest at 20 times; steps and multiplications are those of going to the end at once.
     """
     true = reference(run, np.linspace(run.t0, run.t1, _CHECKPOINTS + 1))[1:]
     rows = []
     for method, settings in METHODS.items():
         for setting in settings:
-            cov = solve(method, setting, run, pieces=_CHECKPOINTS)
-            times, steps = [], 0
-            for _ in range(repeats):
-                go, _ = _prepare(method, setting, run, False)
-                start = time.perf_counter()
-                steps = go(run.t0, run.t1 - run.t0)
-                times.append(time.perf_counter() - start)
-            operations = count(method, setting, run)
+            cov, _ = solve(method, setting, run, pieces=_CHECKPOINTS)
+            _, steps = solve(method, setting, run)
             rows.append({
                 "method": method, "setting": setting, "steps": steps,
                 "deviation": float(relative_deviation(cov, true).max()),
-                "operations": round(sum(operations.values())),
-                **{name: round(number) for name, number in operations.items()},
-                "time_us": 1e6 * statistics.median(times),
+                "multiplications": steps * multiplications(method, run.model),
             })  # fmt: skip
     return rows
 
 
 def cheapest(rows: Sequence[dict[str, Any]], goal: float) -> dict[str, dict[str, Any] | None]:
-    """Return of each method the run of fewest operations that deviates by no more than ``goal``, or None."""
+    """Return of each method the run of fewest multiplications that deviates by no more than ``goal``, or None."""
     out: dict[str, dict[str, Any] | None] = {}
     for method in METHODS:
         good = [row for row in rows if row["method"] == method and row["deviation"] <= goal]
-        out[method] = min(good, key=lambda row: int(row["operations"])) if good else None
+        out[method] = min(good, key=lambda row: int(row["multiplications"])) if good else None
     return out

@@ -1,0 +1,74 @@
+"""Tables as text, and charts whose bytes are the same each time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.figures.charts import chart, label, png
+from training.figures.consistency import consistency_figures
+from training.figures.tables import csv_table, markdown_table, number, text_table
+from training.replay.picture import draw_replay
+from training.runs.errors import BadInput
+from training.runs.options import whole_numbers
+from training.runs.rows import resume
+
+
+def test_columns_line_up() -> None:
+    assert text_table(["who", "n"], [["a", "100"], ["long", "1"]]) == "who     n\na     100\nlong    1"
+    assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
+    assert csv_table([{"a": 1}, {"b": None, "a": "x,y"}], ["c"]) == 'c,a,b\n,1,\n,"x,y",\n'
+    assert number(None, 2) == "–" and number(1.005, 1, "-") == "1.0"
+
+
+def test_a_chart_has_neither_date_nor_version_in_it() -> None:
+    def drawn() -> bytes:
+        figure, panels = chart(2, size=(300, 400))
+        panels[0].plot([1, 2], [3.0, np.nan], label="a")
+        label(panels[0], "σ", "t [s]", "x", log="y")
+        return png(figure)
+
+    assert drawn() == drawn()
+    assert b"tEXt" not in drawn()
+
+
+def test_dead_reckoning_does_not_widen_a_replay_s_picture() -> None:
+    path, far = np.array([[0.0, 0.0], [np.nan, np.nan], [2.0, 1.0]]), np.array([[0.0, 0.0], [1e4, 1e4]])
+    none = np.zeros((0, 2))
+    figure = draw_replay(
+        reference=none, reckoned=far, estimate=path, landmarks=np.array([[1.0, 3.0]]),
+        surveyed=np.full((1, 2), np.nan), title="",
+    )  # fmt: skip
+    left, right, low, high = figure.axes[0].axis()
+    assert -1 < left < 0 and 2 < right < 3 and -1 < low < 0 and 3 < high < 4
+
+
+def test_numbers_of_an_option() -> None:
+    assert whole_numbers("--n", "5, 1,5", low=1, high=10) == [1, 5]
+    for wrong in ("", "0", "11", "a", "1,,2", "-1", "9" * 5000):
+        with pytest.raises(BadInput, match=r"--n .* must be whole numbers in 1 … 10"):
+            whole_numbers("--n", wrong, low=1, high=10)
+
+
+def double(job: tuple[str, int]) -> list[int]:
+    return [2 * job[1]]
+
+
+def test_rows_are_resumed_and_a_line_cut_off_is_done_again(tmp_path: Path) -> None:
+    store = tmp_path / "new" / "rows.jsonl"
+    assert resume(store, [("a", 1), ("a", 2)], double, workers=1) == {("a", 1): [2], ("a", 2): [4]}
+    first, second = store.read_text().splitlines()
+    store.write_text(f"{json.dumps([['b', 3], [7]])}\n{first}\n{second[:9]}")
+    rows = resume(store, [("b", 3), ("a", 2)], double, workers=1)
+    assert rows == {("b", 3): [7], ("a", 2): [4]} and list(rows) == [("b", 3), ("a", 2)]
+    assert resume(store, [("a", 2), ("a", 1)], pytest.fail, workers=1) == {("a", 2): [4], ("a", 1): [2]}
+
+
+def test_runs_that_end_early_leave_the_average_to_the_others() -> None:
+    found = consistency_figures([[3.0, 3.0, 300.0], [3.0, 3.0, 300.0], [3.0]])
+    assert found["nees_over_3_mean"] == pytest.approx((1 + 1 + 100) / 3)
+    assert found["fraction_in_band"] == pytest.approx(2 / 3)
+    assert consistency_figures([[]])["nees_over_3_mean"] is None

@@ -1,0 +1,42 @@
+"""Is the error as large as the covariance says? The pose's NEES over many runs, step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from slam.metrics.measures import anees, nees_band
+
+__all__ = ["consistency_figures", "step_averages"]
+
+Array = NDArray[np.float64]
+
+
+def step_averages(profiles: Sequence[ArrayLike]) -> tuple[Array, Array, Array]:
+    """Return per step the average NEES / 3 over the runs, and the limits of its 95 % band.
+
+    Counted as long as at least half the runs go on; the others' ends would leave the average to a few.
+    """
+    runs = [np.asarray(profile, np.float64) for profile in profiles]
+    steps = int(np.median([len(run) for run in runs]))
+    values = np.full((len(runs), steps), np.nan)
+    for row, run in zip(values, runs, strict=True):
+        row[: len(run)] = run[:steps]
+    going_on = [sum(len(run) > k for run in runs) for k in range(steps)]
+    bands = {count: nees_band(3, count) for count in set(going_on)}
+    low, high = np.array([bands[count] for count in going_on]).reshape(-1, 2).T
+    return anees(values, axis=0), low, high
+
+
+def consistency_figures(profiles: Sequence[ArrayLike]) -> dict[str, Any]:
+    """Return how the average NEES / 3 of runs, each a profile ``(steps,)``, lies in the band of that many runs."""
+    averages, lows, highs = step_averages(profiles)
+    inside = np.count_nonzero((averages >= lows) & (averages <= highs))
+    return {
+        "nees_over_3_mean": float(averages.mean()) if len(averages) else None,
+        "nees_band_95": list(nees_band(3, len(profiles))),
+        "fraction_in_band": float(inside / max(len(averages), 1)),
+    }
