@@ -12,12 +12,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.metrics.chi_square import chi2_quantile
 from slam.types import LINE
 
 __all__ = [
     "IGNORED",
+    "JOINT_GATES",
+    "MAX_OBSERVATIONS",
     "UNMATCHED",
-    "innovation_blocks",
     "joint_compatibility",
     "line_blocks",
     "nearest_neighbour",
@@ -31,18 +33,18 @@ UNMATCHED, IGNORED = -1, -2
 """An observation of something new; one too near to a landmark to be new, yet not surely that landmark."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float, float]:
-    """Write H of landmark ``i`` ``(2, 5)``: by x, y, θ, xi, yi; return the predicted range and bearing.
-
-    theory.md A, observe; ``offset`` is L.
-    """
-    return _point_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), h)
+MAX_OBSERVATIONS = 64
+"""Observations that are taken at once."""
+JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, MAX_OBSERVATIONS + 1)])
+"""Largest squared distance of k pairings together: 99 % of chi-square with 2k degrees of freedom."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array) -> tuple[float, float]:
-    """Do :func:`innovation_blocks` with the heading's cosine and sine, for who asks about many landmarks."""
+    """Write H of landmark ``i`` ``(2, 5)``: by x, y, θ, xi, yi; return the predicted range and bearing.
+
+    theory.md A, observe; ``offset`` is L, ``c`` and ``s`` are the heading's cosine and sine.
+    """
     dx = x[0] + offset * c - x[3 + 2 * i]
     dy = x[1] + offset * s - x[4 + 2 * i]
     rho2 = dx * dx + dy * dy
@@ -78,7 +80,7 @@ def predicted(x: Array, i: int, kind: float, offset: float, h: Array) -> tuple[f
     """Write H of a landmark of a kind ``(2, 5)`` and return what should be seen of it."""
     if kind == LINE:
         return line_blocks(x, i, offset, h)
-    return innovation_blocks(x, i, offset, h)
+    return _point_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), h)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -91,27 +93,35 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance(p: Array, i: int, rho: float, bearing: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from what is predicted of landmark ``i``."""
-    m = 3 + 2 * i
-    # S = H P Hᵀ + R over the five states that H touches, read from the upper triangle.
-    s00, s01, s11 = z[2], z[3], z[4]
-    for a in range(5):
-        ia = a if a < 3 else m + a - 3
-        for b in range(5):
-            ib = b if b < 3 else m + b - 3
-            v = p[ia, ib] if ia <= ib else p[ib, ia]
-            s00 += h[0, a] * v * h[0, b]
-            s01 += h[0, a] * v * h[1, b]
-            s11 += h[1, a] * v * h[1, b]
+    s00, s01, s11 = add_expected(z[2], z[3], z[4], p, i, h)
     dr, db = z[0] - rho, wrap_scalar(z[1] - bearing)
     det = s00 * s11 - s01 * s01
     return float((s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refuse_unlikely(
-    x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64], h: Array
-) -> None:
+def add_expected(
+    s00: float, s01: float, s11: float, p: Array, i: int, h: Array
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return a covariance of range and bearing, R or zeros, plus H P Hᵀ of landmark ``i``.
+
+    Over the five states that H touches, read from the upper triangle.
+    """
+    for a in range(5):
+        ia = a if a < 3 else 2 * i + a
+        for b in range(5):
+            ib = b if b < 3 else 2 * i + b
+            v = p[ia, ib] if ia <= ib else p[ib, ia]
+            s00 += h[0, a] * v * h[0, b]
+            s01 += h[0, a] * v * h[1, b]
+            s11 += h[1, a] * v * h[1, b]
+    return s00, s01, s11
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def refuse_unlikely(x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64]) -> None:
     """Set to IGNORED the matches, given from outside, that lie beyond a squared Mahalanobis distance."""
+    h = np.empty((2, 5))
     for k in range(z.shape[0]):
         if match[k] >= 0 and _gate(x, p, match[k], offset, z[k], h) > gate:
             match[k] = IGNORED
@@ -159,8 +169,8 @@ _FEWEST_SURE = 2  # matches without which a scan takes those, too
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
-    max_turn: float, only_sure: bool, match: NDArray[np.int64], distance: Array, h: Array,
+    x: Array, p: Array, offset: float, z: Array, marks: Array, gate: float, near: float, max_turn: float,
+    only_sure: bool, match: NDArray[np.int64], distance: Array,
 ) -> None:  # fmt: skip
     """Match each observation to the nearest landmark of its kind within the gate, each landmark once.
 
@@ -186,6 +196,7 @@ def nearest_neighbour(
     """
     c, s = math.cos(x[2]), math.sin(x[2])
     spread = math.sqrt(p[0, 0] + p[1, 1])
+    h = np.empty((2, 5))
     for k in range(z.shape[0]):
         match[k] = UNMATCHED
         distance[k] = np.inf
@@ -194,7 +205,7 @@ def nearest_neighbour(
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
         candidates, surface = 0, -1
-        for i in range(landmarks):
+        for i in range(marks.shape[0]):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if z[k, 5] != LINE and (abs(dx) > window or abs(dy) > window):
                 continue
@@ -231,34 +242,27 @@ def nearest_neighbour(
 
 _WALL_WINDOW_M = 1.0  # farther off, a piece of wall is not tested for being a known wall
 _CANDIDATES = 8  # landmarks considered for one observation, the nearest first
+_MOST_NODES = 4000  # the search stops there with the best set so far; it is exponential at worst
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def joint_compatibility(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gates: Array, near: float,
-    max_turn: float, most_nodes: int, match: NDArray[np.int64],
+    x: Array, p: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float,
+    match: NDArray[np.int64],
 ) -> float:  # fmt: skip
     """Match as many observations as one pose can explain together; return their joint squared distance.
 
     Joint compatibility branch and bound (Neira and Tardós 2001): the innovations of all pairings at once, with
     their cross-covariances, must lie within the gate. Among the largest such sets, the nearest one. S is factored
-    row by row as the search goes down, so that a pairing costs its own two rows only.
-
-    Parameters
-    ----------
-    z, marks, near, max_turn, match
-        As in :func:`nearest_neighbour`.
-    gates : Array
-        ``(> m,)`` largest squared Mahalanobis distance of k pairings at index k.
-    most_nodes : int
-        The search stops here with the best set so far; it is exponential at worst.
+    row by row as the search goes down, so that a pairing costs its own two rows only. The arguments are
+    :func:`nearest_neighbour`'s.
     """
     m = z.shape[0]
     candidate, count = np.zeros((m, _CANDIDATES), np.int64), np.zeros(m + 1, np.int64)
     distance = np.zeros((m, _CANDIDATES))
     for k in range(m):
         match[k] = UNMATCHED
-        count[k] = _compatible(x, p, landmarks, offset, z[k], marks, gates[1], max_turn, candidate[k], distance[k])
+        count[k] = _compatible(x, p, offset, z[k], marks, max_turn, candidate[k], distance[k])
     left = np.zeros(m + 1, np.int64)  # observations from k on that any landmark could be
     for k in range(m - 1, -1, -1):
         left[k] = left[k + 1] + (count[k] > 0)
@@ -272,7 +276,7 @@ def joint_compatibility(
     pairs = best_pairs = 0
     best_nis = 0.0
     k = 0
-    for _ in range(most_nodes):
+    for _ in range(_MOST_NODES):
         if paired[k]:  # come back from below
             paired[k] = False
             chosen[k] = UNMATCHED
@@ -296,7 +300,7 @@ def joint_compatibility(
             landmark[pairs] = i
             extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
             more = nis[pairs] + y[2 * pairs] ** 2 + y[2 * pairs + 1] ** 2
-            if more > gates[pairs + 1]:
+            if more > JOINT_GATES[pairs + 1]:
                 continue
             pairs += 1
             nis[pairs] = more
@@ -304,33 +308,41 @@ def joint_compatibility(
             chosen[k] = i
         k += 1
         option[k] = 0
-    _set_aside(x, landmarks, offset, z, marks, near, max_turn, count, match)
+    _set_aside(x, offset, z, marks, near, max_turn, count, match)
     return float(best_nis)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compatible(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, max_turn: float,
-    candidate: NDArray[np.int64], distance: Array,
+    x: Array, p: Array, offset: float, z: Array, marks: Array, max_turn: float, candidate: NDArray[np.int64],
+    distance: Array,
 ) -> int:  # fmt: skip
     """List the landmarks that one observation could be, nearest first; return how many."""
     h = np.zeros((2, 5))
     found = 0
-    for i in range(landmarks):
+    for i in range(marks.shape[0]):
         if not _alike(z, marks[i], x[2], max_turn):
             continue
         if z[5] == LINE and not _beside(x, i, offset, z, marks[i], _WALL_WINDOW_M):
             continue
         d2 = _gate(x, p, i, offset, z, h)
-        if d2 >= gate or (found == _CANDIDATES and d2 >= distance[found - 1]):
-            continue
-        j = found if found < _CANDIDATES else found - 1
-        while j > 0 and distance[j - 1] > d2:
-            candidate[j], distance[j] = candidate[j - 1], distance[j - 1]
-            j -= 1
-        candidate[j], distance[j] = i, d2
-        found = min(found + 1, _CANDIDATES)
+        if d2 < JOINT_GATES[1]:
+            found = insert_nearest(i, d2, candidate, distance, found)
     return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def insert_nearest(i: int, d2: float, nearest: NDArray[np.int64], distance: Array, count: int) -> int:
+    """Put ``i`` into a list, sorted by distance, of the nearest that there is room for; return their number."""
+    most = nearest.shape[0]
+    if count == most and d2 >= distance[most - 1]:
+        return count
+    j = min(count, most - 1)
+    while j > 0 and distance[j - 1] > d2:
+        nearest[j], distance[j] = nearest[j - 1], distance[j - 1]
+        j -= 1
+    nearest[j], distance[j] = i, d2
+    return int(min(count + 1, most))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -373,8 +385,8 @@ def _cross(p: Array, i: int, hi: Array, j: int, hj: Array) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _set_aside(
-    x: Array, landmarks: int, offset: float, z: Array, marks: Array, near: float, max_turn: float,
-    count: NDArray[np.int64], match: NDArray[np.int64],
+    x: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float, count: NDArray[np.int64],
+    match: NDArray[np.int64],
 ) -> None:  # fmt: skip
     """Mark as IGNORED what is unmatched, yet could be a landmark or is too near to one to be new."""
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -387,7 +399,7 @@ def _set_aside(
         bearing = x[2] + z[k, 1]
         px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
-        for i in range(landmarks):
+        for i in range(marks.shape[0]):
             if not _alike(z[k], marks[i], x[2], max_turn):
                 continue
             if _too_near(x, i, offset, z[k], marks[i], near, x[3 + 2 * i] - px, x[4 + 2 * i] - py):

@@ -13,7 +13,8 @@ from slam import Observations, Odometry
 from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
-from slam.landmarks.association import IGNORED, UNMATCHED, innovation_blocks, nearest_neighbour
+from slam.landmarks import association
+from slam.landmarks.association import IGNORED, UNMATCHED, nearest_neighbour
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees, nees_pose
 from slam.motion import move
@@ -45,7 +46,7 @@ def random_state(seed: int, landmarks: int) -> tuple[np.ndarray, np.ndarray, np.
 def test_observation_jacobian_against_finite_differences(seed: int) -> None:
     x, _, _ = random_state(seed, 1)
     h = np.zeros((2, 5))
-    z = innovation_blocks(x, 0, OFFSET, h)
+    z = association.predicted(x, 0, 0.0, OFFSET, h)
     np.testing.assert_allclose(z, predicted(x), atol=1e-12)
     np.testing.assert_allclose(h, numerical_jacobian(predicted, x, angle=1), atol=1e-5)
 
@@ -95,7 +96,7 @@ def test_stacked_update_is_the_textbook_one(seed: int, seen: int, landmarks: int
         z[k, 2:5] = noise[0, 0], noise[0, 1], noise[1, 1]
         match[k] = i
         block = np.zeros((2, 5))
-        innovation_blocks(x, int(i), OFFSET, block)
+        association.predicted(x, int(i), 0.0, OFFSET, block)
         h[2 * k : 2 * k + 2, :3] = block[:, :3]
         h[2 * k : 2 * k + 2, 3 + 2 * i : 5 + 2 * i] = block[:, 3:]
         r[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = noise
@@ -134,9 +135,7 @@ def test_nearest_neighbour_takes_the_right_one_once_and_leaves_new_ones() -> Non
         row(5.0, 3.0, 1.0),
     ])  # fmt: skip
     match, distance = np.zeros(len(z), np.int64), np.zeros(len(z))
-    nearest_neighbour(
-        x, p, 3, OFFSET, z, marks, chi2_quantile(0.997, 2), 0.2, 0.6, False, match, distance, np.zeros((2, 5))
-    )
+    nearest_neighbour(x, p, OFFSET, z, marks, chi2_quantile(0.997, 2), 0.2, 0.6, False, match, distance)
     assert match.tolist() == [0, 1, IGNORED, UNMATCHED, UNMATCHED, IGNORED, UNMATCHED]
     assert distance[0] < distance[2]
 
