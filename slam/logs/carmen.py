@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from slam.geometry import relative
 from slam.logs.laser import check_jumps, check_place, check_stamp, scan_of
-from slam.logs.scans import SETTINGS, ScanLog, chain, rising, without_returns
+from slam.logs.scans import ScanLog, chain, rising, scan_log
 from slam.logs.tables import numbers_of, read_lines
 
-__all__ = ["beam_angles", "read", "read_poses"]
+__all__ = ["read", "read_poses"]
 
 Array = NDArray[np.float64]
 
@@ -55,16 +55,8 @@ def read(path: Path) -> ScanLog:
     offset = np.median(mount, axis=0)
     if np.abs(mount - offset).max() < _MOUNT_VARIES and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M:
         travelled = _moved_by(travelled, offset)
-    times = rising(stamps)
-    measured, reach = without_returns(ranges)
-    angle_min, increment = beam_angles(ranges.shape[1])
-    return ScanLog(
-        name=path.name.split(".")[0], clock_start_s=float(times[0]), times=times - times[0], stamps=stamps,
-        ranges=measured,
-        angle_min=angle_min, angle_increment=increment, range_max=reach, odometry_poses=travelled,
-        start_pose=travelled[0].copy(), reference_times=np.zeros(0), reference_poses=np.zeros((0, 3)),
-        reference_gap_s=30.0, settings=SETTINGS, note="no reference; give one with --reference",
-    )  # fmt: skip
+    note = "no reference; give one with --reference"
+    return scan_log(path, ranges, travelled, times=rising(stamps), stamps=stamps, note=note)
 
 
 def read_poses(path: Path) -> tuple[Array, Array]:
@@ -74,16 +66,6 @@ def read_poses(path: Path) -> tuple[Array, Array]:
     """
     _, poses, _, stamps = _scans(path)
     return stamps, poses[:, :3].copy()
-
-
-def beam_angles(beams: int) -> tuple[float, float]:
-    """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
-
-    180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
-    so, better than with beams centred or spread to 90°, see docs/replay.md). Other numbers span -90° to 90°.
-    """
-    step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
-    return math.radians(-90.0), math.radians(step)
 
 
 def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
