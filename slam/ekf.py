@@ -112,7 +112,11 @@ class EkfSlam(LandmarkBackend):
     def _take(self, z: Array, scan: Scan | None) -> None:
         """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
         match = self._associate(z)
-        loop = self._put_off(z, match)
+        # Old landmarks that one match alone does not make sure are left out at first.
+        sigma, book = self.config.loop_sigma_m, self._book
+        loop = sigma < math.inf and put_off(
+            self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match
+        )
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
         self._correct(z, match)
@@ -163,14 +167,6 @@ class EkfSlam(LandmarkBackend):
             self._max_turn, match,
         )  # fmt: skip
         return match
-
-    def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
-        """Leave out old landmarks that one match alone does not make sure; tell whether there are any."""
-        sigma, book = self.config.loop_sigma_m, self._book
-        if sigma == math.inf:
-            return False
-        x, p, offset = self._x, self._p, self.config.lidar_offset_m
-        return put_off(x, p, offset, z, book.marks, book.now, sigma, match) > 0
 
     def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import relative
-from slam.logs.laser import check_jumps, check_place, check_stamp, scan_of
+from slam.logs.laser import check_jumps, message_of, scan_of
 from slam.logs.scans import ScanLog, chain, rising, scan_log
-from slam.logs.tables import numbers_of, read_lines
+from slam.logs.tables import read_lines
 
 __all__ = ["read", "read_poses"]
 
@@ -83,12 +83,10 @@ def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
         elif kind == ["FLASER"]:
             words = line.split()[1:]
             scan = scan_of(words, kind="FLASER", after=_AFTER_RANGES, earlier=ranges, path=path, line=number)
-            at = numbers_of(
-                words[1 + len(scan) : 8 + len(scan)], path=path, line=number, what="pose or time of FLASER"
-            )
-            check_place(at[:3], path=path, line=number)
-            check_place(at[3:6], path=path, line=number)
-            check_stamp(float(at[6]), path=path, line=number)
+            at = message_of(
+                words[1 + len(scan) : 8 + len(scan)], poses_at=(0, 3), stamp_at=6, path=path, line=number,
+                what="pose or time of FLASER",
+            )  # fmt: skip
             same = before is not None and before[6] == at[6]
             ranges.append(scan)
             poses.append(at[:6])
@@ -107,10 +105,7 @@ def _odom(words: Sequence[str], path: Path, number: int) -> Array:
     if len(words) != 9:
         raise ValueError(f"{path}, line {number}: expected 9 values after ODOM ({_ODOM}), got {len(words)}; "
                          "the line is cut short or damaged")  # fmt: skip
-    values = numbers_of(words[:7], path=path, line=number, what=_ODOM)
-    check_place(values[:3], path=path, line=number)
-    check_stamp(float(values[6]), path=path, line=number)
-    return values
+    return message_of(words[:7], poses_at=(0,), stamp_at=6, path=path, line=number, what=_ODOM)
 
 
 def _moved_by(poses: Array, offset: Array) -> Array:

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.logs.laser import check_jumps, check_place, scan_of
+from slam.logs.laser import check_jumps, message_of, scan_of
 from slam.logs.scans import ScanLog, scan_log
-from slam.logs.tables import numbers_of, read_lines
+from slam.logs.tables import read_lines
 
 __all__ = ["NOMINAL_DT_S", "read"]
 
@@ -54,8 +54,9 @@ def _pairs(path: Path) -> tuple[Array, Array]:
             if len(words) != 3:
                 raise ValueError(f"{path}, line {number}: expected 3 values after Odometry (x y theta), got "
                                  f"{len(words)}; the line is cut short or damaged")  # fmt: skip
-            pose = numbers_of(words, path=path, line=number, what="Odometry x y theta")
-            check_place(pose, path=path, line=number)
+            pose = message_of(
+                words, poses_at=(0,), stamp_at=None, path=path, line=number, what="Odometry x y theta"
+            )
         elif kind == "Laser":
             if pose is None:
                 raise ValueError(
