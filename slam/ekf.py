@@ -18,8 +18,9 @@ from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
-from slam.landmarks.association import MAX_OBSERVATIONS, UNMATCHED, joint_compatibility, refuse_unlikely
+from slam.landmarks.association import UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.measures import nees_pose
 from slam.motion import predict_robot

@@ -20,8 +20,8 @@ from slam.belief import Belief
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.geometry import rotation
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
-from slam.landmarks.association import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.book import DIRECTION, KIND, LandmarkPolicy, count_recent
+from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
 from slam.particles.resampling import (

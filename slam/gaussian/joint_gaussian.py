@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.landmarks.association import insert_nearest
+from slam.landmarks.joint_compatibility import insert_nearest
 from slam.types import LINE
 
 __all__ = [

@@ -16,14 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.landmarks.association import (
-    IGNORED,
-    JOINT_GATES,
-    add_expected,
-    extend,
-    joint_compatibility,
-    predicted,
-)
+from slam.landmarks.association import IGNORED, add_expected, predicted
+from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
 from slam.types import LINE
 
 __all__ = ["agreeing", "put_off"]
@@ -92,7 +86,7 @@ def agreeing(
     """Match old landmarks that are not expected to within ``sigma`` [m] if enough of them agree; return how many.
 
     ``match`` ``(m,)`` is filled. Enough of the pairings must be expected to within ``sigma`` once those before
-    them are taken for true. The other arguments are :func:`slam.landmarks.association.joint_compatibility`'s.
+    them are taken for true. The other arguments are ``joint_compatibility``'s.
     """
     m = z.shape[0]
     match[:] = IGNORED

@@ -20,7 +20,6 @@ from slam.metrics.chi_square import chi2_quantile
 __all__ = [
     "CornerDeviation",
     "MapScore",
-    "RelativeError",
     "align_se2",
     "anees",
     "ate",
@@ -28,15 +27,10 @@ __all__ = [
     "compare_walls",
     "corner_deviation",
     "coverage",
-    "fraction_in_band",
-    "free_space_iou",
     "heading_errors",
-    "nees",
     "nees_band",
     "nees_pose",
     "nees_pose_invariant",
-    "nis",
-    "rpe",
     "time_to",
 ]
 
@@ -45,13 +39,6 @@ Mask = NDArray[np.bool_]
 
 # ---------------------------------------------------------------------------------------------------------
 # Trajectories (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)
-
-
-class RelativeError(NamedTuple):
-    """Root mean square drift over a fixed number of steps."""
-
-    translation_m: float
-    rotation_rad: float
 
 
 def ate(true_poses: ArrayLike, est_poses: ArrayLike) -> float:
@@ -82,19 +69,6 @@ def align_se2(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
     return np.array([*(true_centre - turned), wrap_scalar(angle)])
 
 
-def rpe(true_poses: ArrayLike, est_poses: ArrayLike, *, delta: int = 1) -> RelativeError:
-    """Return the relative pose error over ``delta`` steps of poses ``(n, 3)``, n > delta.
-
-    The motion from pose i to i + delta, in the body frame of pose i, estimated against true: RMS of the
-    difference in translation [m] and in heading [rad].
-    """
-    true, est = _trajectories(true_poses, est_poses, columns=3)
-    if not 1 <= delta < len(true):
-        raise ValueError(f"rpe of {len(true)} poses needs delta in 1 … {len(true) - 1}, got {delta}")
-    translation, rotation = (e - t for t, e in zip(_motions(true, delta), _motions(est, delta), strict=True))
-    return RelativeError(_rms(translation), _rms(wrap(rotation)[:, None]))
-
-
 def heading_errors(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
     """Return estimated minus true heading ``(n,)`` [rad] in [-π, π) of poses ``(n, 3)``."""
     true, est = _trajectories(true_poses, est_poses, columns=3)
@@ -106,12 +80,6 @@ def _trajectories(true_poses: ArrayLike, est_poses: ArrayLike, *, columns: int) 
     if true.ndim != 2 or true.shape != est.shape or len(true) == 0 or true.shape[1] < columns:
         raise ValueError(f"needs two equal arrays of poses (n ≥ 1, {columns}), got {true.shape} and {est.shape}")
     return true, est
-
-
-def _motions(poses: Array, delta: int) -> tuple[Array, Array]:
-    step = poses[delta:] - poses[:-delta]
-    c, s = np.cos(poses[:-delta, 2]), np.sin(poses[:-delta, 2])
-    return np.stack([c * step[:, 0] + s * step[:, 1], c * step[:, 1] - s * step[:, 0]], axis=1), step[:, 2]
 
 
 def _rms(vectors: Array) -> float:
@@ -187,62 +155,6 @@ def nees_pose_invariant(est: Array, cov: Array, true: Array) -> float:
     return _pose_form((a * dx + b * dy) * scale - est[1] * t, (a * dy - b * dx) * scale + est[0] * t, t, cov)
 
 
-@njit(cache=True, nogil=True)
-def _forms(errors: Array, covs: Array) -> Array:
-    """Return eᵀ P⁻¹ e for each row of ``(n, k)`` under ``(n, k, k)``, by L D Lᵀ in one scratch matrix."""
-    n, k = errors.shape
-    out, residual, work = np.zeros(n), np.empty(k), np.empty((k, k))
-    for i in range(n):
-        residual[:] = errors[i]
-        work[:] = covs[i]
-        for j in range(k):
-            pivot, variance = work[j, j], covs[i, j, j]
-            out[i] += _term(residual[j], pivot, variance)
-            if _pivot_vanishes(pivot, variance):
-                continue
-            for r in range(j + 1, k):
-                factor = work[r, j] / pivot
-                residual[r] -= factor * residual[j]
-                for c in range(j + 1, r + 1):
-                    work[r, c] -= factor * work[c, j]
-    return out
-
-
-def nees(error: ArrayLike, cov: ArrayLike) -> Array:
-    """Return the normalised estimation error squared of poses, eᵀ P⁻¹ e: mean 3 for a consistent filter.
-
-    Parameters
-    ----------
-    error, cov : (…, 3), (…, 3, 3)
-        Pose errors [m, m, rad], headings wrapped here, and claimed covariances.
-
-    Returns
-    -------
-    (…,) array, singular covariances as in :func:`nees_pose`.
-    """
-    errors = np.array(error, np.float64)
-    if errors.ndim < 1 or errors.shape[-1] != 3:
-        raise ValueError(f"nees is of pose errors (…, 3), got {errors.shape}")
-    errors[..., 2] = wrap(errors[..., 2])
-    return nis(errors, cov)
-
-
-def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
-    """Return the normalised innovation squared νᵀ S⁻¹ ν: mean k for a consistent filter.
-
-    Parameters
-    ----------
-    innovation, cov : (…, k), (…, k, k)
-        Innovations, bearings already wrapped, and their covariances S.
-    """
-    v, s = np.asarray(innovation, np.float64), np.asarray(cov, np.float64)
-    if v.ndim < 1 or s.shape != (*v.shape, v.shape[-1]):
-        raise ValueError(f"needs vectors (…, k) and covariances (…, k, k), got {v.shape} and {s.shape}")
-    k = v.shape[-1]
-    values: Array = _forms(v.reshape(-1, k), s.reshape(-1, k, k)).reshape(v.shape[:-1])
-    return values
-
-
 def anees(values: ArrayLike, *, dof: int = 3, axis: int | None = None) -> Array:
     """Return the average of NEES (or NIS) values divided by ``dof``: ideal 1, above it overconfident.
 
@@ -264,13 +176,6 @@ def nees_band(dof: int, runs: int, *, confidence: float = 0.95) -> tuple[float, 
     """
     total, tail = dof * runs, 0.5 * (1.0 - confidence)
     return chi2_quantile(tail, total) / total, chi2_quantile(1.0 - tail, total) / total
-
-
-def fraction_in_band(averages: ArrayLike, *, dof: int, runs: int, confidence: float = 0.95) -> float:
-    """Return the share of steps whose Monte-Carlo average (:func:`anees`) lies in :func:`nees_band`."""
-    low, high = nees_band(dof, runs, confidence=confidence)
-    v = np.asarray(averages, np.float64)
-    return float(np.mean((v >= low) & (v <= high))) if v.size else math.nan
 
 
 # ---------------------------------------------------------------------------------------------------------
@@ -331,13 +236,6 @@ def compare_walls(
     believed, walls = int(np.count_nonzero(belief & counted)), int(np.count_nonzero(true & counted))
     # TP + FN is all the true cells.
     return MapScore(_ratio(found, walls + believed - right), _ratio(right, believed), _ratio(found, walls))
-
-
-def free_space_iou(belief_free: Mask, true_free: Mask, *, region: Mask | None = None) -> float:
-    """Return |A ∩ B| / |A ∪ B| of the free cells ``(rows, cols)`` believed and true, within ``region``."""
-    belief, true, counted = _rasters(belief_free, true_free, region)
-    both, either = np.count_nonzero(belief & true & counted), np.count_nonzero((belief | true) & counted)
-    return _ratio(int(both), int(either))
 
 
 def coverage(belief_free: Mask, visible_free: Mask) -> float:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 import slam
 from slam import Observations, Odometry
 from slam.geometry import compose, inverse, wrap
-from slam.landmarks.association import IGNORED, JOINT_GATES, joint_compatibility, nearest_neighbour, predicted
+from slam.landmarks.association import IGNORED, nearest_neighbour, predicted
+from slam.landmarks.joint_compatibility import JOINT_GATES, joint_compatibility
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
