@@ -211,9 +211,7 @@ def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
     return CornerDeviation(float(each.mean()), float(each.max()), each)
 
 
-def compare_walls(
-    belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float, region: Mask | None = None
-) -> MapScore:
+def compare_walls(belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float) -> MapScore:
     """Compare the walls of two rasters on one lattice, forgiving displacements up to a tolerance.
 
     A belief cell is *right* when a true wall cell lies within the tolerance, a true cell *found* when a
@@ -227,20 +225,18 @@ def compare_walls(
         Cells believed, and known, to hold a wall.
     tolerance_cells : float
         Greatest distance [cells] that still counts as a match.
-    region : (rows, cols) bool, optional
-        Cells that are counted, such as what can be seen; matches may lie outside it.
     """
-    belief, true, counted = _rasters(belief_occupied, true_wall, region)
-    right = int(np.count_nonzero(belief & counted & _within(true, tolerance_cells)))
-    found = int(np.count_nonzero(true & counted & _within(belief, tolerance_cells)))
-    believed, walls = int(np.count_nonzero(belief & counted)), int(np.count_nonzero(true & counted))
+    belief, true = _rasters(belief_occupied, true_wall)
+    right = int(np.count_nonzero(belief & _within(true, tolerance_cells)))
+    found = int(np.count_nonzero(true & _within(belief, tolerance_cells)))
+    believed, walls = int(np.count_nonzero(belief)), int(np.count_nonzero(true))
     # TP + FN is all the true cells.
     return MapScore(_ratio(found, walls + believed - right), _ratio(right, believed), _ratio(found, walls))
 
 
 def coverage(belief_free: Mask, visible_free: Mask) -> float:
     """Return the share of the free cells that can be seen which the belief rightly has as free."""
-    belief, visible, _ = _rasters(belief_free, visible_free, None)
+    belief, visible = _rasters(belief_free, visible_free)
     return _ratio(int(np.count_nonzero(belief & visible)), int(np.count_nonzero(visible)))
 
 
@@ -253,12 +249,11 @@ def time_to(coverage_curve: ArrayLike, times: ArrayLike, *, level: float) -> flo
     return float(t[reached[0]]) if len(reached) else None
 
 
-def _rasters(belief: Mask, true: Mask, region: Mask | None) -> tuple[Mask, Mask, Mask]:
+def _rasters(belief: Mask, true: Mask) -> tuple[Mask, Mask]:
     a, b = np.asarray(belief, np.bool_), np.asarray(true, np.bool_)
-    counted = np.ones(a.shape, np.bool_) if region is None else np.asarray(region, np.bool_)
-    if a.ndim != 2 or not a.shape == b.shape == counted.shape:
-        raise ValueError(f"rasters must share one lattice, got {a.shape}, {b.shape} and {counted.shape}")
-    return a, b, counted
+    if a.ndim != 2 or a.shape != b.shape:
+        raise ValueError(f"rasters must share one lattice, got {a.shape} and {b.shape}")
+    return a, b
 
 
 def _within(cells: Mask, tolerance: float) -> Mask:
