@@ -14,7 +14,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 __all__ = [
-    "compose", "exp", "has_moved", "inverse", "log", "relative", "rotation", "transform_points", "wrap", "wrap_scalar",
+    "compose", "exp", "has_moved", "inverse", "log", "relative", "rotation", "transform_points", "wrap",
+    "wrap_scalar",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]

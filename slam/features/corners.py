@@ -153,17 +153,14 @@ def edge(
             return 0
         if faces == 0:
             t = _meets(line, rays[index])
+        px, py = reach * rays[index, 0], reach * rays[index, 1]
+        beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
         if reach > missed + limits[EDGE_JUMP]:
-            px, py = reach * rays[index, 0], reach * rays[index, 1]
             depth = line[NX] * px + line[NY] * py - line[R]
-            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
             if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
                 break  # past the end face, or there is none to see
-        else:
-            px, py = reach * rays[index, 0], reach * rays[index, 1]
-            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
-            if beyond > limits[EDGE_FACE]:
-                return 0  # the surface goes on, a little off the line
+        elif beyond > limits[EDGE_FACE]:
+            return 0  # the surface goes on, a little off the line
         faces += 1
         if faces > 40:
             return 0
