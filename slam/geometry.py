@@ -67,7 +67,7 @@ def relative(poses: Array, seen: Array) -> Array:
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap(seen[:, 2] - poses[:, 2])])
 
 
-def has_moved(before: Pose, now: Pose, *, way_m: float, turn_rad: float) -> bool:
+def has_moved(before: Pose, now: Pose, way_m: float, turn_rad: float) -> bool:
     """Tell whether one pose ``(3,)`` lies at least so far from another, or is turned as much against it."""
     way = math.hypot(now[0] - before[0], now[1] - before[1])
     return way >= way_m or math.cos(now[2] - before[2]) <= math.cos(min(turn_rad, math.pi))

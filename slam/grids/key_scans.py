@@ -59,9 +59,7 @@ class KeyScans:
     def wants(self, x: float, y: float, theta: float) -> bool:
         """Tell whether a scan from this sensor pose should be kept: it has moved on since the last one."""
         config = self.config
-        return not self._scans or has_moved(
-            self._last, (x, y, theta), way_m=config.spacing_m, turn_rad=config.spacing_rad
-        )
+        return not self._scans or has_moved(self._last, (x, y, theta), config.spacing_m, config.spacing_rad)
 
     def keep(
         self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], points: Array

@@ -122,9 +122,7 @@ class ScanOdometry:
 
     def _moved_on(self) -> bool:
         config = self.config
-        return not self._scans or has_moved(
-            self._scans[-1][0], self.pose, way_m=config.spacing_m, turn_rad=config.spacing_rad
-        )
+        return not self._scans or has_moved(self._scans[-1][0], self.pose, config.spacing_m, config.spacing_rad)
 
     def _keep(self, points: Array) -> None:
         self._scans.append((self.pose.copy(), points))
