@@ -13,13 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = [
-    "compose", "exp", "has_moved", "inverse", "log", "relative", "rotation", "transform_points", "wrap",
-    "wrap_scalar",
-]  # fmt: skip
+__all__ = ["compose", "exp", "inverse", "log", "relative", "rotation", "transform_points", "wrap", "wrap_scalar"]
 
 Array = NDArray[np.float64]
-Pose = Array | tuple[float, float, float]
 
 _TWO_PI = 2.0 * math.pi
 
@@ -65,12 +61,6 @@ def relative(poses: Array, seen: Array) -> Array:
     dx, dy = (seen[:, :2] - poses[:, :2]).T
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, wrap(seen[:, 2] - poses[:, 2])])
-
-
-def has_moved(before: Pose, now: Pose, way_m: float, turn_rad: float) -> bool:
-    """Tell whether one pose ``(3,)`` lies at least so far from another, or is turned as much against it."""
-    way = math.hypot(now[0] - before[0], now[1] - before[1])
-    return way >= way_m or math.cos(now[2] - before[2]) <= math.cos(min(turn_rad, math.pi))
 
 
 def exp(twist: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.geometry import has_moved, wrap_scalar
+from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import Scan
 
@@ -47,6 +47,7 @@ class KeyScans:
         self._anchor_local = np.zeros((64, _ANCHORS, 2))  # in the frame of that pose
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
+        self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -58,8 +59,15 @@ class KeyScans:
 
     def wants(self, x: float, y: float, theta: float) -> bool:
         """Tell whether a scan from this sensor pose should be kept: it has moved on since the last one."""
+        n = len(self._scans)
+        if n == 0:
+            return True
+        last_x, last_y, last_theta = self._last
         config = self.config
-        return not self._scans or has_moved(self._last, (x, y, theta), config.spacing_m, config.spacing_rad)
+        return (
+            math.hypot(x - last_x, y - last_y) >= config.spacing_m
+            or math.cos(theta - last_theta) <= self._cos_spacing
+        )
 
     def keep(
         self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], points: Array

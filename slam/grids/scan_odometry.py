@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import has_moved, transform_points
+from slam.geometry import transform_points
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
 from slam.settings import require
@@ -121,8 +121,12 @@ class ScanOdometry:
         self._upper = np.zeros((3, 3))
 
     def _moved_on(self) -> bool:
-        config = self.config
-        return not self._scans or has_moved(self._scans[-1][0], self.pose, config.spacing_m, config.spacing_rad)
+        if not self._scans:
+            return True
+        last, config = self._scans[-1][0], self.config
+        return math.hypot(self.pose[0] - last[0], self.pose[1] - last[1]) >= config.spacing_m or math.cos(
+            self.pose[2] - last[2]
+        ) <= math.cos(min(config.spacing_rad, math.pi))
 
     def _keep(self, points: Array) -> None:
         self._scans.append((self.pose.copy(), points))

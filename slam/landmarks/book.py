@@ -31,7 +31,7 @@ _WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may beco
 # Columns of the tentative ones.
 _X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
 _TENTATIVE = 64
-_NO_BEAMS = np.zeros(0)
+_NO_SCAN = Scan(np.zeros(0), 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,7 +161,7 @@ class LandmarkBook:
         self._now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
-        ranges, first, step = (_NO_BEAMS, 0.0, 1.0) if scan is None else scan[:3]
+        ranges, first, step, _, _ = scan or _NO_SCAN
         count, self._tentative_count, doubtful = _review(
             x, offset, z, match, ranges, first, step, self._now, self.marks, self._tentative,
             self._tentative_count, self._limits, at_once, self._new,
