@@ -113,26 +113,28 @@ class Backend(abc.ABC):
     def belief(self) -> Belief:
         """Everything believed now."""
 
+    # A map may well have no landmarks: what follows is then as it should be.
+
     @property
-    @abc.abstractmethod
     def landmark_count(self) -> int:
         """Number of landmarks in the map."""
+        return 0
 
-    @abc.abstractmethod
     def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
         """Return per landmark how often it was seen ``(n,)`` and its direction [rad] (nan: unknown)."""
+        return np.zeros(0, np.int64), np.zeros(0)
 
-    @abc.abstractmethod
     def near_landmarks(self, out: NDArray[np.float32]) -> None:
         """Write the nearest landmarks in the robot frame, nearest first.
 
         Rows of ``(k, 6)``: x, y [m], σxx, σxy, σyy [m²] of the landmark's own covariance, 1; zeros where
         there are fewer. Nothing exceeds :data:`slam.gaussian.joint_gaussian.OBSERVED_LIMIT`.
         """
+        out[:] = 0.0
 
-    def sensor_pose(self) -> Array:
-        """Return where the sensor is believed to be ``(3,)``."""
-        x, y, theta = self.pose.tolist()
+    def sensor_pose(self, body: Array | None = None) -> Array:
+        """Return where the sensor is ``(3,)`` with the body at a pose ``(3,)``, the believed one if left out."""
+        x, y, theta = (self.pose if body is None else body).tolist()
         offset = self.config.lidar_offset_m
         return np.array([x + offset * math.cos(theta), y + offset * math.sin(theta), theta])
 

@@ -15,7 +15,6 @@ region moves the rows of its landmarks only.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -23,8 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.belief import Belief
-from slam.ekf import EkfConfig, EkfSlam
+from slam.ekf import EkfConfig, EkfSlam, state_rows
 from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import solve
@@ -170,7 +168,7 @@ class CompressedEkfSlam(EkfSlam):
         near |= np.isin(self._map_ids[places], also)
         self._near, self._far = places[near], places[~near]
         self._book.replace(self._map_ids[self._near], marks[near])
-        a, b = _state_rows(self._near, robot=True), _state_rows(self._far, robot=False)
+        a, b = state_rows(self._near, robot=True), state_rows(self._far, robot=False)
         while len(a) + 2 > len(self._x):
             self._enlarge()
         self._n = len(a)
@@ -195,7 +193,7 @@ class CompressedEkfSlam(EkfSlam):
 
     def _write_back(self) -> None:
         """Write the region into the whole map; right after a flush."""
-        a, b = _state_rows(self._near, robot=True), _state_rows(self._far, robot=False)
+        a, b = state_rows(self._near, robot=True), state_rows(self._far, robot=False)
         needed = int(max(a.max(), b.max(initial=0))) + 1
         if needed > len(self._map_x):
             self._enlarge_map(2 * needed + 1)
@@ -213,13 +211,11 @@ class CompressedEkfSlam(EkfSlam):
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
-    @property
-    def joint_cov(self) -> Array:
-        """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, the region's first."""
+    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         self.flush()
         self._write_back()
-        out = np.empty((self._n + 2 * len(self._far),) * 2)
-        rows = np.concatenate([_state_rows(self._near, robot=True), _state_rows(self._far, robot=False)])
+        rows = state_rows(np.concatenate([self._near, self._far])[landmarks], robot=True)
+        out = np.empty((len(rows), len(rows)))
         read_block(self._map_p, rows, out)
         return out
 
@@ -228,53 +224,20 @@ class CompressedEkfSlam(EkfSlam):
         """Number of landmarks in the map."""
         return self._book.count + len(self._far)
 
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
-        """Return per landmark how often it was seen and its direction, in the belief's order."""
-        marks = np.vstack([self._book.marks, self._map_marks[self._far]])
-        marks = marks[marks[:, 0] != LINE]
-        return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
+    @property
+    def _marks(self) -> Array:
+        return np.vstack([self._book.marks, self._map_marks[self._far]])
 
     @property
-    def belief(self) -> Belief:
-        """Pose, landmarks, joint covariance and grid; reading it costs a flush."""
-        joint = self.joint_cov
-        marks = np.vstack([self._book.marks, self._map_marks[self._far]])
-        ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
-        x = self._all_points()
-        rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
-        order = _state_rows(np.concatenate([rows, lines]), robot=True)
-        whole = joint[np.ix_(order, order)]
-        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy()
-        index = 3 + 2 * np.arange(len(rows))
-        cov = np.array([[joint[index + a, index + b] for b in range(2)] for a in range(2)]).transpose(2, 0, 1)
-        near = super().belief
-        return dataclasses.replace(
-            near,
-            landmarks=x[rows],
-            landmark_cov=cov,
-            landmark_ids=ids[rows],
-            landmark_kinds=marks[rows, 0].astype(np.int8),
-            joint_cov=joint,
-            lines=x[lines],
-            line_ends=self._ends_of(x[lines], marks[lines, 6:8]),
-            whole_cov=whole,
-        )
+    def _ids(self) -> NDArray[np.int64]:
+        return np.concatenate([self._book.ids, self._map_ids[self._far]])
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
-        ids = np.concatenate([self._book.ids, self._map_ids[self._far]])
+        """Return every landmark's estimate ``(n, 2)``, the region's first, and which row an id has."""
+        ids = self._ids
         row_of_id = np.full(max(len(self._book.row_of_id), int(ids.max(initial=0)) + 1), -1, np.int64)
         row_of_id[ids] = np.arange(len(ids))
-        return self._all_points(), row_of_id
-
-    def _all_points(self) -> Array:
-        """Return every landmark's estimate ``(n, 2)``, the region's first."""
-        return np.concatenate([self._points, self._map_x[3:].reshape(-1, 2)[self._far]])
-
-
-def _state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
-    """Return the state's indices of landmarks, after the robot's three if wanted."""
-    rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
-    return np.concatenate([np.arange(3), rows]) if robot else rows
+        return np.concatenate([self._points, self._map_x[3:].reshape(-1, 2)[self._far]]), row_of_id
 
 
 def _distance(x: Array, marks: Array, px: float, py: float) -> Array:

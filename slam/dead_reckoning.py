@@ -47,7 +47,7 @@ class OdometrySlam(EkfSlam):
         super()._correct(z, match)
         self._x[:3] = pose
 
-    def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
+    def _out_of_sight(self, recent: int, still: int) -> bool:
         return False  # the pose is not for the scan to doubt
 
     @property

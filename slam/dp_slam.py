@@ -23,7 +23,14 @@ from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
 from slam.particles.grids import ParticleGrids, ScanCells
 from slam.particles.match import ParticleMatcher
 from slam.particles.paths import Paths
-from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.particles.resampling import (
+    ResamplingPolicy,
+    effective_particles,
+    normalise,
+    pose_moments,
+    scattered,
+    systematic,
+)
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import require
 from slam.types import Observations, Odometry, Scan
@@ -81,10 +88,7 @@ class DpSlam(Backend):
         config = self.config
         n = config.particles
         self._rng = np.random.Generator(np.random.PCG64(seed))
-        variances, axes = np.linalg.eigh(pose_cov)
-        spread = axes * np.sqrt(np.maximum(variances, 0.0))
-        self._poses = pose + self._rng.standard_normal((n, 3)) @ spread.T  # (particles, 3) at the last update
-        self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._poses = scattered(pose, pose_cov, n, self._rng)  # (particles, 3) at the last update
         self._log_weights = np.full(n, -math.log(n))
         self._weights = np.full(n, 1.0 / n)
         grids = CopiedGrids if config.copies else SharedGrid
@@ -115,11 +119,11 @@ class DpSlam(Backend):
             self._update_particles(points)
             self._key.append((scan, self.extractor.surface.copy()))
             self._follow_the_lead()
-            self._shown = np.vstack([self._shown, self._sensor(self._poses[self._lead])])
+            self._shown = np.vstack([self._shown, self.sensor_pose(self._poses[self._lead])])
         self._believed = None
         body = compose(self._poses[self._lead], self._motion())
         self.grid.integrate(
-            self._sensor(body), scan, self.extractor.surface,
+            self.sensor_pose(body), scan, self.extractor.surface,
             body=(float(body[0]), float(body[1]), self.config.body_radius_m),
         )  # fmt: skip
 
@@ -203,21 +207,16 @@ class DpSlam(Backend):
 
     # ---- the map that is shown -----------------------------------------------------------------------------
 
-    def _sensor(self, body: Array) -> Array:
-        return compose(body, np.array([self.config.lidar_offset_m, 0.0, 0.0]))
-
     def _follow_the_lead(self) -> None:
         """Redraw the grid where the leading particle took another way than it was drawn from."""
         drawn = self._shown
-        path = np.array([self._sensor(pose) for pose in self._paths.of(self._lead)[: len(drawn)]]).reshape(-1, 3)
+        bodies = self._paths.of(self._lead)[: len(drawn)]
+        path = np.array([self.sensor_pose(body) for body in bodies]).reshape(-1, 3)
         off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
             self.config.key_scans.lever_m
         )
         if len(off) and float(off.max()) > 0.5 * self.grid.resolution:
-            self.grid.clear()
-            for pose, (scan, surface) in zip(path, self._key, strict=False):
-                self.grid.integrate(pose, scan, surface)
-            self.grid.take_changes()  # the revision has gone up: followers start over
+            self.grid.redraw(path, self._key)
             self._shown = path
 
     # ---- the belief ----------------------------------------------------------------------------------------
@@ -251,19 +250,6 @@ class DpSlam(Backend):
     def path(self) -> Array:
         """The leading particle's poses at every update ``(updates, 3)``: the path that its map belongs to."""
         return self._paths.of(self._lead)
-
-    @property
-    def landmark_count(self) -> int:
-        """Always 0."""
-        return 0
-
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
-        """Return empty arrays: there are no landmarks."""
-        return np.zeros(0, np.int64), np.zeros(0)
-
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
-        """Write zeros: there are no landmarks."""
-        out[:] = 0.0
 
     @property
     def belief(self) -> Belief:

@@ -12,33 +12,28 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend, BackendConfig
+from slam.backend import BackendConfig
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
-from slam.landmarks.association import UNMATCHED, joint_compatibility, refuse_unlikely
-from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkBook, LandmarkPolicy, match_and_recall
+from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
+from slam.landmarks.association import UNMATCHED, refuse_unlikely
+from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
-from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
 from slam.types import LINE, Observations, Odometry, Scan
 
-__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
+__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam", "state_rows"]
 
 Array = NDArray[np.float64]
 
 ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
 within the gate; or as many as one pose can explain together (JCBB)."""
-
-_MAX_OBSERVATIONS = 64
-_MOST_NODES = 4000
-_FEWEST_BACK = 2  # landmarks; one alone says nothing about the heading
-# Of k pairings together: 99 % of chi-square with 2k degrees of freedom.
-_JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, _MAX_OBSERVATIONS + 1)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,7 +67,7 @@ class EkfLinesConfig(EkfConfig):
     loop_sigma_m: float = 0.1  # parallel walls stand apart by a few times that
 
 
-class EkfSlam(Backend):
+class EkfSlam(LandmarkBackend):
     """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``."""
 
     config: EkfConfig
@@ -92,13 +87,11 @@ class EkfSlam(Backend):
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
         self._x[:3] = pose
         self._p[:3, :3] = np.triu(pose_cov)
-        self._book = LandmarkBook(self.config.landmarks)
-        self._h, self._w, self._s = work_space(_MAX_OBSERVATIONS, len(self._x))
-        self._match = np.zeros(_MAX_OBSERVATIONS, np.int64)
-        self._distance = np.zeros(_MAX_OBSERVATIONS)
-        self._recall = (0, 0)  # see LandmarkBook.recently_seen
-        self._twist = (0.0, 0.0, 0.0)
-        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
+        self._begin(self.config.landmarks)
+        self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, len(self._x))
+        self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
+        self._distance = np.zeros(MAX_OBSERVATIONS)
+        self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis = 0.0
         self.nis_dof = 0
 
@@ -106,66 +99,49 @@ class EkfSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
-        measured, dt = odometry
-        vx, vy, omega = np.asarray(measured, dtype=np.float64).tolist()
-        twist = vx, vy, omega
-        noise = self._noise
-        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
-        predict_robot(self._x, self._p, self._n, vx, vy, omega, dt, var_v, var_w)
-        self._twist = twist
-        lever = noise.lever_m
-        way = math.hypot(vx, vy, lever * omega) * dt
-        moved, turned = self._unseen_motion
-        self._unseen_motion = moved + way, turned + way / lever
+        vx, vy, omega, var_v, var_w = self._measured(odometry, self._noise)
+        predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
-        z = self._observed(scan)
-        match = self._associate(z)
-        loop = self._put_off(z, match)
-        if self._out_of_sight(match):
-            match = self._allow_for_spinning_wheels(z, match, scan)
-        self._correct(z, match)
-        if loop:
-            self._close_loop(z, match)
-        if self.nis_dof >= 2 * _FEWEST_BACK:
-            self._unseen_motion = (0.0, 0.0)
-        self._manage(z, match, scan)
+        corners = self.extractor.extract(scan)
+        self._take((self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS], scan)
         self._draw(scan)
         if self.key_scans.due():
             self.key_scans.redraw_if_moved(self.grid, *self._map_points())
 
-    def _observed(self, scan: Scan) -> Array:
-        corners = self.extractor.extract(scan)
-        return (self.extractor.with_walls() if self.config.lines else corners)[:_MAX_OBSERVATIONS]
+    def _take(self, z: Array, scan: Scan | None) -> None:
+        """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
+        match = self._associate(z)
+        # Old landmarks that one match alone does not make sure are left out at first.
+        sigma, book = self.config.loop_sigma_m, self._book
+        loop = sigma < math.inf and put_off(
+            self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match
+        )
+        if scan is not None and self._out_of_sight(*self._recall):
+            match = self._allow_for_spinning_wheels(z, match, scan)
+        self._correct(z, match)
+        if loop:
+            self._close_loop(z, match)
+        if scan is not None and self.nis_dof >= 2 * FEWEST_BACK:
+            self._unseen_motion = (0.0, 0.0)
+        self._manage(z, match, scan)
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``).
 
         New ids are added at once; without ids, landmarks are confirmed as with scans.
         """
-        rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
-        cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
-        if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
-            raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-        z = np.zeros((len(rb), 10))
-        z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-        for begin in range(0, len(z), _MAX_OBSERVATIONS):
-            part = z[begin : begin + _MAX_OBSERVATIONS]
+        z = observation_rows(observations)
+        for begin in range(0, len(z), MAX_OBSERVATIONS):
+            part = z[begin : begin + MAX_OBSERVATIONS]
             if observations.ids is None:
-                match = self._associate(part)
-                loop = self._put_off(part, match)
-                self._correct(part, match)
-                if loop:
-                    self._close_loop(part, match)
-                self._manage(part, match, None)
+                self._take(part, None)
                 continue
-            ids = np.asarray(observations.ids)[begin : begin + _MAX_OBSERVATIONS]
+            ids = np.asarray(observations.ids)[begin : begin + MAX_OBSERVATIONS]
             match = np.array([self._book.row(int(i)) for i in ids], np.int64)
             if self.config.known_gate < math.inf:
-                refuse_unlikely(
-                    self._x, self._p, self.config.lidar_offset_m, part, self.config.known_gate, match, self._h[0]
-                )
+                refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, part, self.config.known_gate, match)
             self._correct(part, match)
             self._book.count_sightings(match)
             for k in np.flatnonzero(match == UNMATCHED):
@@ -173,12 +149,12 @@ class EkfSlam(Backend):
                     self._add(part[k], int(ids[k]))
 
     def _associate(self, z: Array) -> NDArray[np.int64]:
-        config = self.config
+        config, book = self.config, self._book
         if config.association == "joint":
             match = self._associate_jointly(z)
-            self._recall = self._book.recently_seen(match)
+            self._recall = count_recent(book.marks, match, book.now)
             return match
-        match, book = self._match[: len(z)], self._book
+        match = self._match[: len(z)]
         self._recall = match_and_recall(
             self._x, self._p, config.lidar_offset_m, z, book.marks, book.now, self._gates,
             config.association == "individual", match, self._distance,
@@ -188,18 +164,10 @@ class EkfSlam(Backend):
     def _associate_jointly(self, z: Array) -> NDArray[np.int64]:
         config, match = self.config, self._match[: len(z)]
         joint_compatibility(
-            self._x, self._p, self._book.count, config.lidar_offset_m, z, self._book.marks, _JOINT_GATES,
-            config.landmarks.new_distance_m, self._max_turn, _MOST_NODES, match,
+            self._x, self._p, config.lidar_offset_m, z, self._book.marks, config.landmarks.new_distance_m,
+            self._max_turn, match,
         )  # fmt: skip
         return match
-
-    def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
-        """Leave out old landmarks that one match alone does not make sure; tell whether there are any."""
-        sigma, book = self.config.loop_sigma_m, self._book
-        if sigma == math.inf:
-            return False
-        x, p, offset = self._x, self._p, self.config.lidar_offset_m
-        return put_off(x, p, offset, z, book.marks, book.now, sigma, match) > 0
 
     def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""
@@ -208,7 +176,7 @@ class EkfSlam(Backend):
         more = np.empty(len(rows), np.int64)
         old = agreeing(
             self._x, self._p, config.lidar_offset_m, z[rows], book.marks, book.now, config.loop_sigma_m,
-            _JOINT_GATES, config.landmarks.new_distance_m, self._max_turn, _MOST_NODES, more,
+            config.landmarks.new_distance_m, self._max_turn, more,
         )  # fmt: skip
         if old == 0:
             return
@@ -218,12 +186,6 @@ class EkfSlam(Backend):
         self._correct(z, closing)
         self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
         match[closing >= 0] = closing[closing >= 0]
-
-    def _out_of_sight(self, match: NDArray[np.int64]) -> bool:
-        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
-        del match  # counted when it was made
-        recent, still = self._recall
-        return recent >= 3 and still < 0.6 * recent
 
     def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
         """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
@@ -245,7 +207,7 @@ class EkfSlam(Backend):
         self._p[2, 2] += turned**2
         match = self._associate_jointly(z)
         found = np.count_nonzero(match >= 0)
-        back = found >= _FEWEST_BACK and found > np.count_nonzero(usual >= 0)
+        back = found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0)
         p_wide = self._p[:3, :3].copy()
         if back and self._fit(z, match, scan) > fit:
             p[:3, :3] = p_wide
@@ -266,11 +228,11 @@ class EkfSlam(Backend):
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
-        book, offset = self._book, self.config.lidar_offset_m
-        if scan is None:
-            new, gone = book.review(self._x, offset, z, match).tolist(), list[int]()
-        else:
-            new, gone = book.review_scan(self._x, offset, z, match, scan)
+        # The first scan is taken at the start, whose pose is known. Landmarks that had to wait for two more would
+        # be placed from where the wheels alone have the robot by then, and pass that on to all that is mapped
+        # later: over apartments with slippery floors it was four fifths of the whole.
+        at_once = scan is not None and self._book.now == 0
+        new, gone = self._book.review(self._x, self.config.lidar_offset_m, z, match, scan, at_once=at_once)
         for k in new:
             self._add(z[k], None)
         for row in gone:
@@ -302,15 +264,11 @@ class EkfSlam(Backend):
         x[: self._n] = self._x[: self._n]
         p[: self._n, : self._n] = self._p[: self._n, : self._n]
         self._x, self._p = x, p
-        self._h, self._w, self._s = work_space(_MAX_OBSERVATIONS, size)
+        self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
         return self._points, self._book.row_of_id
-
-    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        rows = self._book.just_seen()
-        return self._book.ids[rows], self._points[rows]
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
@@ -338,21 +296,19 @@ class EkfSlam(Backend):
     @property
     def joint_cov(self) -> Array:
         """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, walls included."""
-        upper = np.triu(self._p[: self._n, : self._n])
-        return upper + np.triu(upper, 1).T
+        return self._covariance(np.arange(len(self._ids)))
+
+    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
+        """Return the covariance of the robot and some landmarks."""
+        rows = state_rows(landmarks, robot=True)
+        out = np.empty((len(rows), len(rows)))
+        read_block(self._p, rows, out)
+        return out
 
     @property
-    def landmark_count(self) -> int:
-        """Number of confirmed landmarks, walls included."""
-        return self._book.count
-
-    def _point_rows(self) -> NDArray[np.int64]:
-        return np.flatnonzero(self._book.marks[:, 0] != LINE)
-
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
-        """Return per point landmark how often it was seen and its direction in the belief's frame [rad]."""
-        rows = self._point_rows()
-        return self._book.times_seen()[rows], self._book.directions()[rows]
+    def _ids(self) -> NDArray[np.int64]:
+        """Ids ``(n,)`` of every landmark."""
+        return self._book.ids
 
     def near_landmarks(self, out: NDArray[np.float32]) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
@@ -361,12 +317,10 @@ class EkfSlam(Backend):
     @property
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
-        are_lines = self._book.marks[:, 0] == LINE
-        rows, lines = np.flatnonzero(~are_lines), np.flatnonzero(are_lines)
-        marks = np.concatenate([rows, lines])
-        order = np.concatenate([np.arange(3), np.column_stack([3 + 2 * marks, 4 + 2 * marks]).ravel()])
-        whole = np.empty((self._n, self._n))
-        read_block(self._p, order, whole)
+        marks = self._marks
+        rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
+        whole = self._covariance(np.concatenate([rows, lines]))
+        points, _ = self._map_points()
         joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
         index = 3 + 2 * np.arange(len(rows))
         cov = np.empty((len(index), 2, 2))
@@ -376,21 +330,27 @@ class EkfSlam(Backend):
         return Belief(
             pose=self.pose,
             pose_cov=joint[:3, :3].copy(),
-            landmarks=self._points[rows],
+            landmarks=points[rows],
             landmark_cov=cov,
-            landmark_ids=self._book.ids[rows],
+            landmark_ids=self._ids[rows],
             grid=self.grid,
             joint_cov=joint,
-            landmark_kinds=self._book.kinds()[rows],
-            lines=self._points[lines],
-            line_ends=self._ends_of(self._points[lines], self._book.marks[lines, 6:8]),
+            landmark_kinds=marks[rows, 0].astype(np.int8),
+            lines=points[lines],
+            line_ends=_ends_of(points[lines], marks[lines, 6:8]),
             whole_cov=whole,
         )
 
-    @staticmethod
-    def _ends_of(lines: Array, extent: Array) -> Array:
-        """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
-        alpha, r = lines.T
-        n = np.column_stack([np.cos(alpha), np.sin(alpha)])
-        along = np.column_stack([-n[:, 1], n[:, 0]])
-        return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])
+
+def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
+    """Return the state's indices of landmarks, after the robot's three if wanted."""
+    rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
+    return np.concatenate([np.arange(3), rows]) if robot else rows
+
+
+def _ends_of(lines: Array, extent: Array) -> Array:
+    """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
+    alpha, r = lines.T
+    n = np.column_stack([np.cos(alpha), np.sin(alpha)])
+    along = np.column_stack([-n[:, 1], n[:, 0]])
+    return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

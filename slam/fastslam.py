@@ -15,16 +15,23 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend, BackendConfig
+from slam.backend import BackendConfig
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
-from slam.geometry import compose, rotation, wrap
-from slam.landmarks.association import joint_compatibility
-from slam.landmarks.book import DIRECTION, KIND, LandmarkBook, LandmarkPolicy
-from slam.metrics.chi_square import chi2_quantile
+from slam.geometry import rotation
+from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
+from slam.landmarks.book import DIRECTION, KIND, LandmarkPolicy, count_recent
+from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
-from slam.particles.resampling import ResamplingPolicy, effective_particles, normalise, pose_moments, systematic
+from slam.particles.resampling import (
+    ResamplingPolicy,
+    effective_particles,
+    normalise,
+    pose_moments,
+    scattered,
+    systematic,
+)
 from slam.settings import require
 from slam.types import Observations, Odometry, Scan
 
@@ -32,13 +39,6 @@ __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-_MAX_OBSERVATIONS = 64  # of a scan
-_MOST_NODES = 4000
-_FEWEST_BACK = 2  # landmarks; one alone says nothing about the heading
-# Of k pairings together: 99 % of chi-square with 2k degrees of freedom.
-_JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, _MAX_OBSERVATIONS + 1)])
-_LOG_2PI = math.log(2.0 * math.pi)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class FastSlamConfig(BackendConfig):
         require(self.unexplained >= 0, "FastSlamConfig.unexplained must be ≥ 0")
 
 
-class FastSlam(Backend):
+class FastSlam(LandmarkBackend):
     """What both versions share.
 
     ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. The
@@ -78,21 +78,16 @@ class FastSlam(Backend):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         n = self.config.particles
         self._rng = np.random.Generator(np.random.PCG64(seed))
-        variances, axes = np.linalg.eigh(pose_cov)
-        spread = axes * np.sqrt(np.maximum(variances, 0.0))
-        self._poses = pose + self._rng.standard_normal((n, 3)) @ spread.T  # (particles, 3)
-        self._poses[:, 2] = wrap(self._poses[:, 2])
+        self._poses = scattered(pose, pose_cov, n, self._rng)  # (particles, 3)
         self._covs = np.zeros((n, 3, 3))  # of the motion since the pose was last drawn; upper triangles
         self._log_weights = np.full(n, -math.log(n))
         self._weights = np.full(n, 1.0 / n)
         self._origin = np.arange(n)  # the particle of the start that each one descends from
         self._maps = ParticleMaps(n)
-        self._book = LandmarkBook(self.config.landmarks)
-        self._match = np.zeros((n, _MAX_OBSERVATIONS), np.int64)
+        self._begin(self.config.landmarks)
+        self._match = np.zeros((n, MAX_OBSERVATIONS), np.int64)
         self._ancestors = np.zeros(n, np.int64)
         self._updates = 0  # since the last resampling
-        self._twist = (0.0, 0.0, 0.0)
-        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
         self.n_eff = float(n)
         self.resampled = False
         self._believe()
@@ -101,14 +96,8 @@ class FastSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move every particle on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
-        noise, dt = self.config.odometry, odometry.dt
-        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
-        self._move(np.array(twist), dt, var_v, var_w)
-        self._twist = twist
-        way = math.hypot(vx, vy, noise.lever_m * omega) * dt
-        moved, turned = self._unseen_motion
-        self._unseen_motion = (moved + way, turned + way / noise.lever_m)
+        vx, vy, omega, var_v, var_w = self._measured(odometry, self.config.odometry)
+        self._move(np.array([vx, vy, omega]), odometry.dt, var_v, var_w)
         self._believe()
 
     @abc.abstractmethod
@@ -117,11 +106,11 @@ class FastSlam(Backend):
 
     def update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
-        z = self.extractor.extract(scan)[:_MAX_OBSERVATIONS]
+        z = self.extractor.extract(scan)[:MAX_OBSERVATIONS]
         match, leader = self._associate(z)
-        if self._out_of_sight(match[leader]):
+        if self._out_of_sight(*count_recent(self._book.marks, match[leader], self._book.now)):
             self._allow_for_spinning_wheels(z, match, leader, scan)
-        if np.count_nonzero(match[leader] >= 0) >= _FEWEST_BACK:
+        if np.count_nonzero(match[leader] >= 0) >= FEWEST_BACK:
             self._unseen_motion = (0.0, 0.0)
         best = self._correct(z, match)
         self._manage(z, match[best], best, scan)
@@ -133,12 +122,7 @@ class FastSlam(Backend):
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed, and new ones added."""
-        rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
-        cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
-        if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
-            raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-        z = np.zeros((len(rb), 8))
-        z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+        z = observation_rows(observations)
         if observations.ids is None:
             match, _ = self._associate(z)
             best = self._correct(z, match)
@@ -205,11 +189,6 @@ class FastSlam(Backend):
 
     # ---- wheels that turn in vain --------------------------------------------------------------------------
 
-    def _out_of_sight(self, match: Indices) -> bool:
-        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
-        recent, still = self._book.recently_seen(match)
-        return recent >= 3 and still < 0.6 * recent
-
     def _allow_for_spinning_wheels(self, z: Array, match: Indices, leader: int, scan: Scan) -> None:
         """Associate anew as though the wheels had turned in vain, where one pose then explains more.
 
@@ -226,11 +205,11 @@ class FastSlam(Backend):
         p[index, index], p[index, index + 1], p[index + 1, index + 1] = landmarks[:, 2:].T
         found = np.zeros(len(z), np.int64)
         joint_compatibility(
-            x, p, n, config.lidar_offset_m, z, self._book.marks, _JOINT_GATES, policy.new_distance_m,
-            math.radians(config.max_turn_deg), _MOST_NODES, found,
+            x, p, config.lidar_offset_m, z, self._book.marks, policy.new_distance_m,
+            math.radians(config.max_turn_deg), found,
         )  # fmt: skip
         count = np.count_nonzero(found >= 0)
-        if count < _FEWEST_BACK or count <= np.count_nonzero(match[leader] >= 0):
+        if count < FEWEST_BACK or count <= np.count_nonzero(match[leader] >= 0):
             return
         usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
         if self._fit(pose, cov + wide, landmarks, z, found, scan) > usual_fit:
@@ -241,7 +220,7 @@ class FastSlam(Backend):
         """Correct a particle's pose by a match; return how well the scan fits the map from there."""
         pose, offset = pose.copy(), self.config.lidar_offset_m
         narrow(pose, cov.copy(), landmarks, np.arange(len(landmarks)), z, match, offset, 0.0)
-        return self.grid.agreement(compose(pose, np.array([offset, 0.0, 0.0])), scan)
+        return self.grid.agreement(self.sensor_pose(pose), scan)
 
     # ---- the book of landmarks -----------------------------------------------------------------------------
 
@@ -251,21 +230,16 @@ class FastSlam(Backend):
         So a row is the same landmark in every particle, which has it where it saw it from its own pose.
         """
         x = np.concatenate([self._poses[best], self._maps.of(best)[:, :2].ravel()])
-        for k in self._book.review(x, self.config.lidar_offset_m, z, match):
+        new, gone = self._book.review(x, self.config.lidar_offset_m, z, match, scan)
+        for k in new:
             self._add(z[k], best, None)
-        if scan is not None:
-            x = np.concatenate([self._poses[best], self._maps.of(best)[:, :2].ravel()])
-            for row in self._book.contradicted(x, self.config.lidar_offset_m, scan):
-                self._maps.drop(row)
-                self._book.drop(row)
+        for row in gone:
+            self._maps.drop(row)
+            self._book.drop(row)
 
     def _add(self, z: Array, best: int, known_id: int | None) -> None:
         self._book.add(float(z[KIND]), float(z[DIRECTION]) + float(self._poses[best, 2]), known_id)
         self._maps.add(self._poses, z, self.config.lidar_offset_m)
-
-    def _landmarks_in_view(self) -> tuple[Indices, Array]:
-        rows = self._book.just_seen()
-        return self._book.ids[rows], self._points[rows]
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
@@ -303,15 +277,6 @@ class FastSlam(Backend):
         """Pose covariance ``(3, 3)``."""
         return self._cov.copy()
 
-    @property
-    def landmark_count(self) -> int:
-        """Number of confirmed landmarks."""
-        return self._book.count
-
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
-        """Return per landmark how often it was seen and its direction in the belief's frame [rad]."""
-        return self._book.times_seen(), self._book.directions()
-
     def near_landmarks(self, out: NDArray[np.float32]) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
         points, covs = self._landmark_moments()
@@ -336,7 +301,7 @@ class FastSlam(Backend):
             landmark_cov=cov.copy(),
             landmark_ids=self._book.ids.copy(),
             grid=self.grid,
-            landmark_kinds=self._book.kinds(),
+            landmark_kinds=self._marks[:, 0].astype(np.int8),
         )
 
 

@@ -49,9 +49,7 @@ class OdometryNoise:
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: float = 0.6  # of the change beyond that
-    lasting: LastingErrors | None = (
-        None  # what of it invariant-ekf takes for states: see slam.gaussian.wheel_errors
-    )
+    lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
@@ -111,12 +109,8 @@ def twist_between(pose: Array, after: Array, dt: float) -> Array:
     """
     turn = wrap_scalar(float(after[2]) - float(pose[2]))
     middle = float(pose[2]) + 0.5 * turn
-    dx, dy, c, s = (
-        float(after[0]) - float(pose[0]),
-        float(after[1]) - float(pose[1]),
-        math.cos(middle),
-        math.sin(middle),
-    )
+    dx, dy = float(after[0]) - float(pose[0]), float(after[1]) - float(pose[1])
+    c, s = math.cos(middle), math.sin(middle)
     return np.array([c * dx + s * dy, c * dy - s * dx, turn]) / dt
 
 

@@ -1,4 +1,4 @@
-"""Straight surfaces → the corners where they meet or visibly end, with covariances from the fits (kernels)."""
+"""Straight surfaces → the corners where they meet or visibly end, and walls, as rows of observations (kernels)."""
 
 from __future__ import annotations
 
@@ -34,9 +34,11 @@ from slam.features.surfaces import (
     VAR_SLOPE,
     R,
 )
-from slam.types import CONCAVE, CONVEX
+from slam.types import CONCAVE, CONVEX, LINE
 
 Array = NDArray[np.float64]
+
+_LOOSE_M = 0.02
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -151,17 +153,14 @@ def edge(
             return 0
         if faces == 0:
             t = _meets(line, rays[index])
+        px, py = reach * rays[index, 0], reach * rays[index, 1]
+        beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
         if reach > missed + limits[EDGE_JUMP]:
-            px, py = reach * rays[index, 0], reach * rays[index, 1]
             depth = line[NX] * px + line[NY] * py - line[R]
-            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
             if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
                 break  # past the end face, or there is none to see
-        else:
-            px, py = reach * rays[index, 0], reach * rays[index, 1]
-            beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
-            if beyond > limits[EDGE_FACE]:
-                return 0  # the surface goes on, a little off the line
+        elif beyond > limits[EDGE_FACE]:
+            return 0  # the surface goes on, a little off the line
         faces += 1
         if faces > 40:
             return 0
@@ -183,3 +182,51 @@ def edge(
         CONVEX, direction, 1, corner,
     )  # fmt: skip
     return 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def walls_first(
+    lines: Array, corners: Array, length: float, points: float, sigma_r: float, sigma_alpha: float, out: Array
+) -> int:
+    """Write the rows of :meth:`FeatureExtractor.with_walls`; return their number."""
+    count = 0
+    for k in range(lines.shape[0]):
+        line, row = lines[k], out[count]
+        if not _is_wall(line, length, points):
+            continue
+        middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
+        # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
+        row[0], row[1] = line[R], math.atan2(line[NY], line[NX])
+        row[2] = line[VAR_OFFSET] + middle * middle * line[VAR_SLOPE] + sigma_r**2
+        row[3] = middle * line[VAR_SLOPE]
+        row[4] = line[VAR_SLOPE] + sigma_alpha**2
+        row[5], row[6], row[7] = LINE, row[1], 0.0
+        row[8], row[9] = middle + line[T0], middle + line[T1]
+        count += 1
+    for k in range(corners.shape[0]):
+        row = out[count]
+        row[:] = corners[k]
+        one, two = int(corners[k, 8]), int(corners[k, 9])
+        first = _is_wall(lines[one], length, points)
+        second = two >= 0 and _is_wall(lines[two], length, points)
+        if first and second:
+            continue
+        if first or second:
+            _loosen(row, lines[one if first else two])
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _is_wall(line: Array, length: float, points: float) -> bool:
+    return bool(line[T1] - line[T0] >= length and line[POINTS] >= points)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _loosen(row: Array, line: Array) -> None:
+    """Add to a corner's covariance across a wall: that much of it the wall's own row says."""
+    ux, uy = math.cos(row[1]), math.sin(row[1])
+    across, turned = line[NX] * ux + line[NY] * uy, (line[NY] * ux - line[NX] * uy) / row[0]
+    row[2] += _LOOSE_M**2 * across * across
+    row[3] += _LOOSE_M**2 * across * turned
+    row[4] += _LOOSE_M**2 * turned * turned

@@ -15,35 +15,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.features.corners import all_on, edge, meet
-from slam.features.surfaces import (
-    ENDS,
-    FIRST,
-    LAST,
-    MAX_LINES,
-    MAX_STEP,
-    MX,
-    MY,
-    NX,
-    NY,
-    POINTS,
-    T0,
-    T1,
-    VAR_OFFSET,
-    VAR_SLOPE,
-    R,
-    fit,
-    points_in_order,
-    split,
-)
+from slam.features.corners import all_on, edge, meet, walls_first
+from slam.features.surfaces import ENDS, FIRST, LAST, MAX_LINES, MAX_STEP, fit, points_in_order, split
 from slam.settings import require
-from slam.types import LINE, Scan
+from slam.types import Scan
 
-__all__ = ["Corners", "FeatureConfig", "FeatureExtractor", "Lines"]
+__all__ = ["FeatureConfig", "FeatureExtractor"]
 
 Array = NDArray[np.float64]
-
-_LOOSE_M = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,25 +64,6 @@ class FeatureConfig:
         require(self.wall_sigma_m > 0 and self.wall_sigma_rad > 0, "FeatureConfig.wall_sigma_* must be > 0")
 
 
-@dataclass(frozen=True, slots=True)
-class Corners:
-    """Corner points of one scan, in the sensor frame."""
-
-    range_bearing: Array  # (m, 2) range [m], bearing [rad]
-    cov: Array  # (m, 2, 2) [m², m·rad, rad²]
-    kind: NDArray[np.int8]  # (m,) CONVEX or CONCAVE
-    direction: Array  # (m,) bearing of the bisector that points into free space [rad]
-
-
-@dataclass(frozen=True, slots=True)
-class Lines:
-    """Straight surfaces of one scan, in the sensor frame, in order of bearing."""
-
-    hesse: Array  # (k, 2) α [rad], r [m]: the points with x cos α + y sin α = r, r ≥ 0
-    ends: Array  # (k, 4) x1, y1, x2, y2: feet of the first and last point on the line [m]
-    points: NDArray[np.int64]  # (k,) number of points fitted
-
-
 class FeatureExtractor:
     """Extracts corners and lines from scans; holds the buffers, so that no scan allocates in the kernel.
 
@@ -133,7 +93,6 @@ class FeatureExtractor:
 
         Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and 1 for the visible
         end of a surface, 0 for a meeting of two; then the surfaces' numbers, -1 for none.
-        :meth:`corners` and :meth:`lines` give the same as named arrays.
         """
         n = len(scan.ranges)
         key = (n, scan.angle_min, scan.angle_increment)
@@ -161,7 +120,7 @@ class FeatureExtractor:
         it.
         """
         c = self.config
-        count = _walls_first(
+        count = walls_first(
             self._lines[: self._line_count], self._corners[: self._corner_count], c.wall_length_m, c.wall_points,
             c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
         )  # fmt: skip
@@ -178,29 +137,6 @@ class FeatureExtractor:
         # Neighbours as far apart as the flattest incidence never belong together: nothing is that near.
         share = np.where(rest > 0, np.sin(angles) / np.sin(np.maximum(rest, 1e-6)), -np.inf)
         return np.column_stack([share, 2.0 - 2.0 * np.cos(angles)])
-
-    def corners(self) -> Corners:
-        """Return the corners of the last scan as named arrays."""
-        rows = self._corners[: self._corner_count].copy()
-        cov = np.empty((len(rows), 2, 2))
-        cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0], cov[:, 1, 1] = (
-            rows[:, 2],
-            rows[:, 3],
-            rows[:, 3],
-            rows[:, 4],
-        )
-        return Corners(rows[:, :2], cov, rows[:, 5].astype(np.int8), rows[:, 6])
-
-    def lines(self) -> Lines:
-        """Return the straight surfaces of the last scan as named arrays."""
-        rows = self._lines[: self._line_count]
-        nx, ny, r = rows[:, NX], rows[:, NY], rows[:, R]
-        hesse = np.column_stack([np.arctan2(ny, nx), r])
-        # A point of the line at distance t along its direction from the centroid.
-        centre, t0, t1 = rows[:, [MX, MY]], rows[:, [T0]], rows[:, [T1]]
-        along = np.column_stack([-ny, nx])
-        ends = np.hstack([centre + t0 * along, centre + t1 * along])
-        return Lines(hesse, ends, rows[:, POINTS].astype(np.int64))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -250,51 +186,3 @@ def _extract(
                     lines[k], side, ranges, rays, increment, range_max, limits, corners[corner_count]
                 )
     return line_count, corner_count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _walls_first(
-    lines: Array, corners: Array, length: float, points: float, sigma_r: float, sigma_alpha: float, out: Array
-) -> int:
-    """Write the rows of :meth:`FeatureExtractor.with_walls`; return their number."""
-    count = 0
-    for k in range(lines.shape[0]):
-        line, row = lines[k], out[count]
-        if not _is_wall(line, length, points):
-            continue
-        middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
-        # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
-        row[0], row[1] = line[R], math.atan2(line[NY], line[NX])
-        row[2] = line[VAR_OFFSET] + middle * middle * line[VAR_SLOPE] + sigma_r**2
-        row[3] = middle * line[VAR_SLOPE]
-        row[4] = line[VAR_SLOPE] + sigma_alpha**2
-        row[5], row[6], row[7] = LINE, row[1], 0.0
-        row[8], row[9] = middle + line[T0], middle + line[T1]
-        count += 1
-    for k in range(corners.shape[0]):
-        row = out[count]
-        row[:] = corners[k]
-        one, two = int(corners[k, 8]), int(corners[k, 9])
-        first = _is_wall(lines[one], length, points)
-        second = two >= 0 and _is_wall(lines[two], length, points)
-        if first and second:
-            continue
-        if first or second:
-            _loosen(row, lines[one if first else two])
-        count += 1
-    return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _is_wall(line: Array, length: float, points: float) -> bool:
-    return bool(line[T1] - line[T0] >= length and line[POINTS] >= points)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _loosen(row: Array, line: Array) -> None:
-    """Add to a corner's covariance across a wall: that much of it the wall's own row says."""
-    ux, uy = math.cos(row[1]), math.sin(row[1])
-    across, turned = line[NX] * ux + line[NY] * uy, (line[NY] * ux - line[NX] * uy) / row[0]
-    row[2] += _LOOSE_M**2 * across * across
-    row[3] += _LOOSE_M**2 * across * turned
-    row[4] += _LOOSE_M**2 * turned * turned

@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.landmarks.joint_compatibility import insert_nearest
 from slam.types import LINE
 
 __all__ = [
@@ -127,25 +128,16 @@ def read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -> None:
-    """Write the nearest point landmarks in the robot frame, by insertion into a list sorted by distance."""
+    """Write the nearest point landmarks in the robot frame, nearest first."""
     out[:] = 0.0
     c, s = math.cos(x[2]), math.sin(x[2])
-    size = out.shape[0]
-    nearest, distance = np.empty(size, np.int64), np.empty(size)
+    nearest, distance = np.empty(out.shape[0], np.int64), np.empty(out.shape[0])
     filled = 0
     for i in range(marks.shape[0]):
         if marks[i, 0] == LINE:
             continue
         dx, dy = x[3 + 2 * i] - x[0], x[4 + 2 * i] - x[1]
-        d2 = dx * dx + dy * dy
-        j = filled if filled < size else size - 1
-        if filled == size and d2 >= distance[j]:
-            continue
-        while j > 0 and distance[j - 1] > d2:
-            nearest[j], distance[j] = nearest[j - 1], distance[j - 1]
-            j -= 1
-        nearest[j], distance[j] = i, d2
-        filled = min(filled + 1, size)
+        filled = insert_nearest(i, dx * dx + dy * dy, nearest, distance, filled)
     for j in range(filled):
         k = 3 + 2 * nearest[j]
         dx, dy = x[k] - x[0], x[k + 1] - x[1]

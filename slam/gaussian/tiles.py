@@ -58,16 +58,7 @@ def downdate(p: Array, n: int, left: Array, right: Array, rows: int, pairs: int)
     """
     whole = n - n % _HEIGHT
     for i in range(0, whole, _HEIGHT):
-        j = i - i % LANES
-        while j + _WIDTH <= n:
-            _tile(p, i, j, left, right, rows, pairs, None, None, None)
-            j += _WIDTH
-        if j < n:
-            rest = n - j
-            _tile(
-                p, i, j, left, right, rows, pairs,
-                first(rest), first(rest - LANES), first(rest - 2 * LANES),
-            )  # fmt: skip
+        _tiles(p, i, i - i % LANES, n, left, right, rows, pairs)
     for i in range(whole, n):
         for j in range(i, n):
             for k in range(rows):
@@ -81,15 +72,7 @@ def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: i
     """Subtract the product Lᵀ R of two arrays' first ``rows`` from ``out[:height, :n]``."""
     whole = height - height % _HEIGHT
     for i in range(0, whole, _HEIGHT):
-        for j in range(0, n, _WIDTH):
-            rest = n - j
-            if rest >= _WIDTH:
-                _tile(out, i, j, left, right, rows, 0, None, None, None)
-            else:
-                _tile(
-                    out, i, j, left, right, rows, 0,
-                    first(rest), first(rest - LANES), first(rest - 2 * LANES),
-                )  # fmt: skip
+        _tiles(out, i, 0, n, left, right, rows, 0)
     for i in range(whole, height):
         for j in range(0, n, LANES):
             mask = first(n - j)
@@ -97,6 +80,17 @@ def subtract(out: Array, height: int, n: int, left: Array, right: Array, rows: i
             for k in range(rows):
                 v = subtract_product(v, left[k, i], load(right, (k, j), mask))
             store(out, (i, j), mask, v)
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def _tiles(p: Array, i: int, j: int, n: int, left: Array, right: Array, rows: int, pairs: int) -> None:
+    """Subtract the tiles of Lᵀ R that begin in row i and from column j on."""
+    while j + _WIDTH <= n:
+        _tile(p, i, j, left, right, rows, pairs, None, None, None)
+        j += _WIDTH
+    if j < n:
+        rest = n - j
+        _tile(p, i, j, left, right, rows, pairs, first(rest), first(rest - LANES), first(rest - 2 * LANES))
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)

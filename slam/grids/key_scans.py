@@ -105,10 +105,7 @@ class KeyScans:
             return False
         self._poses[:n] = corrected
         self._last = tuple(corrected[-1].tolist())
-        grid.clear()
-        for pose, (scan, surface) in zip(corrected, self._scans, strict=True):
-            grid.integrate(pose, scan, surface)
-        grid.take_changes()  # the revision has gone up: followers start over
+        grid.redraw(corrected, self._scans)
         return True
 
 

@@ -11,6 +11,7 @@ that lie on a straight surface between two beams, gain.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, Self
 
 import cv2
@@ -44,6 +45,7 @@ __all__ = ["CLASS_OF", "FREE", "OCCUPIED", "PROBABILITY_BYTE", "UNKNOWN", "Occup
 Array = NDArray[np.float64]
 
 _CHUNK = 32  # the grid's edges lie on multiples of this, so that every overview block is whole
+_SPARE = 2  # chunks more than is needed when it grows
 _OVERVIEW = 64  # the overview never has more than this many blocks a side
 
 
@@ -186,6 +188,13 @@ class OccupancyGrid:
         self._change_count = 0
         self._build_overview()
 
+    def redraw(self, sensor_poses: Array, scans: Iterable[tuple[Scan, NDArray[np.int16]]]) -> None:
+        """Draw anew from poses ``(n, 3)`` of scans, each with its surfaces; followers start over."""
+        self.clear()
+        for pose, (scan, surface) in zip(sensor_poses, scans, strict=False):
+            self.integrate(pose, scan, surface)
+        self._change_count = 0
+
     def mark_visited(self, x: float, y: float, radius: float) -> None:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
         x, y, radius = self._make_room_for(x, y, radius)
@@ -276,16 +285,14 @@ class OccupancyGrid:
         if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row1 and col1 <= self._col1:
             return
         rows, cols = self.shape
-        new_row0, new_col0, new_row1, new_col1 = self._row0, self._col0, self._row1, self._col1
-        spare = 2 * _CHUNK
-        if row0 < new_row0:
-            new_row0 = math.floor((row0 - spare) / _CHUNK) * _CHUNK
-        if col0 < new_col0:
-            new_col0 = math.floor((col0 - spare) / _CHUNK) * _CHUNK
-        if row1 > new_row1:
-            new_row1 = math.ceil((row1 + spare) / _CHUNK) * _CHUNK
-        if col1 > new_col1:
-            new_col1 = math.ceil((col1 + spare) / _CHUNK) * _CHUNK
+        new_row0, new_col0 = (
+            old if wanted >= old else (wanted // _CHUNK - _SPARE) * _CHUNK
+            for wanted, old in ((row0, self._row0), (col0, self._col0))
+        )  # fmt: skip
+        new_row1, new_col1 = (
+            old if wanted <= old else (-(-wanted // _CHUNK) + _SPARE) * _CHUNK
+            for wanted, old in ((row1, self._row1), (col1, self._col1))
+        )  # fmt: skip
         r, c = self._row0 - new_row0, self._col0 - new_col0
         shape = (new_row1 - new_row0, new_col1 - new_col0)
         log_odds, visited = _blank(shape).view(np.int8), _blank(shape)

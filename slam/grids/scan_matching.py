@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "r
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
+_MARGIN_M = 1.0  # of a field around its points
 _PHASES = 8  # sub-cell positions a side at which a surface point is drawn
 _FLAT_INFO = 1e-3  # [1/m², 1/rad²] added so that a featureless scan still has a (very wide) covariance
 
@@ -81,41 +83,26 @@ class LikelihoodField:
         Centre of cell (0, 0) [m].
     """
 
-    def __init__(self, config: MatchConfig, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """Make an empty field over the box from ``low`` to ``high`` [m]."""
-        cell = config.cell_m
-        self.cell_m, self.stamps = cell, stamps_of(config)
-        col, row = math.floor(low[0] / cell), math.floor(low[1] / cell)
-        shape = (math.floor(high[1] / cell) - row + 1, math.floor(high[0] / cell) - col + 1)
-        self.x0, self.y0 = (col + 0.5) * cell, (row + 0.5) * cell
-        self.values = np.zeros(shape, np.float32)
-        self._bounds: Values | None = None
-
-    @classmethod
-    def of_points(cls, config: MatchConfig, points: Array, *, margin_m: float = 1.0) -> LikelihoodField:
+    def __init__(self, config: MatchConfig, points: Array) -> None:
         """Draw surface points ``(n, 2)`` [m] into a field that encloses them with a margin."""
-        if not len(points):
-            return cls(config, (0.0, 0.0), (0.0, 0.0))
-        low, high = points.min(axis=0) - margin_m, points.max(axis=0) + margin_m
-        field = cls(config, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
-        field.add(points)
-        return field
+        cell = config.cell_m
+        low = high = np.zeros(2)
+        if len(points):
+            low, high = points.min(axis=0) - _MARGIN_M, points.max(axis=0) + _MARGIN_M
+        self.cell_m = cell
+        (col, row), (last_col, last_row) = (
+            (math.floor(x / cell), math.floor(y / cell)) for x, y in (low.tolist(), high.tolist())
+        )
+        self.x0, self.y0 = (col + 0.5) * cell, (row + 0.5) * cell
+        self.values = np.zeros((last_row - row + 1, last_col - col + 1), np.float32)
+        splat(self.values, self.x0, self.y0, cell, stamps_of(config), np.asarray(points, dtype=np.float64))
 
-    def add(self, points: Array) -> None:
-        """Draw surface points ``(n, 2)`` [m]; what lies outside is left out."""
-        splat(self.values, self.x0, self.y0, self.cell_m, self.stamps, np.asarray(points, dtype=np.float64))
-        self._bounds = None
-
-    @property
+    @cached_property
     def bounds(self) -> Values:
         """Cell (r, c): the largest value of the block of 4 × 4 cells that begins there."""
-        if self._bounds is None:
-            kernel = np.ones((BLOCK, BLOCK), np.uint8)
-            self._bounds = np.asarray(
-                cv2.dilate(self.values, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0.0),
-                np.float32,
-            )
-        return self._bounds
+        kernel = np.ones((BLOCK, BLOCK), np.uint8)
+        largest = cv2.dilate(self.values, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
+        return np.asarray(largest, np.float32)
 
 
 _STAMPS: dict[tuple[float, float], Values] = {}

@@ -131,7 +131,7 @@ class ScanOdometry:
     def _keep(self, points: Array) -> None:
         self._scans.append((self.pose.copy(), points))
         seen = [transform_points(pose, ends) for pose, ends in self._scans]
-        self._field = LikelihoodField.of_points(self.matching, np.vstack(seen))
+        self._field = LikelihoodField(self.matching, np.vstack(seen))
 
     def _start_over(self, points: Array) -> None:
         """Nothing fits any more, the wheels alone were believed for a while: forget the old surroundings."""

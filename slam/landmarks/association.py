@@ -1,4 +1,4 @@
-"""Which landmark was seen: Mahalanobis gating, nearest neighbour and joint compatibility over a joint Gaussian.
+"""Which landmark was seen: Mahalanobis gating and nearest neighbour over a joint Gaussian.
 
 The joint covariance is passed as its upper triangle; landmark ``i`` stands at state index 3 + 2i.
 """
@@ -17,12 +17,15 @@ from slam.types import LINE
 __all__ = [
     "IGNORED",
     "UNMATCHED",
-    "innovation_blocks",
-    "joint_compatibility",
+    "add_expected",
+    "alike",
+    "beside",
+    "gated_distance",
     "line_blocks",
     "nearest_neighbour",
     "predicted",
     "refuse_unlikely",
+    "too_near",
 ]
 
 Array = NDArray[np.float64]
@@ -32,17 +35,11 @@ UNMATCHED, IGNORED = -1, -2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def innovation_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float, float]:
+def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array) -> tuple[float, float]:
     """Write H of landmark ``i`` ``(2, 5)``: by x, y, θ, xi, yi; return the predicted range and bearing.
 
-    theory.md A, observe; ``offset`` is L.
+    theory.md A, observe; ``offset`` is L, ``c`` and ``s`` are the heading's cosine and sine.
     """
-    return _point_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), h)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array) -> tuple[float, float]:
-    """Do :func:`innovation_blocks` with the heading's cosine and sine, for who asks about many landmarks."""
     dx = x[0] + offset * c - x[3 + 2 * i]
     dy = x[1] + offset * s - x[4 + 2 * i]
     rho2 = dx * dx + dy * dy
@@ -78,11 +75,11 @@ def predicted(x: Array, i: int, kind: float, offset: float, h: Array) -> tuple[f
     """Write H of a landmark of a kind ``(2, 5)`` and return what should be seen of it."""
     if kind == LINE:
         return line_blocks(x, i, offset, h)
-    return innovation_blocks(x, i, offset, h)
+    return _point_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), h)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
+def gated_distance(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from landmark ``i``."""
     rho, bearing = predicted(x, i, z[5], offset, h)
     return _distance(p, i, rho, bearing, z, h)
@@ -91,34 +88,42 @@ def _gate(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> floa
 @njit(cache=True, nogil=True, error_model="numpy")
 def _distance(p: Array, i: int, rho: float, bearing: float, z: Array, h: Array) -> float:
     """Return the squared Mahalanobis distance of an observation row from what is predicted of landmark ``i``."""
-    m = 3 + 2 * i
-    # S = H P Hᵀ + R over the five states that H touches, read from the upper triangle.
-    s00, s01, s11 = z[2], z[3], z[4]
-    for a in range(5):
-        ia = a if a < 3 else m + a - 3
-        for b in range(5):
-            ib = b if b < 3 else m + b - 3
-            v = p[ia, ib] if ia <= ib else p[ib, ia]
-            s00 += h[0, a] * v * h[0, b]
-            s01 += h[0, a] * v * h[1, b]
-            s11 += h[1, a] * v * h[1, b]
+    s00, s01, s11 = add_expected(z[2], z[3], z[4], p, i, h)
     dr, db = z[0] - rho, wrap_scalar(z[1] - bearing)
     det = s00 * s11 - s01 * s01
     return float((s11 * dr * dr - 2.0 * s01 * dr * db + s00 * db * db) / det)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refuse_unlikely(
-    x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64], h: Array
-) -> None:
+def add_expected(
+    s00: float, s01: float, s11: float, p: Array, i: int, h: Array
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return a covariance of range and bearing, R or zeros, plus H P Hᵀ of landmark ``i``.
+
+    Over the five states that H touches, read from the upper triangle.
+    """
+    for a in range(5):
+        ia = a if a < 3 else 2 * i + a
+        for b in range(5):
+            ib = b if b < 3 else 2 * i + b
+            v = p[ia, ib] if ia <= ib else p[ib, ia]
+            s00 += h[0, a] * v * h[0, b]
+            s01 += h[0, a] * v * h[1, b]
+            s11 += h[1, a] * v * h[1, b]
+    return s00, s01, s11
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def refuse_unlikely(x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64]) -> None:
     """Set to IGNORED the matches, given from outside, that lie beyond a squared Mahalanobis distance."""
+    h = np.empty((2, 5))
     for k in range(z.shape[0]):
-        if match[k] >= 0 and _gate(x, p, match[k], offset, z[k], h) > gate:
+        if match[k] >= 0 and gated_distance(x, p, match[k], offset, z[k], h) > gate:
             match[k] = IGNORED
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
+def alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
     """Tell whether an observation has a landmark's kind and direction, as far as both are known."""
     if (z[5] == 0.0 and mark[0] != LINE) or (mark[0] == 0.0 and z[5] != LINE):
         return True
@@ -126,7 +131,7 @@ def _alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: float) -> bool:
+def beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: float) -> bool:
     """Tell whether a piece of wall that is seen lies within a window [m] of wall ``i``, along it and across."""
     alpha, r = x[3 + 2 * i], x[4 + 2 * i]
     nx, ny = math.cos(alpha), math.sin(alpha)
@@ -142,14 +147,14 @@ def _beside(x: Array, i: int, offset: float, z: Array, mark: Array, window: floa
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _too_near(x: Array, i: int, offset: float, z: Array, mark: Array, near: float, dx: float, dy: float) -> bool:
+def too_near(x: Array, i: int, offset: float, z: Array, mark: Array, near: float, dx: float, dy: float) -> bool:
     """Tell whether what is seen lies too near to landmark ``i``, of a point ``dx`` and ``dy`` away, to be new.
 
     How near that is [m] has nothing to do with how well the robot knows where it is: the longer the way from the
     start, the more of the walls beside others would be taken for neither known nor new, and be of no use at all.
     """
     if z[5] == LINE:
-        return _beside(x, i, offset, z, mark, near)
+        return beside(x, i, offset, z, mark, near)
     return bool(dx * dx + dy * dy < near * near)
 
 
@@ -159,8 +164,8 @@ _FEWEST_SURE = 2  # matches without which a scan takes those, too
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, near: float,
-    max_turn: float, only_sure: bool, match: NDArray[np.int64], distance: Array, h: Array,
+    x: Array, p: Array, offset: float, z: Array, marks: Array, gate: float, near: float, max_turn: float,
+    only_sure: bool, match: NDArray[np.int64], distance: Array,
 ) -> None:  # fmt: skip
     """Match each observation to the nearest landmark of its kind within the gate, each landmark once.
 
@@ -186,6 +191,7 @@ def nearest_neighbour(
     """
     c, s = math.cos(x[2]), math.sin(x[2])
     spread = math.sqrt(p[0, 0] + p[1, 1])
+    h = np.empty((2, 5))
     for k in range(z.shape[0]):
         match[k] = UNMATCHED
         distance[k] = np.inf
@@ -194,25 +200,25 @@ def nearest_neighbour(
         py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
         window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
         candidates, surface = 0, -1
-        for i in range(landmarks):
+        for i in range(marks.shape[0]):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py
             if z[k, 5] != LINE and (abs(dx) > window or abs(dy) > window):
                 continue
-            if not _alike(z[k], marks[i], x[2], max_turn):
+            if not alike(z[k], marks[i], x[2], max_turn):
                 continue
             if z[k, 5] == LINE:
-                if not _beside(x, i, offset, z[k], marks[i], window):
+                if not beside(x, i, offset, z[k], marks[i], window):
                     continue
                 rho, phi = line_blocks(x, i, offset, h)
             else:
                 rho, phi = _point_blocks(x, i, offset, c, s, h)
             d2 = _distance(p, i, rho, phi, z[k], h)
             candidates += d2 < gate
-            if d2 < gate and z[k, 5] == LINE and _beside(x, i, offset, z[k], marks[i], near):
+            if d2 < gate and z[k, 5] == LINE and beside(x, i, offset, z[k], marks[i], near):
                 surface = i if surface < 0 or marks[i, 5] > marks[surface, 5] else surface
             if d2 < gate and d2 < distance[k]:
                 match[k], distance[k] = i, d2
-            elif match[k] == UNMATCHED and _too_near(x, i, offset, z[k], marks[i], near, dx, dy):
+            elif match[k] == UNMATCHED and too_near(x, i, offset, z[k], marks[i], near, dx, dy):
                 match[k] = IGNORED
         if only_sure and candidates > 1:
             match[k] = _LIES_ON - surface if surface >= 0 else IGNORED
@@ -227,168 +233,3 @@ def nearest_neighbour(
         for j in range(k):
             if match[k] >= 0 and match[k] == match[j] and z[k, 5] != LINE:
                 match[k if distance[k] >= distance[j] else j] = IGNORED
-
-
-_WALL_WINDOW_M = 1.0  # farther off, a piece of wall is not tested for being a known wall
-_CANDIDATES = 8  # landmarks considered for one observation, the nearest first
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def joint_compatibility(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gates: Array, near: float,
-    max_turn: float, most_nodes: int, match: NDArray[np.int64],
-) -> float:  # fmt: skip
-    """Match as many observations as one pose can explain together; return their joint squared distance.
-
-    Joint compatibility branch and bound (Neira and Tardós 2001): the innovations of all pairings at once, with
-    their cross-covariances, must lie within the gate. Among the largest such sets, the nearest one. S is factored
-    row by row as the search goes down, so that a pairing costs its own two rows only.
-
-    Parameters
-    ----------
-    z, marks, near, max_turn, match
-        As in :func:`nearest_neighbour`.
-    gates : Array
-        ``(> m,)`` largest squared Mahalanobis distance of k pairings at index k.
-    most_nodes : int
-        The search stops here with the best set so far; it is exponential at worst.
-    """
-    m = z.shape[0]
-    candidate, count = np.zeros((m, _CANDIDATES), np.int64), np.zeros(m + 1, np.int64)
-    distance = np.zeros((m, _CANDIDATES))
-    for k in range(m):
-        match[k] = UNMATCHED
-        count[k] = _compatible(x, p, landmarks, offset, z[k], marks, gates[1], max_turn, candidate[k], distance[k])
-    left = np.zeros(m + 1, np.int64)  # observations from k on that any landmark could be
-    for k in range(m - 1, -1, -1):
-        left[k] = left[k + 1] + (count[k] > 0)
-
-    h = np.zeros((m, 2, 5))  # one entry a pairing, down the present branch
-    landmark = np.zeros(m, np.int64)
-    factor, y = np.zeros((2 * m, 2 * m)), np.zeros(2 * m)
-    nis = np.zeros(m + 1)
-    option, paired = np.zeros(m + 1, np.int64), np.zeros(m + 1, np.bool_)
-    chosen = np.full(m, UNMATCHED)
-    pairs = best_pairs = 0
-    best_nis = 0.0
-    k = 0
-    for _ in range(most_nodes):
-        if paired[k]:  # come back from below
-            paired[k] = False
-            chosen[k] = UNMATCHED
-            pairs -= 1
-        hope = pairs + left[k]
-        hopeless = hope < best_pairs or (hope == best_pairs and nis[pairs] >= best_nis)
-        if k == m and not hopeless:
-            best_pairs, best_nis = pairs, nis[pairs]
-            match[:] = chosen
-        if k == m or hopeless or option[k] > count[k]:
-            if k == 0:
-                break
-            k -= 1
-            continue
-        o = option[k]
-        option[k] += 1
-        if o < count[k]:
-            i = candidate[k, o]
-            if z[k, 5] != LINE and np.any(landmark[:pairs] == i):
-                continue
-            landmark[pairs] = i
-            extend(x, p, offset, z[k], landmark, pairs, h, factor, y)
-            more = nis[pairs] + y[2 * pairs] ** 2 + y[2 * pairs + 1] ** 2
-            if more > gates[pairs + 1]:
-                continue
-            pairs += 1
-            nis[pairs] = more
-            paired[k] = True
-            chosen[k] = i
-        k += 1
-        option[k] = 0
-    _set_aside(x, landmarks, offset, z, marks, near, max_turn, count, match)
-    return float(best_nis)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _compatible(
-    x: Array, p: Array, landmarks: int, offset: float, z: Array, marks: Array, gate: float, max_turn: float,
-    candidate: NDArray[np.int64], distance: Array,
-) -> int:  # fmt: skip
-    """List the landmarks that one observation could be, nearest first; return how many."""
-    h = np.zeros((2, 5))
-    found = 0
-    for i in range(landmarks):
-        if not _alike(z, marks[i], x[2], max_turn):
-            continue
-        if z[5] == LINE and not _beside(x, i, offset, z, marks[i], _WALL_WINDOW_M):
-            continue
-        d2 = _gate(x, p, i, offset, z, h)
-        if d2 >= gate or (found == _CANDIDATES and d2 >= distance[found - 1]):
-            continue
-        j = found if found < _CANDIDATES else found - 1
-        while j > 0 and distance[j - 1] > d2:
-            candidate[j], distance[j] = candidate[j - 1], distance[j - 1]
-            j -= 1
-        candidate[j], distance[j] = i, d2
-        found = min(found + 1, _CANDIDATES)
-    return found
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def extend(
-    x: Array, p: Array, offset: float, z: Array, landmark: NDArray[np.int64], pairs: int, h: Array, factor: Array,
-    y: Array,
-) -> None:  # fmt: skip
-    """Add a pairing's two rows to the Cholesky factor L of S and to y = L⁻¹ ν."""
-    i = landmark[pairs]
-    rho, bearing = predicted(x, i, z[5], offset, h[pairs])
-    row = 2 * pairs
-    y[row], y[row + 1] = z[0] - rho, wrap_scalar(z[1] - bearing)
-    for e in range(2):
-        r = row + e
-        for j in range(r + 1):
-            v = _cross(p, i, h[pairs, e], landmark[j // 2], h[j // 2, j % 2])
-            if j >= row:
-                v += z[2 + e + (j - row)]  # R's terms: ρρ, ρφ, φφ
-            for q in range(j):
-                v -= factor[r, q] * factor[j, q]
-            if j < r:
-                factor[r, j] = v / factor[j, j]
-                y[r] -= factor[r, j] * y[j]
-            else:
-                factor[r, r] = math.sqrt(v)
-                y[r] /= factor[r, r]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _cross(p: Array, i: int, hi: Array, j: int, hj: Array) -> float:
-    """Return Hi P Hjᵀ for a row of either landmark's H, from P's upper triangle."""
-    total = 0.0
-    for a in range(5):
-        ia = a if a < 3 else 3 + 2 * i + a - 3
-        for b in range(5):
-            jb = b if b < 3 else 3 + 2 * j + b - 3
-            total += hi[a] * hj[b] * (p[ia, jb] if ia <= jb else p[jb, ia])
-    return total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _set_aside(
-    x: Array, landmarks: int, offset: float, z: Array, marks: Array, near: float, max_turn: float,
-    count: NDArray[np.int64], match: NDArray[np.int64],
-) -> None:  # fmt: skip
-    """Mark as IGNORED what is unmatched, yet could be a landmark or is too near to one to be new."""
-    c, s = math.cos(x[2]), math.sin(x[2])
-    for k in range(z.shape[0]):
-        if match[k] != UNMATCHED:
-            continue
-        if count[k] > 0:
-            match[k] = IGNORED
-            continue
-        bearing = x[2] + z[k, 1]
-        px = x[0] + offset * c + z[k, 0] * math.cos(bearing)
-        py = x[1] + offset * s + z[k, 0] * math.sin(bearing)
-        for i in range(landmarks):
-            if not _alike(z[k], marks[i], x[2], max_turn):
-                continue
-            if _too_near(x, i, offset, z[k], marks[i], near, x[3 + 2 * i] - px, x[4 + 2 * i] - py):
-                match[k] = IGNORED

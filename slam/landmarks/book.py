@@ -18,7 +18,7 @@ from slam.landmarks.association import UNMATCHED, nearest_neighbour
 from slam.settings import require
 from slam.types import LINE, Scan
 
-__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy", "match_and_recall"]
+__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
 
 Array = NDArray[np.float64]
 
@@ -31,6 +31,7 @@ _WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may beco
 # Columns of the tentative ones.
 _X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
 _TENTATIVE = 64
+_NO_SCAN = Scan(np.zeros(0), 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,18 +91,6 @@ class LandmarkBook:
         """Ids ``(n,)``; an id is never used twice. A view."""
         return self._ids[: self.count]
 
-    def kinds(self) -> NDArray[np.int8]:
-        """Return CONVEX, CONCAVE or 0 (unknown) per landmark ``(n,)``."""
-        return self.marks[:, _KIND].astype(np.int8)
-
-    def directions(self) -> Array:
-        """Return the direction per landmark ``(n,)`` [rad], nan where the kind is unknown."""
-        return np.where(self.marks[:, _KIND] == 0, np.nan, self.marks[:, _DIRECTION])
-
-    def times_seen(self) -> NDArray[np.int64]:
-        """Return the number of sightings per landmark ``(n,)``."""
-        return self.marks[:, _SEEN].astype(np.int64)
-
     def row(self, landmark_id: int) -> int:
         """Return the row of a landmark, or -1."""
         if 0 <= landmark_id < len(self.row_of_id):
@@ -115,9 +104,7 @@ class LandmarkBook:
         new_id = self._next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
-        if self.count == len(self._ids):
-            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
-            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        self._make_room(self.count + 1)
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
@@ -139,21 +126,19 @@ class LandmarkBook:
         """Have these landmarks ``(n,)``, with these marks ``(n, 8)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
-        while count > len(self._ids):
-            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
-            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
+        self._make_room(count)
         self._ids[:count], self._marks[:count] = ids, marks
         self.row_of_id[ids] = np.arange(count)
         self.count = count
 
-    def recently_seen(self, match: NDArray[np.int64]) -> tuple[int, int]:
-        """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
-        recent, still = count_recent(self.marks, match, self._now)
-        return recent, still
-
     def just_seen(self) -> NDArray[np.int64]:
         """Return the rows ``(k,)`` of the points that the last update showed."""
-        return _points_seen_at(self._marks, self.count, self._now)
+        return np.flatnonzero((self.marks[:, _LAST_SEEN] == self._now) & (self.marks[:, _KIND] != LINE))
+
+    def _make_room(self, count: int) -> None:
+        while count > len(self._ids):
+            self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
+            self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
 
     def count_sightings(self, match: NDArray[np.int64]) -> None:
         """Count an update in which these rows (negative: none) were seen, all of them known from outside."""
@@ -162,40 +147,24 @@ class LandmarkBook:
         self._marks[seen, _SEEN] += 1.0
         self._marks[seen, _LAST_SEEN] = self._now
 
-    def review(self, x: Array, offset: float, z: Array, match: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Count sightings; return which observations are new landmarks by now.
+    def review(
+        self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan | None = None, *,
+        at_once: bool = False,
+    ) -> tuple[list[int], list[int]]:  # fmt: skip
+        """Count sightings; return the observations that are new landmarks by now, and rows to drop, highest first.
 
-        ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their landmarks.
+        Dropped are, where there is a scan, landmarks that its beams keep passing through, or never show. Add what
+        is new first or last: it was just seen. With ``at_once``, what is seen where features meet is a landmark at
+        its first sighting. ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their
+        landmarks.
         """
         self._now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
-        count, self._tentative_count = _review(
-            x, offset, z, match, self._now, self.marks, self._tentative, self._tentative_count, self._limits,
-            False, self._new,
-        )  # fmt: skip
-        return self._new[:count]
-
-    def contradicted(self, x: Array, offset: float, scan: Scan) -> list[int]:
-        """Return the rows to drop, highest first: landmarks that beams keep passing through, or never show."""
-        doubtful = _look_through(
-            x, offset, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks, self._limits
-        )
-        return self._to_drop() if doubtful else []
-
-    def review_scan(
-        self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan
-    ) -> tuple[list[int], list[int]]:
-        """Do :meth:`review` and :meth:`contradicted` in one call of a kernel; return the results of both.
-
-        Looking for contradictions first and adding what is new after is the same: what is new was just seen.
-        """
-        self._now += 1
-        if len(self._new) < len(z):
-            self._new = np.zeros(len(z), np.int64)
-        count, self._tentative_count, doubtful = _review_scan(
-            x, offset, z, match, scan.ranges, scan.angle_min, scan.angle_increment, self._now, self.marks,
-            self._tentative, self._tentative_count, self._limits, self._new,
+        ranges, first, step, _, _ = scan or _NO_SCAN
+        count, self._tentative_count, doubtful = _review(
+            x, offset, z, match, ranges, first, step, self._now, self.marks, self._tentative,
+            self._tentative_count, self._limits, at_once, self._new,
         )  # fmt: skip
         return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
 
@@ -204,16 +173,6 @@ class LandmarkBook:
         passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
         overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
         return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
-
-
-@njit(cache=True, nogil=True)
-def _points_seen_at(marks: Array, count: int, now: float) -> NDArray[np.int64]:
-    out = np.empty(count, np.int64)
-    found = 0
-    for row in range(count):
-        out[found] = row
-        found += marks[row, _LAST_SEEN] == now and marks[row, _KIND] != LINE
-    return out[:found]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -231,7 +190,7 @@ def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
-    """Count what :meth:`LandmarkBook.recently_seen` returns."""
+    """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
     recent = still = 0
     for i in range(marks.shape[0]):
         if marks[i, _LAST_SEEN] > now - _RECENT:
@@ -243,14 +202,11 @@ def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _review(
+def _sightings(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
     n: int, limits: Array, at_once: bool, new: NDArray[np.int64],
 ) -> tuple[int, int]:  # fmt: skip
-    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are.
-
-    With ``at_once``, what is seen where features meet is a landmark at its first sighting.
-    """
+    """Count sightings; return how many observations are new landmarks, and how many tentative ones there are."""
     gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
     forget_after = limits[4]
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -366,14 +322,13 @@ def _look_through(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _review_scan(
+def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
-    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, new: NDArray[np.int64],
+    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, at_once: bool,
+    new: NDArray[np.int64],
 ) -> tuple[int, int, bool]:  # fmt: skip
-    # The first scan is taken at the start, whose pose is known. Landmarks that had to wait for two more would be
-    # placed from where the wheels alone have the robot by then, and pass that on to all that is mapped later:
-    # over apartments with slippery floors it was four fifths of the whole.
-    found, kept = _review(x, offset, z, match, now, marks, tentative, n, limits, now == 1, new)
+    """Do what :meth:`LandmarkBook.review` does; return the numbers of new and of tentative ones, and of doubts."""
+    found, kept = _sightings(x, offset, z, match, now, marks, tentative, n, limits, at_once, new)
     return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)
 
 
@@ -382,8 +337,7 @@ def match_and_recall(
     x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
     match: NDArray[np.int64], distance: Array,
 ) -> tuple[int, int]:  # fmt: skip
-    """Match by nearest neighbour; return what the book says of it (``LandmarkBook.recently_seen``)."""
+    """Match by nearest neighbour; return what :func:`count_recent` does of it."""
     gate, near, max_turn = gates[0], gates[1], gates[2]
-    h = np.empty((2, 5))
-    nearest_neighbour(x, p, marks.shape[0], offset, z, marks, gate, near, max_turn, only_sure, match, distance, h)
+    nearest_neighbour(x, p, offset, z, marks, gate, near, max_turn, only_sure, match, distance)
     return count_recent(marks, match, now)

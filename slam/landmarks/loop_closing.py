@@ -16,7 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.landmarks.association import IGNORED, extend, joint_compatibility, predicted
+from slam.landmarks.association import IGNORED, add_expected, predicted
+from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
 from slam.types import LINE
 
 __all__ = ["agreeing", "put_off"]
@@ -47,15 +48,7 @@ def _variance(z: Array, s00: float, s01: float, s11: float) -> float:
 def _expected_variance(x: Array, p: Array, i: int, offset: float, z: Array, h: Array) -> float:
     """Return the variance [m²] of where landmark ``i`` should be seen, the observation's own noise left out."""
     predicted(x, i, z[5], offset, h)
-    s00 = s01 = s11 = 0.0
-    for a in range(5):
-        ia = a if a < 3 else 2 * i + a
-        for b in range(5):
-            ib = b if b < 3 else 2 * i + b
-            v = p[ia, ib] if ia <= ib else p[ib, ia]
-            s00 += h[0, a] * v * h[0, b]
-            s01 += h[0, a] * v * h[1, b]
-            s11 += h[1, a] * v * h[1, b]
+    s00, s01, s11 = add_expected(0.0, 0.0, 0.0, p, i, h)
     return _variance(z, s00, s01, s11)
 
 
@@ -87,19 +80,19 @@ def put_off(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def agreeing(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float,
-    gates: Array, near: float, max_turn: float, most_nodes: int, match: NDArray[np.int64],
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float, near: float,
+    max_turn: float, match: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Match old landmarks that are not expected to within ``sigma`` [m] if enough of them agree; return how many.
 
     ``match`` ``(m,)`` is filled. Enough of the pairings must be expected to within ``sigma`` once those before
-    them are taken for true. The other arguments are :func:`slam.landmarks.association.joint_compatibility`'s.
+    them are taken for true. The other arguments are ``joint_compatibility``'s.
     """
     m = z.shape[0]
     match[:] = IGNORED
     if m <= _LEAST:  # the first is never expected any better
         return 0
-    joint_compatibility(x, p, marks.shape[0], offset, z, marks, gates, near, max_turn, most_nodes, match)
+    joint_compatibility(x, p, offset, z, marks, near, max_turn, match)
     h = np.zeros((m, 2, 5))
     landmark = np.zeros(m, np.int64)
     factor, y = np.zeros((2 * m, 2 * m)), np.zeros(2 * m)
@@ -116,7 +109,7 @@ def agreeing(
         row = 2 * pairs
         a, b, c = factor[row, row], factor[row + 1, row], factor[row + 1, row + 1]
         narrow = _variance(z[k], a * a, a * b, b * b + c * c) <= sigma**2
-        confirmed += narrow and y[row] ** 2 + y[row + 1] ** 2 < gates[1]
+        confirmed += narrow and y[row] ** 2 + y[row + 1] ** 2 < JOINT_GATES[1]
         pairs += 1
     if confirmed < _LEAST:
         match[:] = IGNORED

@@ -6,6 +6,7 @@ Logs of landmark observations become a :class:`RecordedLog`, logs of laser scans
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,8 @@ _UTIAS_FILE = re.compile(r"Robot(\d+)_Odometry\.dat(?:\.gz)?")
 
 
 # By the first word of a line; CARMEN has more, which are not read.
-_CARMEN_WORDS = frozenset({"ODOM", "FLASER", "RLASER", "PARAM", "SYNC", "TRUEPOS", "ROBOTLASER1", "NEFF"})
-_DPSLAM_WORDS = frozenset({"Odometry", "Laser"})
+_CARMEN_WORDS = ("ODOM", "FLASER", "RLASER", "PARAM", "SYNC", "TRUEPOS", "ROBOTLASER1", "NEFF")
+_READERS = dict.fromkeys(_CARMEN_WORDS, carmen.read) | dict.fromkeys(("Odometry", "Laser"), dpslam.read)
 _LINES_TO_KNOW_BY = 10_000
 
 
@@ -68,7 +69,9 @@ def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
     match = _UTIAS_FILE.fullmatch(path.name)
     if match is None:
         _refuse_robot(robot, path)
-        return _open_scans(path)
+        if (read := _reader_of(path)) is None:
+            raise ValueError(f"file {path} is no log that is known: {_KNOWN}")
+        return read(path)
     if robot is not None and robot != int(match[1]):
         raise ValueError(f"log {path} is robot {match[1]}'s, not robot {robot}'s; leave --robot out")
     return utias.read(path.parent, int(match[1]))
@@ -95,12 +98,12 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
         raise ValueError(f"log {log.name} has its own reference; leave --reference out")
     if not path.is_file():
         raise ValueError(f"reference {path} is no file; give a log of the same scans with corrected poses")
-    kind = _kind_of(path)
-    if kind is None:
+    read = _reader_of(path)
+    if read is None:
         raise ValueError(f"reference {path} is no log that is known: give a CARMEN or DP-SLAM log")
     note = f"reference: poses of {path.name} at the same scans; the start pose is the reference's"
-    if kind == "dpslam":
-        poses = dpslam.read(path).odometry_poses
+    if read is dpslam.read:
+        poses = read(path).odometry_poses
         if len(poses) != len(log.times):
             counts = f"{len(poses)} scans, {log.name} {len(log.times)}"
             raise ValueError(f"reference {path} has {counts}; give a log of the same scans")
@@ -133,23 +136,12 @@ def _with_equal_stamps(stamps: list[float], of_reference: list[float]) -> tuple[
     return mine, others
 
 
-def _open_scans(path: Path) -> ScanLog:
-    kind = _kind_of(path)
-    if kind is None:
-        raise ValueError(f"file {path} is no log that is known: {_KNOWN}")
-    return carmen.read(path) if kind == "carmen" else dpslam.read(path)
-
-
-def _kind_of(path: Path) -> str | None:
-    """Return "carmen", "dpslam" or, where no line at the beginning is either's, ``None``."""
+def _reader_of(path: Path) -> Callable[[Path], ScanLog] | None:
+    """Return what reads a log of scans; ``None`` where no line at its beginning is either format's."""
     for number, line in read_lines(path):
         word = "".join(line[:20].split(maxsplit=1)[:1])
-        if word in _CARMEN_WORDS:
-            return "carmen"
-        if word in _DPSLAM_WORDS:
-            return "dpslam"
-        if number >= _LINES_TO_KNOW_BY:
-            break
+        if word in _READERS or number >= _LINES_TO_KNOW_BY:
+            return _READERS.get(word)
     return None
 
 

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.geometry import relative
-from slam.logs.laser import check_jumps, check_place, check_stamp, scan_of
-from slam.logs.scans import SETTINGS, ScanLog, chain, rising, without_returns
-from slam.logs.tables import numbers_of, read_lines
+from slam.logs.laser import check_jumps, message_of, scan_of
+from slam.logs.scans import ScanLog, chain, rising, scan_log
+from slam.logs.tables import read_lines
 
-__all__ = ["beam_angles", "read", "read_poses"]
+__all__ = ["read", "read_poses"]
 
 Array = NDArray[np.float64]
 
@@ -55,16 +55,8 @@ def read(path: Path) -> ScanLog:
     offset = np.median(mount, axis=0)
     if np.abs(mount - offset).max() < _MOUNT_VARIES and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M:
         travelled = _moved_by(travelled, offset)
-    times = rising(stamps)
-    measured, reach = without_returns(ranges)
-    angle_min, increment = beam_angles(ranges.shape[1])
-    return ScanLog(
-        name=path.name.split(".")[0], clock_start_s=float(times[0]), times=times - times[0], stamps=stamps,
-        ranges=measured,
-        angle_min=angle_min, angle_increment=increment, range_max=reach, odometry_poses=travelled,
-        start_pose=travelled[0].copy(), reference_times=np.zeros(0), reference_poses=np.zeros((0, 3)),
-        reference_gap_s=30.0, settings=SETTINGS, note="no reference; give one with --reference",
-    )  # fmt: skip
+    note = "no reference; give one with --reference"
+    return scan_log(path, ranges, travelled, times=rising(stamps), stamps=stamps, note=note)
 
 
 def read_poses(path: Path) -> tuple[Array, Array]:
@@ -74,17 +66,6 @@ def read_poses(path: Path) -> tuple[Array, Array]:
     """
     _, poses, _, stamps = _scans(path)
     return stamps, poses[:, :3].copy()
-
-
-def beam_angles(beams: int) -> tuple[float, float]:
-    """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
-
-    180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
-    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Other numbers span -90° to
-    90°.
-    """
-    step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
-    return math.radians(-90.0), math.radians(step)
 
 
 def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
@@ -102,12 +83,10 @@ def _scans(path: Path) -> tuple[Array, Array, Array, Array]:
         elif kind == ["FLASER"]:
             words = line.split()[1:]
             scan = scan_of(words, kind="FLASER", after=_AFTER_RANGES, earlier=ranges, path=path, line=number)
-            at = numbers_of(
-                words[1 + len(scan) : 8 + len(scan)], path=path, line=number, what="pose or time of FLASER"
-            )
-            check_place(at[:3], path=path, line=number)
-            check_place(at[3:6], path=path, line=number)
-            check_stamp(float(at[6]), path=path, line=number)
+            at = message_of(
+                words[1 + len(scan) : 8 + len(scan)], poses_at=(0, 3), stamp_at=6, path=path, line=number,
+                what="pose or time of FLASER",
+            )  # fmt: skip
             same = before is not None and before[6] == at[6]
             ranges.append(scan)
             poses.append(at[:6])
@@ -126,10 +105,7 @@ def _odom(words: Sequence[str], path: Path, number: int) -> Array:
     if len(words) != 9:
         raise ValueError(f"{path}, line {number}: expected 9 values after ODOM ({_ODOM}), got {len(words)}; "
                          "the line is cut short or damaged")  # fmt: skip
-    values = numbers_of(words[:7], path=path, line=number, what=_ODOM)
-    check_place(values[:3], path=path, line=number)
-    check_stamp(float(values[6]), path=path, line=number)
-    return values
+    return message_of(words[:7], poses_at=(0,), stamp_at=6, path=path, line=number, what=_ODOM)
 
 
 def _moved_by(poses: Array, offset: Array) -> Array:

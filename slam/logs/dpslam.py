@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.logs.carmen import beam_angles
-from slam.logs.laser import check_jumps, check_place, scan_of
-from slam.logs.scans import SETTINGS, ScanLog, without_returns
-from slam.logs.tables import numbers_of, read_lines
+from slam.logs.laser import check_jumps, message_of, scan_of
+from slam.logs.scans import ScanLog, scan_log
+from slam.logs.tables import read_lines
 
 __all__ = ["NOMINAL_DT_S", "read"]
 
@@ -38,16 +37,9 @@ def read(path: Path) -> ScanLog:
         no scan.
     """
     odometry, ranges = _pairs(path)
-    measured, reach = without_returns(ranges)
-    angle_min, increment = beam_angles(ranges.shape[1])
     times = np.arange(len(ranges), dtype=np.float64) * NOMINAL_DT_S
-    return ScanLog(
-        name=path.name.split(".")[0], clock_start_s=0.0, times=times, stamps=times,
-        ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach, odometry_poses=odometry,
-        start_pose=odometry[0].copy(), reference_times=np.zeros(0), reference_poses=np.zeros((0, 3)),
-        reference_gap_s=30.0, settings=SETTINGS,
-        note=f"no reference; without time stamps, taken to be {NOMINAL_DT_S} s from scan to scan",
-    )  # fmt: skip
+    note = f"no reference; without time stamps, taken to be {NOMINAL_DT_S} s from scan to scan"
+    return scan_log(path, ranges, odometry, times=times, stamps=times, note=note)
 
 
 def _pairs(path: Path) -> tuple[Array, Array]:
@@ -62,8 +54,9 @@ def _pairs(path: Path) -> tuple[Array, Array]:
             if len(words) != 3:
                 raise ValueError(f"{path}, line {number}: expected 3 values after Odometry (x y theta), got "
                                  f"{len(words)}; the line is cut short or damaged")  # fmt: skip
-            pose = numbers_of(words, path=path, line=number, what="Odometry x y theta")
-            check_place(pose, path=path, line=number)
+            pose = message_of(
+                words, poses_at=(0,), stamp_at=None, path=path, line=number, what="Odometry x y theta"
+            )
         elif kind == "Laser":
             if pose is None:
                 raise ValueError(

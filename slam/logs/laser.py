@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam.logs.tables import numbers_of
 
-__all__ = ["check_jumps", "check_place", "check_stamp", "scan_of"]
+__all__ = ["check_jumps", "message_of", "scan_of"]
 
 Array = NDArray[np.float64]
 
@@ -49,22 +49,27 @@ def scan_of(
     return scan
 
 
-def check_place(pose: Array, *, path: Path, line: int) -> None:
-    """Raise ``ValueError`` with file and line where a pose ``(3,)`` is none that a log comes to."""
-    far, turned = np.abs(pose[:2]).max(), abs(float(pose[2]))
-    if far > _FARTHEST_M:
-        raise ValueError(f"{path}, line {line}: a coordinate of {far:.3g} m is more than {_FARTHEST_M:g} m; "
-                         "correct the line")  # fmt: skip
-    if turned > _FARTHEST_RAD:
-        raise ValueError(f"{path}, line {line}: a heading of {turned:.3g} rad is more than {_FARTHEST_RAD:g} rad; "
-                         "correct the line")  # fmt: skip
+def message_of(
+    words: Sequence[str], *, poses_at: tuple[int, ...], stamp_at: int | None, path: Path, line: int, what: str
+) -> Array:
+    """Return the numbers that words of a line stand for, with poses from some of them on and a time stamp.
 
-
-def check_stamp(stamp: float, *, path: Path, line: int) -> None:
-    """Raise ``ValueError`` with file and line where a time stamp is no clock's [s]."""
-    if abs(stamp) > _LATEST_S:
-        raise ValueError(f"{path}, line {line}: a time of {stamp:.3g} s is more than {_LATEST_S:g} s; "
-                         "correct the line")  # fmt: skip
+    Raises ``ValueError`` with file and line where a word is no number, a pose none that a log comes to, or the
+    stamp no clock's [s].
+    """
+    values = numbers_of(words, path=path, line=line, what=what)
+    wrong = ""
+    for i in poses_at:
+        far, turned = np.abs(values[i : i + 2]).max(), abs(values[i + 2])
+        if far > _FARTHEST_M:
+            wrong = f"a coordinate of {far:.3g} m is more than {_FARTHEST_M:g} m"
+        elif turned > _FARTHEST_RAD:
+            wrong = f"a heading of {turned:.3g} rad is more than {_FARTHEST_RAD:g} rad"
+    if stamp_at is not None and abs(values[stamp_at]) > _LATEST_S:
+        wrong = wrong or f"a time of {values[stamp_at]:.3g} s is more than {_LATEST_S:g} s"
+    if wrong:
+        raise ValueError(f"{path}, line {line}: {wrong}; correct the line")
+    return values
 
 
 def check_jumps(poses: Array, *, path: Path, lines: Sequence[int]) -> None:

@@ -6,6 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,13 @@ from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
 from slam.types import Odometry, Scan
 
-__all__ = ["SETTINGS", "ScanLog", "chain", "rising", "without_returns"]
+__all__ = ["ScanLog", "beam_angles", "chain", "rising", "scan_log", "without_returns"]
 
 Array = NDArray[np.float64]
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
 # way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.
-SETTINGS = {
+_SETTINGS = {
     "lidar_offset_m": 0.0,
     "odometry": {
         "lever_m": 0.25, "speed_floor_m_s": 0.002, "speed_share": 0.1, "turn_floor_rad_s": 0.002,
@@ -117,6 +118,30 @@ class ScanLog(Log):
             self, reference_times=self.times[rows], reference_poses=poses, start_pose=compose(poses[0], back),
             note=note,
         )  # fmt: skip
+
+
+def scan_log(
+    path: Path, ranges: Array, odometry_poses: Array, *, times: Array, stamps: Array, note: str
+) -> ScanLog:
+    """Return a log without a reference, of ranges ``(n, beams)`` [m] as they were recorded."""
+    measured, reach = without_returns(ranges)
+    angle_min, increment = beam_angles(ranges.shape[1])
+    return ScanLog(
+        name=path.name.split(".")[0], clock_start_s=float(times[0]), times=times - times[0], stamps=stamps,
+        ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach,
+        odometry_poses=odometry_poses, start_pose=odometry_poses[0].copy(), reference_times=np.zeros(0),
+        reference_poses=np.zeros((0, 3)), reference_gap_s=30.0, settings=_SETTINGS, note=note,
+    )  # fmt: skip
+
+
+def beam_angles(beams: int) -> tuple[float, float]:
+    """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
+
+    180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
+    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Other numbers span -90° to 90°.
+    """
+    step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
+    return math.radians(-90.0), math.radians(step)
 
 
 def chain(start: Array, steps: Array) -> Array:

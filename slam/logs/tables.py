@@ -13,7 +13,7 @@ from typing import BinaryIO, cast
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["check_times", "find", "numbers_of", "read_lines", "read_table"]
+__all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
 
 Array = NDArray[np.float64]
 
@@ -56,33 +56,30 @@ def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, NDArray[n
         One line: the file and line with a wrong number of columns, or something that is no finite number; or
         that the file cannot be read or holds no row.
     """
-    lines = _text(path).splitlines()
-    rows = [(number, line.split()) for number, line in enumerate(lines, 1) if not line.lstrip().startswith("#")]
-    rows = [(number, words) for number, words in rows if words]
-    if not rows:
-        raise ValueError(f"{path} holds no data: expected lines of {meaning}")
-    for number, words in rows:
+    rows: list[Array] = []
+    numbers: list[int] = []
+    for number, line in read_lines(path):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
         if len(words) != columns:
             raise ValueError(f"{path}, line {number}: expected {columns} columns ({meaning}), got {len(words)}")
-    numbers = np.array([number for number, _ in rows], np.int64)
-    try:
-        values = np.array([[float(word) for word in words] for _, words in rows])
-    except ValueError:
-        values = np.array([[_number(word) for word in words] for _, words in rows])
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(bad):
-        number, words = rows[int(bad[0])]
-        word = next(w for w in words if not math.isfinite(_number(w)))
-        raise ValueError(f"{path}, line {number}: {word[:40]!r} is not a finite number ({meaning})")
-    return values, numbers
+        rows.append(numbers_of(words, path=path, line=number, what=meaning))
+        numbers.append(number)
+    if not rows:
+        raise ValueError(f"{path} holds no data: expected lines of {meaning}")
+    return np.stack(rows), np.array(numbers, np.int64)
 
 
-def check_times(path: Path, times: Array, lines: NDArray[np.int64]) -> None:
-    """Raise ``ValueError`` with the file and line where a time lies before the one above it."""
+def read_timed(path: Path, columns: int, meaning: str) -> Array:
+    """Read a table like :func:`read_table` whose first column is a time, which must not go back."""
+    values, lines = read_table(path, columns, meaning)
+    times = values[:, 0]
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0]) + 1
         raise ValueError(f"{path}, line {lines[i]}: time {times[i]:.6g} is before {times[i - 1]:.6g} above it")
+    return values
 
 
 def _number(word: str) -> float:
@@ -119,21 +116,13 @@ def numbers_of(words: Sequence[str], *, path: Path, line: int, what: str) -> Arr
         One line: file, line, the word that is no finite number, and ``what`` it belongs to.
     """
     try:
-        values = np.array(words, dtype=np.float64)
+        values = np.array([float(word) for word in words])
     except ValueError:
         values = np.array([_number(word) for word in words])
     if not np.isfinite(values).all():
         word = words[int(np.flatnonzero(~np.isfinite(values))[0])]
         raise ValueError(f"{path}, line {line}: {word[:40]!r} is not a finite number ({what}); correct the line")
     return values
-
-
-def _text(path: Path) -> str:
-    with _opened(path) as file:
-        data = file.read(_LARGEST + 1)
-    if len(data) > _LARGEST:
-        raise ValueError(f"{path} is larger than {_LARGEST >> 20} MiB: it is no such log")
-    return data.decode("utf-8", "replace")
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time, split_holds
-from slam.logs.tables import check_times, find, read_table
+from slam.logs.tables import find, read_table, read_timed
 
 __all__ = ["FIRST_LANDMARK", "NOISE", "SETTINGS", "read"]
 
@@ -48,9 +48,9 @@ def read(folder: Path, robot: int) -> RecordedLog:
     ValueError
         One line: the file (and line) that is missing or damaged.
     """
-    odometry = _timed(find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, forward velocity, angular velocity")
-    measured = _timed(find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing")
-    truth = _timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation")
+    odometry = read_timed(find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, speed, angular velocity")
+    measured = read_timed(find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing")
+    truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation")
     landmark_ids, landmarks = _landmarks(find(folder, "Landmark_Groundtruth.dat"))
     subject_of_code = _codes(find(folder, "Barcodes.dat"))
 
@@ -82,12 +82,6 @@ def read(folder: Path, robot: int) -> RecordedLog:
         observation_noise=NOISE, settings=SETTINGS,
         note="reference: Vicon pose of the robot's centre; the start pose is the reference's",
     )  # fmt: skip
-
-
-def _timed(path: Path, columns: int, meaning: str) -> Array:
-    values, lines = read_table(path, columns, meaning)
-    check_times(path, values[:, 0], lines)
-    return values
 
 
 def _codes(path: Path) -> dict[int, int]:

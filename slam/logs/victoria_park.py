@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time
-from slam.logs.tables import check_times, find, read_table
+from slam.logs.tables import find, read_table, read_timed
 
 __all__ = [
     "AXLES_M",
@@ -103,8 +103,10 @@ def read(folder: Path) -> RecordedLog:
         One line: the file (and line) that is missing or damaged, or two files that disagree in length.
     """
     times = _times(folder, "time.txt")
-    speed, _ = _column(folder, "speed.txt", "wheel speed", like=times, of="time.txt")
-    steering, lines = _column(folder, "steering.txt", "steering angle", like=times, of="time.txt")
+    rows = len(times)
+    speed = _beside(folder, "speed.txt", 1, "wheel speed", rows=rows, of="time.txt")[0][:, 0]
+    angles, lines = _beside(folder, "steering.txt", 1, "steering angle", rows=rows, of="time.txt")
+    steering = angles[:, 0]
     steep = np.flatnonzero(np.abs(steering) > _STEEPEST)
     if len(steep):
         i = int(steep[0])
@@ -113,9 +115,7 @@ def read(folder: Path) -> RecordedLog:
     begin, end = float(times[0]), float(times[-1])
     if not begin < end:
         raise ValueError(f"log {folder} has odometry of a single instant; it is cut short")
-    gps_path = find(folder, "gps.txt")
-    gps, gps_lines = read_table(gps_path, 3, "time in ms, east, north")
-    check_times(gps_path, gps[:, 0], gps_lines)
+    gps = read_timed(find(folder, "gps.txt"), 3, "time in ms, east, north")
     gps[:, 0] *= 1e-3
     _, first = np.unique(gps[:, 0], return_index=True)
     gps = gps[first]
@@ -137,10 +137,15 @@ def read(folder: Path) -> RecordedLog:
 def _trees(folder: Path, begin: float, end: float) -> tuple[Array, Array, NDArray[np.int64]]:
     """Return times ``(m,)`` since ``begin``, trees ``(o, 2)`` and where each frame's end ``(m,)``."""
     times = _times(folder, "lasersampling.txt")
-    distances, angles = (
-        _frames(folder, name, meaning, like=times)
-        for name, meaning in (("ObservationDistance.txt", "distances"), ("ObservationAngle.txt", "angles"))
-    )
+    frames: list[Array] = []
+    for name, what in (("ObservationDistance.txt", "distances"), ("ObservationAngle.txt", "angles")):
+        meaning = f"{what} of up to {_TREES} trees, 0 for none"
+        values, lines = _beside(folder, name, _TREES, meaning, rows=len(times), of="lasersampling.txt")
+        bad = np.flatnonzero((values < 0.0).any(axis=1))
+        if len(bad):
+            raise ValueError(f"{find(folder, name)}, line {lines[bad[0]]}: {what} cannot be negative")
+        frames.append(values)
+    distances, angles = frames
     seen = distances > 0.0
     frame = np.nonzero(seen)[0]
     # The laser counts its angle from the right; ahead is a quarter turn on.
@@ -150,29 +155,15 @@ def _trees(folder: Path, begin: float, end: float) -> tuple[Array, Array, NDArra
 
 
 def _times(folder: Path, name: str) -> Array:
+    return 1e-3 * read_timed(find(folder, name), 1, "time in ms")[:, 0]
+
+
+def _beside(
+    folder: Path, name: str, columns: int, meaning: str, *, rows: int, of: str
+) -> tuple[Array, NDArray[np.int64]]:
+    """Read a table that must have as many rows as another file."""
     path = find(folder, name)
-    values, lines = read_table(path, 1, "time in ms")
-    check_times(path, values[:, 0], lines)
-    return 1e-3 * values[:, 0]
-
-
-def _column(folder: Path, name: str, meaning: str, *, like: Array, of: str) -> tuple[Array, NDArray[np.int64]]:
-    path = find(folder, name)
-    values, lines = read_table(path, 1, meaning)
-    _same_length(path, len(values), len(like), of)
-    return values[:, 0], lines
-
-
-def _frames(folder: Path, name: str, meaning: str, *, like: Array) -> Array:
-    path = find(folder, name)
-    values, lines = read_table(path, _TREES, f"{meaning} of up to {_TREES} trees, 0 for none")
-    _same_length(path, len(values), len(like), "lasersampling.txt")
-    bad = np.flatnonzero((values < 0.0).any(axis=1))
-    if len(bad):
-        raise ValueError(f"{path}, line {lines[bad[0]]}: {meaning} cannot be negative")
-    return values
-
-
-def _same_length(path: Path, rows: int, expected: int, of: str) -> None:
-    if rows != expected:
-        raise ValueError(f"{path} has {rows} rows, {of} {expected}: one of them is cut short; fetch them again")
+    values, lines = read_table(path, columns, meaning)
+    if len(values) != rows:
+        raise ValueError(f"{path} has {len(values)} rows, {of} {rows}: one of them is cut short; fetch them again")
+    return values, lines

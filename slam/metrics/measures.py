@@ -16,40 +16,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.metrics.chi_square import chi2_quantile
-from slam.metrics.relations import (
-    RelationScore,
-    closing_relations,
-    local_relations,
-    relation_errors,
-    relation_score,
-)
 
 __all__ = [
     "CornerDeviation",
     "MapScore",
-    "RelationScore",
-    "RelativeError",
     "align_se2",
     "anees",
     "ate",
     "ate_aligned",
-    "chi2_quantile",
-    "closing_relations",
     "compare_walls",
     "corner_deviation",
     "coverage",
-    "fraction_in_band",
-    "free_space_iou",
     "heading_errors",
-    "local_relations",
-    "nees",
     "nees_band",
     "nees_pose",
     "nees_pose_invariant",
-    "nis",
-    "relation_errors",
-    "relation_score",
-    "rpe",
     "time_to",
 ]
 
@@ -58,13 +39,6 @@ Mask = NDArray[np.bool_]
 
 # ---------------------------------------------------------------------------------------------------------
 # Trajectories (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)
-
-
-class RelativeError(NamedTuple):
-    """Root mean square drift over a fixed number of steps."""
-
-    translation_m: float
-    rotation_rad: float
 
 
 def ate(true_poses: ArrayLike, est_poses: ArrayLike) -> float:
@@ -95,19 +69,6 @@ def align_se2(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
     return np.array([*(true_centre - turned), wrap_scalar(angle)])
 
 
-def rpe(true_poses: ArrayLike, est_poses: ArrayLike, *, delta: int = 1) -> RelativeError:
-    """Return the relative pose error over ``delta`` steps of poses ``(n, 3)``, n > delta.
-
-    The motion from pose i to i + delta, in the body frame of pose i, estimated against true: RMS of the
-    difference in translation [m] and in heading [rad].
-    """
-    true, est = _trajectories(true_poses, est_poses, columns=3)
-    if not 1 <= delta < len(true):
-        raise ValueError(f"rpe of {len(true)} poses needs delta in 1 … {len(true) - 1}, got {delta}")
-    translation, rotation = (e - t for t, e in zip(_motions(true, delta), _motions(est, delta), strict=True))
-    return RelativeError(_rms(translation), _rms(wrap(rotation)[:, None]))
-
-
 def heading_errors(true_poses: ArrayLike, est_poses: ArrayLike) -> Array:
     """Return estimated minus true heading ``(n,)`` [rad] in [-π, π) of poses ``(n, 3)``."""
     true, est = _trajectories(true_poses, est_poses, columns=3)
@@ -119,12 +80,6 @@ def _trajectories(true_poses: ArrayLike, est_poses: ArrayLike, *, columns: int) 
     if true.ndim != 2 or true.shape != est.shape or len(true) == 0 or true.shape[1] < columns:
         raise ValueError(f"needs two equal arrays of poses (n ≥ 1, {columns}), got {true.shape} and {est.shape}")
     return true, est
-
-
-def _motions(poses: Array, delta: int) -> tuple[Array, Array]:
-    step = poses[delta:] - poses[:-delta]
-    c, s = np.cos(poses[:-delta, 2]), np.sin(poses[:-delta, 2])
-    return np.stack([c * step[:, 0] + s * step[:, 1], c * step[:, 1] - s * step[:, 0]], axis=1), step[:, 2]
 
 
 def _rms(vectors: Array) -> float:
@@ -200,62 +155,6 @@ def nees_pose_invariant(est: Array, cov: Array, true: Array) -> float:
     return _pose_form((a * dx + b * dy) * scale - est[1] * t, (a * dy - b * dx) * scale + est[0] * t, t, cov)
 
 
-@njit(cache=True, nogil=True)
-def _forms(errors: Array, covs: Array) -> Array:
-    """Return eᵀ P⁻¹ e for each row of ``(n, k)`` under ``(n, k, k)``, by L D Lᵀ in one scratch matrix."""
-    n, k = errors.shape
-    out, residual, work = np.zeros(n), np.empty(k), np.empty((k, k))
-    for i in range(n):
-        residual[:] = errors[i]
-        work[:] = covs[i]
-        for j in range(k):
-            pivot, variance = work[j, j], covs[i, j, j]
-            out[i] += _term(residual[j], pivot, variance)
-            if _pivot_vanishes(pivot, variance):
-                continue
-            for r in range(j + 1, k):
-                factor = work[r, j] / pivot
-                residual[r] -= factor * residual[j]
-                for c in range(j + 1, r + 1):
-                    work[r, c] -= factor * work[c, j]
-    return out
-
-
-def nees(error: ArrayLike, cov: ArrayLike) -> Array:
-    """Return the normalised estimation error squared of poses, eᵀ P⁻¹ e: mean 3 for a consistent filter.
-
-    Parameters
-    ----------
-    error, cov : (…, 3), (…, 3, 3)
-        Pose errors [m, m, rad], headings wrapped here, and claimed covariances.
-
-    Returns
-    -------
-    (…,) array, singular covariances as in :func:`nees_pose`.
-    """
-    errors = np.array(error, np.float64)
-    if errors.ndim < 1 or errors.shape[-1] != 3:
-        raise ValueError(f"nees is of pose errors (…, 3), got {errors.shape}")
-    errors[..., 2] = wrap(errors[..., 2])
-    return nis(errors, cov)
-
-
-def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
-    """Return the normalised innovation squared νᵀ S⁻¹ ν: mean k for a consistent filter.
-
-    Parameters
-    ----------
-    innovation, cov : (…, k), (…, k, k)
-        Innovations, bearings already wrapped, and their covariances S.
-    """
-    v, s = np.asarray(innovation, np.float64), np.asarray(cov, np.float64)
-    if v.ndim < 1 or s.shape != (*v.shape, v.shape[-1]):
-        raise ValueError(f"needs vectors (…, k) and covariances (…, k, k), got {v.shape} and {s.shape}")
-    k = v.shape[-1]
-    values: Array = _forms(v.reshape(-1, k), s.reshape(-1, k, k)).reshape(v.shape[:-1])
-    return values
-
-
 def anees(values: ArrayLike, *, dof: int = 3, axis: int | None = None) -> Array:
     """Return the average of NEES (or NIS) values divided by ``dof``: ideal 1, above it overconfident.
 
@@ -279,13 +178,6 @@ def nees_band(dof: int, runs: int, *, confidence: float = 0.95) -> tuple[float, 
     return chi2_quantile(tail, total) / total, chi2_quantile(1.0 - tail, total) / total
 
 
-def fraction_in_band(averages: ArrayLike, *, dof: int, runs: int, confidence: float = 0.95) -> float:
-    """Return the share of steps whose Monte-Carlo average (:func:`anees`) lies in :func:`nees_band`."""
-    low, high = nees_band(dof, runs, confidence=confidence)
-    v = np.asarray(averages, np.float64)
-    return float(np.mean((v >= low) & (v <= high))) if v.size else math.nan
-
-
 # ---------------------------------------------------------------------------------------------------------
 # Maps
 
@@ -306,17 +198,6 @@ class MapScore(NamedTuple):
     recall: float
 
 
-@njit(cache=True, nogil=True)
-def _nearest_distances(points: Array, targets: Array) -> Array:
-    out = np.full(len(points), np.inf)
-    for i in range(len(points)):
-        for j in range(len(targets)):
-            dx, dy = points[i, 0] - targets[j, 0], points[i, 1] - targets[j, 1]
-            out[i] = min(out[i], dx * dx + dy * dy)
-        out[i] = math.sqrt(out[i])
-    return out
-
-
 def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
     """Return paper D's r: the distance of each mapped corner ``(n, 2)`` from the nearest true one ``(m, 2)``.
 
@@ -326,13 +207,11 @@ def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
     targets = np.asarray(true, np.float64).reshape(-1, 2)
     if len(points) == 0 or len(targets) == 0:
         return CornerDeviation(math.nan, math.nan, np.full(len(points), math.nan))
-    each: Array = _nearest_distances(points, targets)
+    each: Array = np.sqrt(np.min(np.sum((points[:, None] - targets) ** 2, axis=2), axis=1))
     return CornerDeviation(float(each.mean()), float(each.max()), each)
 
 
-def compare_walls(
-    belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float, region: Mask | None = None
-) -> MapScore:
+def compare_walls(belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float) -> MapScore:
     """Compare the walls of two rasters on one lattice, forgiving displacements up to a tolerance.
 
     A belief cell is *right* when a true wall cell lies within the tolerance, a true cell *found* when a
@@ -346,27 +225,18 @@ def compare_walls(
         Cells believed, and known, to hold a wall.
     tolerance_cells : float
         Greatest distance [cells] that still counts as a match.
-    region : (rows, cols) bool, optional
-        Cells that are counted, such as what can be seen; matches may lie outside it.
     """
-    belief, true, counted = _rasters(belief_occupied, true_wall, region)
-    right = int(np.count_nonzero(belief & counted & _within(true, tolerance_cells)))
-    found = int(np.count_nonzero(true & counted & _within(belief, tolerance_cells)))
-    believed, walls = int(np.count_nonzero(belief & counted)), int(np.count_nonzero(true & counted))
+    belief, true = _rasters(belief_occupied, true_wall)
+    right = int(np.count_nonzero(belief & _within(true, tolerance_cells)))
+    found = int(np.count_nonzero(true & _within(belief, tolerance_cells)))
+    believed, walls = int(np.count_nonzero(belief)), int(np.count_nonzero(true))
     # TP + FN is all the true cells.
     return MapScore(_ratio(found, walls + believed - right), _ratio(right, believed), _ratio(found, walls))
 
 
-def free_space_iou(belief_free: Mask, true_free: Mask, *, region: Mask | None = None) -> float:
-    """Return |A ∩ B| / |A ∪ B| of the free cells ``(rows, cols)`` believed and true, within ``region``."""
-    belief, true, counted = _rasters(belief_free, true_free, region)
-    both, either = np.count_nonzero(belief & true & counted), np.count_nonzero((belief | true) & counted)
-    return _ratio(int(both), int(either))
-
-
 def coverage(belief_free: Mask, visible_free: Mask) -> float:
     """Return the share of the free cells that can be seen which the belief rightly has as free."""
-    belief, visible, _ = _rasters(belief_free, visible_free, None)
+    belief, visible = _rasters(belief_free, visible_free)
     return _ratio(int(np.count_nonzero(belief & visible)), int(np.count_nonzero(visible)))
 
 
@@ -379,12 +249,11 @@ def time_to(coverage_curve: ArrayLike, times: ArrayLike, *, level: float) -> flo
     return float(t[reached[0]]) if len(reached) else None
 
 
-def _rasters(belief: Mask, true: Mask, region: Mask | None) -> tuple[Mask, Mask, Mask]:
+def _rasters(belief: Mask, true: Mask) -> tuple[Mask, Mask]:
     a, b = np.asarray(belief, np.bool_), np.asarray(true, np.bool_)
-    counted = np.ones(a.shape, np.bool_) if region is None else np.asarray(region, np.bool_)
-    if a.ndim != 2 or not a.shape == b.shape == counted.shape:
-        raise ValueError(f"rasters must share one lattice, got {a.shape}, {b.shape} and {counted.shape}")
-    return a, b, counted
+    if a.ndim != 2 or a.shape != b.shape:
+        raise ValueError(f"rasters must share one lattice, got {a.shape} and {b.shape}")
+    return a, b
 
 
 def _within(cells: Mask, tolerance: float) -> Mask:

@@ -3,7 +3,6 @@
 Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss and Kleiner, "On measuring the accuracy of SLAM
 algorithms", Autonomous Robots 27 (2009). It compares relative poses, so neither where the frame lies nor an
 early error that turns all that follows counts more than once. ``docs/reference/metrics.md`` has the equations.
-Re-exported by :mod:`slam.metrics.measures`.
 """
 
 from __future__ import annotations

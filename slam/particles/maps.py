@@ -39,11 +39,6 @@ class ParticleMaps:
         # Smallest and largest x and y of each landmark over the particles (or somewhat wider).
         self.extents = np.zeros((32, 4))
 
-    @property
-    def particles(self) -> int:
-        """Number of particles."""
-        return len(self.table)
-
     def of(self, particle: int) -> Array:
         """Return one particle's landmarks ``(n, 5)``: x, y [m], σxx, σxy, σyy [m²]."""
         return self.records[self.table[particle, : self.count]]
@@ -65,7 +60,7 @@ class ParticleMaps:
         if self.count == self.table.shape[1]:
             self.table = np.hstack([self.table, np.zeros_like(self.table)])
             self.extents = np.vstack([self.extents, np.zeros_like(self.extents)])
-        self.reserve(self.particles)
+        self.reserve(len(self.table))
         row = self.count
         _add(poses, z, offset, row, self.table, self.records, self.references, self.free, self.free_count)
         self.count = row + 1

@@ -35,7 +35,6 @@ class ParticleMatcher:
         self._plane = np.zeros((1, 1), np.uint8)
         self._cells = np.zeros((1, 2), np.int32)
         self._evidence = np.zeros((1, 4), np.float32)
-        self._curvature = np.zeros((3, 3))
 
     def fit(
         self, grids: ParticleGrids, particle: int, points: Array, pose: Array, info: Array, *,

@@ -9,10 +9,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.geometry import wrap_scalar
+from slam.geometry import wrap, wrap_scalar
 from slam.settings import require, unknown_name
 
-__all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "systematic"]
+__all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,15 @@ class ResamplingPolicy:
         if self.when == "n_eff":
             return n_eff < self.share * particles
         return self.when == "every_step" or updates >= self.every
+
+
+def scattered(pose: Array, pose_cov: Array, particles: int, rng: np.random.Generator) -> Array:
+    """Return poses ``(particles, 3)`` drawn from the Gaussian of a start pose."""
+    variances, axes = np.linalg.eigh(pose_cov)
+    spread = axes * np.sqrt(np.maximum(variances, 0.0))
+    poses: Array = pose + rng.standard_normal((particles, 3)) @ spread.T
+    poses[:, 2] = wrap(poses[:, 2])
+    return poses
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

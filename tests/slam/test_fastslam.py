@@ -166,7 +166,7 @@ def test_association_is_that_of_the_joint_filter_without_correlations(seed: int)
         z[k, 5:7] = marks[i, 0], wrap(marks[i, 1] - x[2] + rng.normal(0, 0.4))
     maps.extents[:n] = np.repeat(x[3:].reshape(n, 2), 2, axis=1)
     want, distance = np.zeros(m, np.int64), np.zeros(m)
-    nearest_neighbour(x, np.triu(p), n, OFFSET, z, marks, 11.8, 0.2, 0.6, False, want, distance, np.zeros((2, 5)))
+    nearest_neighbour(x, np.triu(p), OFFSET, z, marks, 11.8, 0.2, 0.6, False, want, distance)
     match, covs = np.zeros((2, m), np.int64), np.repeat(np.triu(p[:3, :3])[None], 2, axis=0)
     leader = associate(
         np.repeat(x[None, :3], 2, axis=0), covs, OFFSET, z, marks, 11.8, 0.2, 0.6, maps.table, maps.records,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.logs import ScanLog
-from slam.metrics.measures import RelationScore, closing_relations, local_relations, relation_score
+from slam.metrics.relations import RelationScore, closing_relations, local_relations, relation_score
 from training.replay.run import Replay
 
 __all__ = ["scan_metrics"]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,6 +17,18 @@ from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
 
 ROOM = np.array([[0.0, 0.0], [6.0, 0.0], [6.0, 5.0], [0.0, 5.0]])
 inside = st.tuples(st.floats(1, 5), st.floats(1, 4), st.floats(-3.1, 3.1)).map(np.array)
+
+
+class Corners(NamedTuple):
+    range_bearing: np.ndarray  # (m, 2)
+    cov: np.ndarray  # (m, 2, 2)
+    kind: np.ndarray  # (m,)
+    direction: np.ndarray  # (m,)
+
+
+def corners_in(extractor: FeatureExtractor, scan: Scan) -> Corners:
+    rows = extractor.extract(scan).copy()
+    return Corners(rows[:, :2], rows[:, [2, 3, 3, 4]].reshape(-1, 2, 2), rows[:, 5], rows[:, 6])
 
 
 def polygon_scan(pose: np.ndarray, loops: list[np.ndarray], rng: np.random.Generator | None = None) -> Scan:
@@ -44,8 +57,8 @@ def polar(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 @given(inside)
 def test_a_clean_room_has_exact_corners_and_walls(pose: np.ndarray) -> None:
     extractor = FeatureExtractor()
-    extractor.extract(room_scan(pose))
-    corners, lines = extractor.corners(), extractor.lines()
+    corners = corners_in(extractor, room_scan(pose))
+    rows = extractor.with_walls()
     true = polar(pose, ROOM)
     assert 3 <= len(corners.kind) <= 4  # one may lie where the circle of beams begins
     for seen, direction, kind in zip(corners.range_bearing, corners.direction, corners.kind, strict=True):
@@ -56,7 +69,7 @@ def test_a_clean_room_has_exact_corners_and_walls(pose: np.ndarray) -> None:
         inward = math.atan2(*np.sign(np.array([3.0, 2.5]) - ROOM[i])[::-1])
         assert abs(float(wrap(direction + pose[2] - inward))) < 1e-2
     walls = {0.0: pose[0], math.pi / 2: pose[1], math.pi: 6 - pose[0], -math.pi / 2: 5 - pose[1]}
-    for alpha, r in lines.hesse:
+    for r, alpha in rows[rows[:, 5] == LINE, :2]:
         outward = float(wrap(alpha + pose[2] + math.pi))
         nearest = min(walls, key=lambda a: abs(float(wrap(a - outward))))
         assert abs(r - walls[nearest]) < 1e-6
@@ -69,8 +82,7 @@ def test_corner_errors_have_the_declared_covariance() -> None:
     nees, found = [], 0
     for _ in range(400):
         pose = np.array([rng.uniform(1, 5), rng.uniform(1, 4), rng.uniform(-3, 3)])
-        extractor.extract(room_scan(pose, rng))
-        corners, true = extractor.corners(), polar(pose, ROOM)
+        corners, true = corners_in(extractor, room_scan(pose, rng)), polar(pose, ROOM)
         found += len(corners.kind)
         for z, cov in zip(corners.range_bearing, corners.cov, strict=True):
             error = np.column_stack([true[:, 0] - z[0], wrap(true[:, 1] - z[1])])
@@ -84,9 +96,7 @@ def test_corner_errors_have_the_declared_covariance() -> None:
 def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None:
     box = np.array([[3.0, 2.0], [3.6, 2.0], [3.6, 2.6], [3.0, 2.6]])
     pose = np.array([1.5, 1.0, 0.4])
-    extractor = FeatureExtractor()
-    extractor.extract(polygon_scan(pose, [ROOM, box], np.random.default_rng(1)))
-    corners = extractor.corners()
+    corners = corners_in(FeatureExtractor(), polygon_scan(pose, [ROOM, box], np.random.default_rng(1)))
     convex = corners.range_bearing[corners.kind == CONVEX]
     # (3, 2) faces the sensor, and the visible faces end at corners of the box too; what the box hides of the
     # walls ends at the rim of its shadow, which is no corner.
@@ -127,8 +137,7 @@ def ends_of_a_wall(sigma: float, *, thick: float, from_x: tuple[float, float]) -
         pose = np.array([rng.uniform(*from_x), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
         scan = polygon_scan(pose, [ROOM, wall])
         scan.ranges[:] += sigma * rng.standard_normal(BEAMS)
-        extractor.extract(scan)
-        corners = extractor.corners()
+        corners = corners_in(extractor, scan)
         for z, cov, kind in zip(corners.range_bearing, corners.cov, corners.kind, strict=True):
             if kind != CONVEX:
                 continue
@@ -187,8 +196,8 @@ def test_a_round_column_is_no_corner() -> None:
     column = np.array([2.5, 2.0]) + 0.3 * np.column_stack([np.cos(around), np.sin(around)])
     extractor = FeatureExtractor()
     for seed in range(20):
-        extractor.extract(polygon_scan(pose, [ROOM, column], np.random.default_rng(seed)))
-        assert not np.any(extractor.corners().kind == CONVEX)
+        scan = polygon_scan(pose, [ROOM, column], np.random.default_rng(seed))
+        assert not np.any(corners_in(extractor, scan).kind == CONVEX)
 
 
 def test_few_beams_far_apart_are_never_joined() -> None:

@@ -236,7 +236,8 @@ def in_a_room(steps: int) -> tuple[InvariantEkfSlam, slam.Scan]:
 
 def test_a_trial_leaves_no_trace() -> None:
     filter_, scan = in_a_room(30)
-    z = filter_._observed(scan)
+    filter_.extractor.extract(scan)
+    z = filter_.extractor.with_walls()
     match = filter_._associate(z).copy()
     assert np.count_nonzero(match >= 0) >= 2 and np.abs(filter_.wheel_errors[0]).max() > 1e-4
     before = filter_._wheels.snapshot()

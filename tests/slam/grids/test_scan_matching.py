@@ -32,7 +32,7 @@ def room_field(config: MatchConfig = CONFIG) -> LikelihoodField:
     """A field of the room's walls themselves, 6 m × 5 m."""
     x, y = np.arange(0, 6.0, 0.02), np.arange(0, 5.0, 0.02)
     walls = [(x, 0 * x), (x, 0 * x + 5.0), (0 * y, y), (0 * y + 6.0, y)]
-    return LikelihoodField.of_points(config, np.vstack([np.column_stack(w) for w in walls]))
+    return LikelihoodField(config, np.vstack([np.column_stack(w) for w in walls]))
 
 
 def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -44,7 +44,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def random_field(seed: int) -> tuple[LikelihoodField, np.ndarray, np.random.Generator]:
     rng = np.random.default_rng(seed)
     surface = rng.uniform(-1.5, 1.5, (60, 2))
-    return LikelihoodField.of_points(CONFIG, surface), rng.uniform(-1.5, 1.5, (40, 2)), rng
+    return LikelihoodField(CONFIG, surface), rng.uniform(-1.5, 1.5, (40, 2)), rng
 
 
 @settings(max_examples=25)
@@ -66,7 +66,7 @@ def test_a_scan_matches_the_scan_before_it_seen_through_an_offset_sensor() -> No
     poses = [HERE, compose(HERE, np.array([0.2, -0.1, 0.15]))]
     ahead = np.array([0.2, 0.0, 0.0])
     points = [body_points(room_scan(compose(p, ahead), rng), CONFIG, offset_m=0.2) for p in poses]
-    field = LikelihoodField.of_points(CONFIG, transform_points(poses[0], points[0]))
+    field = LikelihoodField(CONFIG, transform_points(poses[0], points[0]))
     np.testing.assert_allclose(difference(match(field, points[1], poses[0], CONFIG).pose, poses[1]), 0, atol=0.02)
 
 
@@ -132,7 +132,7 @@ def test_covariance_against_the_scatter_of_matches() -> None:
 
 def test_a_corridor_leaves_its_own_direction_open() -> None:
     x = np.arange(-20, 20, 0.02)
-    field = LikelihoodField.of_points(CONFIG, np.vstack([np.column_stack([x, 0 * x + s]) for s in (-1.0, 1.0)]))
+    field = LikelihoodField(CONFIG, np.vstack([np.column_stack([x, 0 * x + s]) for s in (-1.0, 1.0)]))
     angles = np.radians(np.arange(0, 360))
     with np.errstate(divide="ignore"):
         ranges = 1.0 / np.abs(np.sin(angles))

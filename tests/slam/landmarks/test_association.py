@@ -13,19 +13,18 @@ from hypothesis import strategies as st
 import slam
 from slam import Observations, Odometry
 from slam.geometry import compose, inverse, wrap
-from slam.landmarks.association import IGNORED, innovation_blocks, joint_compatibility, nearest_neighbour
-from slam.metrics.chi_square import chi2_quantile
+from slam.landmarks.association import IGNORED, nearest_neighbour, predicted
+from slam.landmarks.joint_compatibility import JOINT_GATES, joint_compatibility
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
 OFFSET = 0.2
-GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, 65)])
 
 
 def observe(x: np.ndarray, i: int, *, sigma: float = 1e-4) -> np.ndarray:
     """Return the observation row of landmark ``i`` as predicted, of unknown kind."""
     row = np.zeros(8)
-    row[:2] = innovation_blocks(x, i, OFFSET, np.zeros((2, 5)))
+    row[:2] = predicted(x, i, 0.0, OFFSET, np.zeros((2, 5)))
     row[2], row[4] = sigma**2, sigma**2
     return row
 
@@ -37,7 +36,7 @@ def joint_distance(x: np.ndarray, p: np.ndarray, z: np.ndarray, pairs: list[tupl
     nu = np.zeros(2 * len(pairs))
     for q, (k, i) in enumerate(pairs):
         block = np.zeros((2, 5))
-        nu[2 * q : 2 * q + 2] = z[k, :2] - np.array(innovation_blocks(x, i, OFFSET, block))
+        nu[2 * q : 2 * q + 2] = z[k, :2] - np.array(predicted(x, i, 0.0, OFFSET, block))
         nu[2 * q + 1] = wrap(nu[2 * q + 1])
         h[2 * q : 2 * q + 2, :3] = block[:, :3]
         h[2 * q : 2 * q + 2, 3 + 2 * i : 5 + 2 * i] = block[:, 3:]
@@ -54,7 +53,7 @@ def exhaustive(x: np.ndarray, p: np.ndarray, z: np.ndarray, landmarks: int) -> t
             continue
         pairs = [(k, i) for k, i in enumerate(choice) if i >= 0]
         steps = [joint_distance(x, p, z, pairs[: n + 1]) for n in range(len(pairs))]
-        if any(d > GATES[n + 1] for n, d in enumerate(steps)):
+        if any(d > JOINT_GATES[n + 1] for n, d in enumerate(steps)):
             continue
         if pairs and (len(pairs) > best[0] or steps[-1] < best[1]):
             best = (len(pairs), steps[-1])
@@ -70,7 +69,7 @@ def test_joint_compatibility_finds_the_best_set_of_all(seed: int) -> None:
     z = np.array([observe(x, int(i), sigma=0.02) for i in rng.integers(0, 4, 3)])
     z[:, :2] += rng.normal(0, 0.08, (3, 2))
     match = np.zeros(3, np.int64)
-    distance = joint_compatibility(x, np.triu(p), 4, OFFSET, z, np.zeros((4, 2)), GATES, 0.2, 0.6, 100_000, match)
+    distance = joint_compatibility(x, np.triu(p), OFFSET, z, np.zeros((4, 2)), 0.2, 0.6, match)
     pairs = [(k, int(i)) for k, i in enumerate(match) if i >= 0]
     count, nearest = exhaustive(x, p, z, 4)
     assert len(pairs) == count
@@ -89,8 +88,8 @@ def test_joint_compatibility_holds_where_nearest_neighbour_is_fooled() -> None:
     z = np.array([observe(truth, i, sigma=0.01) for i in (1, 2, 3, 4)])
     nearest, joint = np.zeros(4, np.int64), np.zeros(4, np.int64)
     marks = np.zeros((5, 2))
-    nearest_neighbour(x, p, 5, OFFSET, z, marks, GATES[1], 0.1, 0.6, False, nearest, np.zeros(4), np.zeros((2, 5)))
-    joint_compatibility(x, p, 5, OFFSET, z, marks, GATES, 0.1, 0.6, 10_000, joint)
+    nearest_neighbour(x, p, OFFSET, z, marks, JOINT_GATES[1], 0.1, 0.6, False, nearest, np.zeros(4))
+    joint_compatibility(x, p, OFFSET, z, marks, 0.1, 0.6, joint)
     assert nearest[:3].tolist() == [0, 1, 2]
     assert joint.tolist() == [1, 2, 3, 4]
 
@@ -101,7 +100,7 @@ def test_what_could_be_a_landmark_but_is_not_jointly_is_not_new() -> None:
     z = np.array([observe(x, i, sigma=0.002) for i in range(3)])
     z[2, 0] += 0.1  # within the pose's own gate, not together with the other two
     match = np.zeros(3, np.int64)
-    joint_compatibility(x, p, 3, OFFSET, z, np.zeros((3, 2)), GATES, 0.1, 0.6, 10_000, match)
+    joint_compatibility(x, p, OFFSET, z, np.zeros((3, 2)), 0.1, 0.6, match)
     assert match.tolist() == [0, 1, IGNORED]
 
 

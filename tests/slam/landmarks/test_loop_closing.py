@@ -16,7 +16,6 @@ from tests.slam.simulated import observe_landmarks
 
 OFFSET = 0.2
 GATE = chi2_quantile(0.997, 2)
-GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, 20)])
 SIGMA = 0.1
 
 
@@ -46,7 +45,7 @@ def test_a_wall_beside_a_known_one_is_new_however_far_the_start_is(pose_sigma: f
     x, p, marks = lone_wall(pose_sigma)
     z = np.array([wall_row(2.0, math.pi / 2, -1.0, 1.0), wall_row(1.5, math.pi / 2, -3.0, 4.0)])
     match = np.zeros(2, np.int64)
-    nearest_neighbour(x, p, 1, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(2), np.zeros((2, 5)))
+    nearest_neighbour(x, p, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(2))
     assert match.tolist() == [0, UNMATCHED]
 
 
@@ -54,7 +53,7 @@ def test_what_may_be_a_known_wall_badly_seen_is_not_new() -> None:
     x, p, marks = lone_wall(0.3)
     z = np.array([wall_row(1.9, math.pi / 2, -1.0, 1.0)])  # beyond the gate, yet too near to be another
     match = np.zeros(1, np.int64)
-    nearest_neighbour(x, p, 1, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(1), np.zeros((2, 5)))
+    nearest_neighbour(x, p, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(1))
     assert match.tolist() == [IGNORED]
 
 
@@ -68,7 +67,7 @@ def test_a_surface_that_lies_on_two_pieces_of_wall_is_the_one_seen_last() -> Non
     z = np.array([wall_row(2.0, math.pi / 2, start, end) for start, end in ((0.0, 7.0), (-3.0, 3.0))])
     p[4, 4] = p[1, 1] = p[1, 4] = 1e-6  # so that both are within the gate
     match = np.zeros(2, np.int64)
-    nearest_neighbour(x, p, 2, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(2), np.zeros((2, 5)))
+    nearest_neighbour(x, p, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(2))
     assert match.tolist() == [1, 0]  # on both, and on the first alone
 
 
@@ -102,9 +101,9 @@ def test_one_old_wall_closes_no_loop_and_four_that_agree_do() -> None:
     stranger = wall_row(2.2 - sensor[1], math.pi / 2, 0.0, 1.0)
     z = np.array([stranger])
     match = np.zeros(1, np.int64)
-    nearest_neighbour(x, p, 5, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(1), np.zeros((2, 5)))
+    nearest_neighbour(x, p, OFFSET, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(1))
     assert match[0] == 0  # the only one within the gate, 8 cm from where it is expected: 28 cm wrong
-    arguments = (marks, 1000, SIGMA, GATES, 0.2, 0.6, 4000)
+    arguments = (marks, 1000, SIGMA, 0.2, 0.6)
     assert agreeing(x, p, OFFSET, z, *arguments, match) == 0
     assert match.tolist() == [IGNORED]
     z = np.array([stranger] + [seen(i, sensor) for i in range(5)])

@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 import slam
 from slam.geometry import compose, wrap
 from slam.logs import ScanLog, open_log, with_reference
-from slam.logs.carmen import beam_angles
 from slam.logs.dpslam import NOMINAL_DT_S
-from slam.logs.scans import rising, without_returns
+from slam.logs.scans import beam_angles, rising, without_returns
 from slam.metrics.measures import ate
 from tests.slam.logs.logs_on_disk import data_folder, write_utias
 from tests.slam.logs.scans_on_disk import (
@@ -32,6 +31,7 @@ from tests.slam.logs.scans_on_disk import (
 
 coordinates = st.floats(-300.0, 300.0)  # no farther apart than a robot can be from scan to scan
 poses = st.tuples(coordinates, coordinates, st.floats(-3.1, 3.1)).map(np.array)
+measured = st.floats(0.01, 8.0) | st.floats(8.2, 50.0)  # between are a laser's codes for no return
 unknown_lines = st.sampled_from(
     ["", "# a comment", "NEFF 14.2", "PARAM a b", "SYNC x", "RLASER 2 1 1", "TRUEPOS 1", "  ", "FLASERX 3", "\x00"]
 )
@@ -48,8 +48,7 @@ def scan_log(path: Path) -> ScanLog:
 
 @settings(max_examples=40)
 @given(
-    scans=st.lists(st.tuples(st.lists(st.floats(0.01, 50.0), min_size=3, max_size=3), poses), min_size=1,
-                   max_size=6),
+    scans=st.lists(st.tuples(st.lists(measured, min_size=3, max_size=3), poses), min_size=1, max_size=6),
     noise=st.lists(unknown_lines, max_size=8), packed=st.booleans(), end=st.sampled_from(["", "\n", "\r\n"]),
 )  # fmt: skip
 def test_carmen_scans_among_unknown_lines(scans, noise, packed, end, tmp_path_factory):

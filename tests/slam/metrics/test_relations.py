@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam.geometry import compose, inverse
-from slam.metrics import measures as metrics
+from slam.metrics import relations as metrics
 from tests.slam.metrics.test_measures import moved, trajectory, transforms
 
 

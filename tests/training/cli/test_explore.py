@@ -18,9 +18,9 @@ import pytest
 
 from mecanum_env.arguments import make_config
 from mecanum_env.config import from_toml
-from slam.formats import read_map_server, read_tum
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.landmarks.database import read_landmark_map
+from tests.slam.written_files import read_map_server, read_tum
 from tests.training.plans import write_room
 from training.cli import main
 from training.episodes.explore import EXTRAS, FILES

@@ -20,9 +20,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import slam
-from slam.formats import read_tum
 from slam.landmarks.database import read_landmark_map
 from tests.slam.logs.logs_on_disk import data_folder, write_park, write_utias
+from tests.slam.written_files import read_tum
 from training.cli import main
 from training.replay import report as replay_report
 from training.replay import run as task

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import slam
-from slam.formats import read_map_server, read_tum
 from tests.slam.logs.logs_on_disk import data_folder
 from tests.slam.logs.scans_on_disk import HEIGHT, WIDTH, carmen_lines, dpslam_lines, drive, put_lines
+from tests.slam.written_files import read_map_server, read_tum
 from tests.training.replay.test_replay import refused, replayed
 from training.cli import main
 from training.replay import report as replay_report

@@ -1,0 +1,84 @@
+"""What backends with landmarks share: what the wheels claim, observations as rows, the book of landmarks."""
+
+from __future__ import annotations
+
+import abc
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.backend import Backend
+from slam.landmarks.book import LandmarkBook, LandmarkPolicy
+from slam.motion import OdometryNoise
+from slam.types import LINE, Observations, Odometry
+
+__all__ = ["FEWEST_BACK", "LandmarkBackend", "observation_rows"]
+
+Array = NDArray[np.float64]
+
+FEWEST_BACK = 2
+"""Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
+
+
+class LandmarkBackend(Backend):
+    """A backend that keeps a book of landmarks."""
+
+    def _begin(self, policy: LandmarkPolicy) -> None:
+        self._book = LandmarkBook(policy)
+        self._twist = (0.0, 0.0, 0.0)
+        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
+
+    def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
+        """Count a step by the wheels; return its vx, vy, ω and V's variances of speed and turn rate."""
+        vx, vy, omega = np.asarray(odometry.twist, dtype=np.float64).tolist()
+        twist, dt, lever = (vx, vy, omega), odometry.dt, noise.lever_m
+        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
+        self._twist = twist
+        way = math.hypot(vx, vy, lever * omega) * dt
+        moved, turned = self._unseen_motion
+        self._unseen_motion = moved + way, turned + way / lever
+        return vx, vy, omega, var_v, var_w
+
+    def _out_of_sight(self, recent: int, still: int) -> bool:
+        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
+        return recent >= 3 and still < 0.6 * recent
+
+    @property
+    @abc.abstractmethod
+    def _points(self) -> Array:
+        """Estimates ``(n, 2)`` of the book's landmarks."""
+
+    @property
+    def _marks(self) -> Array:
+        """Marks ``(n, 8)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
+        return self._book.marks
+
+    @property
+    def landmark_count(self) -> int:
+        """Number of confirmed landmarks, walls included."""
+        return self._book.count
+
+    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+        """Return per point landmark how often it was seen and its direction in the belief's frame [rad]."""
+        marks = self._marks
+        marks = marks[marks[:, 0] != LINE]
+        return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
+
+    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
+        rows = self._book.just_seen()
+        return self._book.ids[rows], self._points[rows]
+
+
+def observation_rows(observations: Observations) -> Array:
+    """Return landmark observations as rows ``(m, 10)`` like the feature extractor's, of unknown kind.
+
+    Raises ``ValueError`` where they are not finite, or shapes disagree.
+    """
+    rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
+    cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
+    if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
+        raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
+    z = np.zeros((len(rb), 10))
+    z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    return z
