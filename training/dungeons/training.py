@@ -188,7 +188,7 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
             sums += cost.item(), dark.item()
         regret, error = regret_m(network, unseen)
         point = {
-            "epoch": epoch + 1, "cost": sums[0] / batches, "free": sums[1] / batches,
+            "epoch": epoch + 1, "cost": float(sums[0]) / batches, "free": float(sums[1]) / batches,
             "validation_regret_m": regret, "validation_regret_se_m": error, "wall_s": time.monotonic() - begun,
         }  # fmt: skip
         curve.append({key: round(value, 5) for key, value in point.items()})
