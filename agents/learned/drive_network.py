@@ -60,26 +60,29 @@ class Plan(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
+def _there(ahead: float, left: float, pose: Floats, pixel: float) -> tuple[int, int]:
+    """Return row and column on ``map_global`` of a place beside the robot [m]; they may lie beyond the map."""
+    at_col, at_row = (pose[0] + 1.0) * 0.5 * SIZE, SIZE - (pose[1] + 1.0) * 0.5 * SIZE
+    dx, dy = pose[2] * ahead - pose[3] * left, pose[3] * ahead + pose[2] * left
+    return math.floor(at_row - dy / pixel), math.floor(at_col + dx / pixel)
+
+
+@njit(cache=True, nogil=True)
 def pixel_size(near: Bytes, far: Bytes, pose: Floats) -> float:
     """Return the side [m] of a pixel of ``map_global``: the one at which it agrees best with ``map_local``.
 
     The observation does not tell it, but shows the same place on two maps of which one has a known scale.
     """
-    at_col, at_row = (pose[0] + 1.0) * 0.5 * SIZE, SIZE - (pose[1] + 1.0) * 0.5 * SIZE
     best, found = np.inf, 0.4
     for size in _PIXELS_M:
         apart = 0.0
         for i in range(1, SIZE, 3):
             for j in range(1, SIZE, 3):
                 ahead, left = (0.5 * SIZE - 0.5 - i) * CELL_M, (0.5 * SIZE - 0.5 - j) * CELL_M
-                dx, dy = pose[2] * ahead - pose[3] * left, pose[3] * ahead + pose[2] * left
-                row, col = math.floor(at_row - dy / size), math.floor(at_col + dx / size)
-                known = probability = 0.0
-                if 0 <= row < SIZE and 0 <= col < SIZE:
-                    known = far[1, row, col] / 255.0
-                    probability = far[0, row, col] / 255.0 if known > 0.0 else 0.5
-                else:
-                    probability = 0.5
+                row, col = _there(ahead, left, pose, size)
+                known, probability = 0.0, 0.5
+                if 0 <= row < SIZE and 0 <= col < SIZE and far[1, row, col] > 0:
+                    known, probability = far[1, row, col] / 255.0, far[0, row, col] / 255.0
                 apart += abs(near[1, i, j] / 255.0 - known) + 0.5 * abs(near[0, i, j] / 255.0 - probability)
         if apart < best:
             best, found = apart, size
@@ -90,13 +93,11 @@ def pixel_size(near: Bytes, far: Bytes, pose: Floats) -> float:
 def _ends(goal: Floats, far: Floats, pose: Floats, pixel: float, turn_m: float) -> Floats:
     """Return what ending at each local pixel costs ``(n, m)``: a goal there, or the way on from the rim."""
     out = goal.copy()
-    at_col, at_row = (pose[0] + 1.0) * 0.5 * SIZE, SIZE - (pose[1] + 1.0) * 0.5 * SIZE
     for i in range(SIZE):
         for j in range(SIZE):
             ahead, left = (0.5 * SIZE - 0.5 - i) * CELL_M, (0.5 * SIZE - 0.5 - j) * CELL_M
             if max(abs(ahead), abs(left)) > _RIM_M:
-                dx, dy = pose[2] * ahead - pose[3] * left, pose[3] * ahead + pose[2] * left
-                row, col = math.floor(at_row - dy / pixel), math.floor(at_col + dx / pixel)
+                row, col = _there(ahead, left, pose, pixel)
                 if 0 <= row < SIZE and 0 <= col < SIZE:
                     out[i, j] = min(out[i, j], far[row, col])
             away = math.hypot(ahead, left)

@@ -138,7 +138,8 @@ def beam_angles(beams: int) -> tuple[float, float]:
     """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
 
     180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
-    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Other numbers span -90° to 90°.
+    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Other numbers span -90° to
+    90°.
     """
     step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
     return math.radians(-90.0), math.radians(step)

@@ -8,7 +8,6 @@ goes on where it stopped: with the next plan, or after the last whole epoch.
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
 import statistics
@@ -22,8 +21,6 @@ import numpy as np
 import torch
 import typer
 from numpy.typing import NDArray
-from safetensors import safe_open
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from agents.learned.policy_files import write_policy
@@ -40,7 +37,7 @@ __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", 
 
 Floats = NDArray[np.float32]
 
-_CHECKPOINT, _WEIGHTS = "checkpoint.safetensors", "learned-tour.safetensors"
+_CHECKPOINT, _WEIGHTS = "checkpoint.pt", "learned-tour.safetensors"
 _SCORE_M = 20.0
 _VALIDATION = 1000  # seed of the first plan that is validated on
 
@@ -191,7 +188,7 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
             sums += cost.item(), dark.item()
         regret, error = regret_m(network, unseen)
         point = {
-            "epoch": epoch + 1, "cost": sums[0] / batches, "free": sums[1] / batches,
+            "epoch": epoch + 1, "cost": float(sums[0]) / batches, "free": float(sums[1]) / batches,
             "validation_regret_m": regret, "validation_regret_se_m": error, "wall_s": time.monotonic() - begun,
         }  # fmt: skip
         curve.append({key: round(value, 5) for key, value in point.items()})
@@ -221,25 +218,17 @@ def _rate_at(share: float) -> float:
 
 
 def _keep(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer, curve: list[dict[str, float]]) -> None:
-    tensors = {f"weight.{name}": value.contiguous() for name, value in network.state_dict().items()}
-    for name, parameter in network.named_parameters():
-        tensors |= {f"{key}.{name}": value.contiguous() for key, value in optimiser.state[parameter].items()}
     with replacing(path) as temporary:
-        save_file(tensors, temporary, {"curve": json.dumps(curve)})
+        torch.save([network.state_dict(), optimiser.state_dict(), curve], temporary)
 
 
 def _resume(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer) -> list[dict[str, float]]:
     if not path.exists():
         return []
-    tensors = load_file(path)
-    with safe_open(path, "pt") as file:
-        curve: list[dict[str, float]] = json.loads(file.metadata()["curve"])
-    network.load_state_dict(
-        {name.removeprefix("weight."): tensors[name] for name in tensors if name.startswith("weight.")}
-    )
-    for name, parameter in network.named_parameters():
-        optimiser.state[parameter] = {key: tensors[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq")}
-    return curve
+    weights, state, curve = torch.load(path, weights_only=True)
+    network.load_state_dict(weights)
+    optimiser.load_state_dict(state)
+    return list(curve)
 
 
 # ---- the command -----------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 import signal
@@ -10,15 +9,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
-from slam.settings import to_mapping
-
-__all__ = ["interrupt_flag", "plain", "progress_of_run", "versions"]
+__all__ = ["interrupt_flag", "plain", "versions"]
 
 _LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
 
@@ -41,24 +37,6 @@ def interrupt_flag() -> Iterator[threading.Event]:
         yield flag
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def progress_of_run(out: Path, config: Any, **first: Any) -> dict[str, Any]:
-    """Return what ``progress.json`` in a run's folder says or, where there is none, what a run begins with.
-
-    Raises
-    ------
-    ValueError
-        Where the folder holds a run with another configuration.
-    """
-    settings = json.loads(json.dumps(to_mapping(config)))
-    path = out / "progress.json"
-    if not path.exists():
-        return {"config": settings, **first}
-    progress: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    if progress["config"] != settings:
-        raise ValueError(f"{out} holds a run with another configuration; choose another --out")
-    return progress
 
 
 def versions() -> dict[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from agents.learned.drive_network import PlanSettings
 from mecanum_env.config import NOISE_PRESETS
 from slam.settings import positive, require
 from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
@@ -76,3 +77,8 @@ class DriveConfig:
 
     def __post_init__(self) -> None:
         require(self.policy == "drive", "policy must be drive")
+
+    @property
+    def planning(self) -> PlanSettings:
+        """What the planning layer is told."""
+        return PlanSettings(goal_m=self.goal_m, turn_m=self.turn_m)

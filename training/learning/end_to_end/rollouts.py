@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 import agents
-from agents.learned.drive_network import DriveNetwork, PlanSettings
+from agents.learned.drive_network import DriveNetwork
 from mecanum_env.env import ExploreEnv
+from training.learning.end_to_end.config import DriveConfig
 from training.learning.end_to_end.lessons import FollowingTeacher, map_lesson
 
 __all__ = ["Episode", "Outcome", "give_lessons", "guided_lessons", "judge"]
@@ -25,22 +26,23 @@ _MAPS_S = 1.0  # between two lessons on the maps
 _KEPT = ("map_local", "map_global", "pose")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Episode:
-    """One episode: where, how long, and who drives."""
+    """One episode: who drives, where, and how long."""
 
+    config: DriveConfig
+    weights: Weights
     rooms: str
     room_seed: int
     seed: int
-    weights: Weights
-    settings: PlanSettings = field(default_factory=PlanSettings)
-    uncertainty: bool = True
-    slam: str = "invariant-ekf"
-    noise: str = "nominal"
-    time_limit_s: float = 300.0
-    teacher: str = "nearest-frontier"  # whose frontiers are goals
-    teacher_share: float = 1.0  # of the time, that the teacher drives
-    shaken: float = 0.1  # share of the time, about, that whoever drives is disturbed
+    time_limit_s: float
+    teacher_share: float = 0.0  # of the time, that the teacher drives
+
+    @property
+    def network(self) -> DriveNetwork:
+        """The student."""
+        config = self.config
+        return DriveNetwork(self.weights, config.planning, uncertainty=config.uncertainty)
 
 
 class Outcome(NamedTuple):
@@ -64,7 +66,7 @@ def guided_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
 
 def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
     """Have student and teacher drive in turn; return the lessons on maps and on control, and how it went."""
-    scene, network = _Scene(episode), _network(episode)
+    scene, network = _Scene(episode), episode.network
     follow = FollowingTeacher(scene.env)
     rows: list[dict[str, Any]] = []
     switch_at, teacher_drives = 0.0, True
@@ -75,14 +77,8 @@ def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
         way = network.plan(observation)
         inputs = network.inputs(observation, way)
         wanted = follow(way.path, scene.action, observation, scene.env.belief)
-        rows.append(
-            {
-                "scan": observation["scan"].astype(np.float16),
-                "landmarks": inputs.landmarks.astype(np.float16),
-                "numbers": inputs.numbers,
-                "wanted": wanted,
-            }
-        )
+        scan, landmarks = (x.astype(np.float16) for x in (observation["scan"], inputs.landmarks))
+        rows.append({"scan": scan, "landmarks": landmarks, "numbers": inputs.numbers, "wanted": wanted})
         if scene.time_s >= switch_at:
             teacher_drives = bool(scene.rng.random() < episode.teacher_share)
             switch_at = scene.time_s + float(scene.rng.uniform(*_SEGMENT_S))
@@ -94,11 +90,9 @@ class _Drive:
     """An episode under way: what is seen, and how it goes."""
 
     def __init__(self, episode: Episode) -> None:
-        self._episode = episode
-        self.env = ExploreEnv(
-            rooms=episode.rooms, slam=episode.slam, noise=episode.noise,
-            config={"time_limit_s": episode.time_limit_s},
-        )  # fmt: skip
+        self._episode, world = episode, episode.config.world
+        limit = {"time_limit_s": episode.time_limit_s}
+        self.env = ExploreEnv(rooms=episode.rooms, slam=world.slam, noise=world.noise, config=limit)
         observation, _ = self.env.reset(seed=episode.seed, options={"room_seed": episode.room_seed})
         self.observation: dict[str, Any] = dict(observation)
         self.time_s, self._terminated = 0.0, False
@@ -125,8 +119,9 @@ class _Scene(_Drive):
     def __init__(self, episode: Episode) -> None:
         super().__init__(episode)
         self.rng = np.random.default_rng(episode.seed)
-        config = self.env.config
-        self.guide = agents.make(episode.teacher, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        body, self._lessons = self.env.config, episode.config.lessons
+        teacher = self._lessons.teacher
+        self.guide = agents.make(teacher, robot=body.robot, lidar=body.lidar, step_s=body.step_s)
         self.guide.reset(self.env.belief, episode.seed)
         self.action: NDArray[np.float32] = np.zeros(3, np.float32)
         self.maps: list[dict[str, Any]] = []
@@ -146,7 +141,7 @@ class _Scene(_Drive):
         if self.time_s >= self._shake_at:
             length = float(self.rng.uniform(0.5, 2.0))
             self._shake_end = self.time_s + length
-            pause = length * (1.0 / max(self._episode.shaken, 1e-3) - 1.0)
+            pause = length * (1.0 / max(self._lessons.shaken, 1e-3) - 1.0)
             self._shake_at = self._shake_end + float(self.rng.exponential(pause))
             self._shake = self.rng.uniform(-1.0, 1.0, 3) * _SHAKE
         if self.time_s < self._shake_end:
@@ -157,14 +152,10 @@ class _Scene(_Drive):
 
 def judge(episode: Episode) -> Outcome:
     """Drive an episode by the network alone, and return how it went."""
-    drive, network = _Drive(episode), _network(episode)
+    drive, network = _Drive(episode), episode.network
     while not drive.over:
         drive.step(network.twist(network.inputs(drive.observation, network.plan(drive.observation))))
     return drive.outcome
-
-
-def _network(episode: Episode) -> DriveNetwork:
-    return DriveNetwork(episode.weights, episode.settings, uncertainty=episode.uncertainty)
 
 
 def _stacked(rows: list[dict[str, Any]]) -> dict[str, NDArray[Any]]:

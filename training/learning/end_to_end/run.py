@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
-from agents.learned.drive_network import DriveNetwork, PlanSettings
+from agents.learned.drive_network import DriveNetwork
 from slam.formats import atomic_write, replacing
 from training.learning.end_to_end.config import DriveConfig
 from training.learning.end_to_end.imitation import learn_control, learn_maps
@@ -86,14 +86,15 @@ class DriveRun(FolderRun):
         self._say(f"round {number} of {len(self.config.lessons.teacher_shares)} done")
 
     def _give_lessons(self, number: int, pool: ProcessPoolExecutor) -> None:
-        lessons, world = self.config.lessons, self.config.world
+        config, weights = self.config, self.weights
+        lessons, world = config.lessons, config.world
         rng = np.random.default_rng([self.config.seed, 1000 + number])
         low, high = world.seeds
         share = 1.0 if number == 0 else lessons.teacher_shares[number - 1]
         jobs = [
-            self._episode(
-                rooms, int(rng.integers(low, high + 1)), int(rng.integers(2**31)), teacher_share=share,
-                time_limit_s=lessons.time_limit_s, shaken=lessons.shaken,
+            Episode(
+                config, weights, rooms, int(rng.integers(low, high + 1)), int(rng.integers(2**31)),
+                lessons.time_limit_s, share,
             )
             for rooms in world.rooms
             for _ in range(lessons.episodes if number else lessons.guided_episodes)
@@ -105,23 +106,11 @@ class DriveRun(FolderRun):
         said = summary(jobs, [outcome for _, _, outcome in found])
         self._say(f"round {number}: lessons of {len(jobs)} episodes, " + words(said))
 
-    def _episode(self, rooms: str, room_seed: int, seed: int, **more: Any) -> Episode:
-        config = self.config
-        return Episode(
-            rooms=rooms, room_seed=room_seed, seed=seed, weights=self.weights, settings=self._settings,
-            uncertainty=config.uncertainty, slam=config.world.slam, noise=config.world.noise,
-            teacher=config.lessons.teacher, **more,
-        )  # fmt: skip
-
-    @property
-    def _settings(self) -> PlanSettings:
-        return PlanSettings(goal_m=self.config.goal_m, turn_m=self.config.turn_m)
-
     # ---- practice ------------------------------------------------------------------------------------------
 
     def _practise(self, pool: ProcessPoolExecutor) -> None:
         config, ppo = self.config, self.config.ppo
-        network = DriveNetwork(self.weights, self._settings, uncertainty=config.uncertainty)
+        network = DriveNetwork(self.weights, config.planning, uncertainty=config.uncertainty)
         env = VecMonitor(DummyVecEnv([partial(DriveWorld, config.world, network)] * ppo.environments))
         try:
             model = make_model(config, env)
@@ -143,10 +132,11 @@ class DriveRun(FolderRun):
             env.close()
 
     def _evaluate(self, pool: ProcessPoolExecutor, at: dict[str, int]) -> None:
+        config, weights = self.config, self.weights
         jobs = [
-            self._episode(rooms, seed, seed, time_limit_s=self.config.world.time_limit_s)
-            for rooms in self.config.world.rooms
-            for seed in range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + self.config.evaluation.episodes)
+            Episode(config, weights, rooms, seed, seed, config.world.time_limit_s)
+            for rooms in config.world.rooms
+            for seed in range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + config.evaluation.episodes)
         ]
         result = summary(jobs, list(pool.map(judge, jobs)))
         self._note_trial(at, result, -result["score"], partial(self._save, "best"))
