@@ -111,7 +111,7 @@ class InvariantEkfSlam(EkfSlam):
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""
-        return float(nees_pose_invariant(self.pose, self.pose_cov, np.asarray(true_pose, dtype=np.float64)))
+        return float(nees_pose_invariant(self._x, self._p, np.asarray(true_pose, dtype=np.float64)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
