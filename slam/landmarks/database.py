@@ -17,11 +17,9 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,7 +34,6 @@ Array = NDArray[np.float64]
 SCHEMA_VERSION = 1
 
 _KIND_NAMES = {CONVEX: "convex", CONCAVE: "concave", 0: "unknown"}
-_KIND_VALUES = {name: value for value, name in _KIND_NAMES.items()}
 
 _SCHEMA = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -58,21 +55,19 @@ CREATE TABLE relations (
 """
 
 
-@dataclass(frozen=True, slots=True)
-class LandmarkMap:
-    """A cartographic database in memory: ``n`` landmarks by rising id, ``r`` relations by rising pair."""
+_LANDMARKS = [
+    ("id", "i8"), ("kind", "U8"), *((name, "f8") for name in ("x", "y", "var_x", "var_y", "cov_xy", "angle")),
+    ("times_seen", "i8"),
+]  # fmt: skip
+_RELATIONS = [("a", "i8"), ("b", "i8"), ("distance", "f8"), ("distance_sigma", "f8"), ("correlation", "f8")]
 
-    ids: NDArray[np.int64]  # (n,)
-    kinds: NDArray[np.int8]  # (n,) slam.types.CONVEX, CONCAVE or 0 where not known
-    positions: Array  # (n, 2) [m]
-    cov: Array  # (n, 2, 2) [m²]
-    angles: Array  # (n,) bisector into free space [rad], nan where not known
-    times_seen: NDArray[np.int64]  # (n,)
-    pairs: NDArray[np.int64]  # (r, 2) ids a < b
-    distances: Array  # (r,) [m]
-    distance_sigmas: Array  # (r,) [m]
-    correlations: Array  # (r,) in [-1, 1], nan where the backend keeps no joint covariance
-    meta: Mapping[str, str]
+
+class LandmarkMap(NamedTuple):
+    """A cartographic database in memory: arrays whose fields are the columns of the tables, nan where NULL."""
+
+    landmarks: NDArray[np.void]  # (n,) by rising id
+    relations: NDArray[np.void]  # (r,) by rising pair
+    meta: dict[str, str]
 
 
 def relate(
@@ -220,29 +215,16 @@ def read_landmark_map(path: str | Path) -> LandmarkMap:
             if meta.get("schema_version") != str(SCHEMA_VERSION):
                 version = meta.get("schema_version")
                 raise ValueError(f"schema version {version!r}, this program reads {SCHEMA_VERSION}")
-            landmarks = database.execute(
-                "SELECT id, kind, x, y, var_x, var_y, cov_xy, angle, times_seen FROM landmarks ORDER BY id"
-            ).fetchall()
-            relations = database.execute(
-                "SELECT a, b, distance, distance_sigma, correlation FROM relations ORDER BY a, b"
-            ).fetchall()
-        ids, kinds, x, y, var_x, var_y, cov_xy, angles, seen = _columns(landmarks, 9)
-        a, b, distances, sigmas, correlations = _columns(relations, 5)
-        return LandmarkMap(
-            ids=np.array(ids, np.int64),
-            kinds=np.array([_KIND_VALUES[kind] for kind in kinds], np.int8),
-            positions=np.array([x, y], np.float64).T,
-            cov=np.array([[var_x, cov_xy], [cov_xy, var_y]], np.float64).transpose(2, 0, 1),
-            angles=np.array(angles, np.float64),
-            times_seen=np.array(seen, np.int64),
-            pairs=np.array([a, b], np.int64).T,
-            distances=np.array(distances, np.float64),
-            distance_sigmas=np.array(sigmas, np.float64),
-            correlations=np.array(correlations, np.float64),
-            meta=meta,
-        )
+            landmarks = _read(database, "landmarks", _LANDMARKS)
+            relations = _read(database, "relations", _RELATIONS)
+        return LandmarkMap(landmarks, relations, meta)
     except (sqlite3.Error, ValueError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"{path} is not a landmark map: {error}") from error
+
+
+def _read(database: sqlite3.Connection, table: str, columns: list[tuple[str, str]]) -> NDArray[np.void]:
+    names = ", ".join(name for name, _ in columns)
+    return np.array(database.execute(f"SELECT {names} FROM {table} ORDER BY 1, 2").fetchall(), columns)
 
 
 def _column(name: str, values: ArrayLike | None, default: NDArray[Any]) -> NDArray[Any]:
@@ -254,10 +236,6 @@ def _column(name: str, values: ArrayLike | None, default: NDArray[Any]) -> NDArr
             return default
         raise ValueError(f"landmark {name} must have shape {default.shape}, got {array.shape}")
     return array
-
-
-def _columns(rows: list[Any], count: int) -> tuple[tuple[Any, ...], ...]:
-    return tuple(zip(*rows, strict=True)) if rows else ((),) * count
 
 
 def _or_null(value: float) -> float | None:

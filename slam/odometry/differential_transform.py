@@ -1,4 +1,4 @@
-"""Taylor spectra, the arithmetic of the differential (Pukhov) transform, and the motion models written in them.
+"""Taylor spectra of the differential (Pukhov) transform, and the motion models that are written in them.
 
 The spectrum of x about t₀ with scale h is X(k) = hᵏ/k! x⁽ᵏ⁾(t₀), an array ``(order + 1,)`` in the units of x; the
 original is x(t₀ + θ h) = Σ X(k) θᵏ, or a Padé fraction that agrees with it (theory.md C, differential transform).
@@ -8,104 +8,18 @@ Equations: ``docs/reference/differential_transform.md``.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TypeVar
-
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from slam.settings import require, unknown_name
 
-__all__ = [
-    "MODELS", "Model", "PowerModel", "SpectrumModel", "constant", "derivative", "evaluate", "fit_pade",
-    "integral", "make_model", "pade", "power", "product", "quotient", "rescale",
-]  # fmt: skip
+__all__ = ["MODELS", "PowerModel", "fill_model", "fit_pade", "make_model"]
 
 Array = NDArray[np.float64]
-Compiled = TypeVar("Compiled", bound=Callable[..., object])
 
 SINGULAR = 1e-10
 """A pivot this small, as a share of the largest number in its system, is taken for zero."""
-
-
-# ---- spectra ---------------------------------------------------------------------------------------------------
-
-
-def constant(value: float, order: int) -> Array:
-    """Return the spectrum ``(order + 1,)`` of a constant: it stands in the first discrete alone."""
-    out = np.zeros(order + 1)
-    out[0] = value
-    return out
-
-
-def power(exponent: float, t0: float, h: float, order: int) -> Array:
-    """Return the spectrum ``(order + 1,)`` of tᵖ about t₀: C(p, k) t₀ᵖ (h/t₀)ᵏ.
-
-    2/t is ``2 * power(-1, …)``. ``ValueError`` at t₀ = 0 unless p is a whole number of at least 0, and below it
-    unless p is whole.
-    """
-    whole = float(exponent).is_integer()
-    require(t0 > 0 or whole, f"t to the power of {exponent:g} has no spectrum about t0 = {t0:g}")
-    require(t0 != 0 or exponent >= 0, f"t to the power of {exponent:g} has no spectrum about 0")
-    out = np.empty(order + 1)
-    _fill_power(out, float(exponent), float(t0), float(h))
-    return out
-
-
-def derivative(x: Array, h: float) -> Array:
-    """Return the spectrum ``(order,)`` of dx/dt: (k + 1)/h X(k + 1)."""
-    return np.asarray(np.arange(1, len(x)) * x[1:] / h)
-
-
-def integral(x: Array, h: float, start: float = 0.0) -> Array:
-    """Return the spectrum ``(order + 2,)`` of ``start`` plus x's integral; :func:`derivative` undoes it."""
-    return np.concatenate([[start], h * x / np.arange(1, len(x) + 1)])
-
-
-def product(x: Array, y: Array) -> Array:
-    """Return the spectrum of x y: the convolution Σ X(l) Y(k - l), up to the shorter one's order."""
-    order = min(len(x), len(y))
-    return np.asarray(np.convolve(x, y)[:order])
-
-
-def quotient(x: Array, y: Array) -> Array:
-    """Return the spectrum of x / y: the convolution solved for its factor. ``ValueError`` where y(t₀) = 0."""
-    require(y[0] != 0, "nothing can be divided by a spectrum whose first discrete is zero")
-    order = min(len(x), len(y))
-    out = np.zeros(order)
-    for k in range(order):
-        out[k] = (x[k] - out[:k] @ y[k:0:-1]) / y[0]
-    return out
-
-
-def rescale(x: Array, ratio: float) -> Array:
-    """Return the spectrum of the same function for the scale ``ratio`` · h: X(k) ratioᵏ."""
-    return np.asarray(x * np.power(float(ratio), np.arange(len(x))))
-
-
-def evaluate(x: Array, share: ArrayLike) -> Array:
-    """Return x(t₀ + θ h) of θ = ``share`` (any shape) by the series."""
-    theta, out = np.asarray(share, np.float64), np.zeros(np.shape(share))
-    for value in x[::-1].tolist():
-        out = out * theta + value
-    return out
-
-
-def pade(x: Array) -> tuple[Array, Array] | None:
-    """Return numerator ``(m + 1,)`` and denominator ``(m + 1,)`` of the [m/m] fraction of a spectrum in θ.
-
-    The spectrum holds 2m + 1 discretes: [3/3], the paper's, takes seven. None where the m × m system for the
-    denominator is singular, as a polynomial's of low degree is: then the series does.
-    """
-    require(len(x) % 2 == 1 and len(x) >= 3, "a Padé fraction [m/m] takes 2m + 1 discretes")
-    m = len(x) // 2
-    below = np.zeros(m)
-    if not fit_pade(np.asarray(x, np.float64), np.empty((m, m + 1)), below):
-        return None
-    denominator = np.concatenate([[1.0], below])
-    return product(x[: m + 1], denominator), denominator
 
 
 # ---- kernels ---------------------------------------------------------------------------------------------------
@@ -187,69 +101,31 @@ def fit_pade(c: Array, system: Array, below: Array) -> bool:
 # ---- models ----------------------------------------------------------------------------------------------------
 
 
-class Model(ABC):
+class PowerModel:
     """The motion of one coordinate: x' = F(t) x + G q, of which the first state is measured, z = x₁ + ϑ.
-
-    Attributes
-    ----------
-    name : str
-        For messages and tables.
-    size : int
-        n, the number of states.
-    drive : NDArray[np.float64]
-        G ``(n,)``: where the process noise enters.
-    """
-
-    def __init__(self, name: str, drive: ArrayLike) -> None:
-        self.name = name
-        self.drive: Array = np.array(drive, np.float64)
-        self.size = len(self.drive)
-
-    @abstractmethod
-    def spectrum(self, t0: float, h: float, order: int) -> Array:
-        """Return the spectra ``(order + 1, n, n)`` of F about t₀ [s] with scale h [s]."""
-
-    def matrix(self, t: float) -> Array:
-        """Return F(t) ``(n, n)``."""
-        return np.asarray(self.spectrum(t, 1.0, 0)[0])
-
-
-class PowerModel(Model):
-    """F(t) = Σ ``matrices[j]`` t^``powers[j]``: all of the filter then runs compiled.
 
     Parameters
     ----------
+    name
+        For messages and tables.
     powers, matrices
-        ``(j,)`` and ``(j, n, n)``. A power that is negative or not whole needs t₀ > 0.
+        ``(j,)`` and ``(j, n, n)``: F(t) = Σ ``matrices[j]`` t^``powers[j]``. A power that is negative or not whole
+        needs t₀ > 0.
+    drive
+        G ``(n,)``: where the process noise enters.
     """
 
     def __init__(self, name: str, *, powers: ArrayLike, matrices: ArrayLike, drive: ArrayLike) -> None:
-        super().__init__(name, drive)
+        self.name = name
         self.powers: Array = np.array(powers, np.float64)
         self.matrices: Array = np.array(matrices, np.float64)
-        n = self.size
+        self.drive: Array = np.array(drive, np.float64)
+        self.size = n = len(self.drive)
         require(
             self.matrices.shape == (len(self.powers), n, n),
             f"{name} takes matrices ({len(self.powers)}, {n}, {n})",
         )
         self.needs_positive_time = bool(np.any((self.powers < 0) | (self.powers % 1.0 != 0)))
-
-    def spectrum(self, t0: float, h: float, order: int) -> Array:
-        """Return the spectra ``(order + 1, n, n)`` of F about t₀ [s] with scale h [s]."""
-        columns = np.array([power(p, t0, h, order) for p in self.powers])
-        return np.asarray(np.einsum("jk,jab->kab", columns, self.matrices))
-
-
-class SpectrumModel(Model):
-    """Any F(t) whose spectra are known: ``of(t0, h, order)`` returns them, ``(order + 1, n, n)``."""
-
-    def __init__(self, name: str, of: Callable[[float, float, int], Array], *, drive: ArrayLike) -> None:
-        super().__init__(name, drive)
-        self._of = of
-
-    def spectrum(self, t0: float, h: float, order: int) -> Array:
-        """Return the spectra ``(order + 1, n, n)`` of F about t₀ [s] with scale h [s]."""
-        return np.asarray(self._of(t0, h, order), np.float64)
 
 
 _POSITION_RATE = np.array([[0.0, 1.0], [0.0, 0.0]])

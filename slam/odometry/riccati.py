@@ -18,10 +18,7 @@ from numpy.typing import NDArray
 from slam.odometry.differential_transform import fill_model, fit_pade
 from slam.settings import require, unknown_name
 
-__all__ = [
-    "MOST_EXPANSIONS", "RECOVERIES", "Tolerances", "Workspace", "advance", "covariance_spectrum",
-    "estimate_spectrum", "expand", "recover",
-]  # fmt: skip
+__all__ = ["RECOVERIES", "Rules", "Tolerances", "Workspace", "advance"]
 
 Array = NDArray[np.float64]
 Rules = tuple[float, float, bool]  # relative and absolute error of an expansion, whether fractions are tried
@@ -29,7 +26,7 @@ Rules = tuple[float, float, bool]  # relative and absolute error of an expansion
 RECOVERIES = ("pade", "series")
 _SAFETY = 0.9  # of the step that the error estimate allows
 _RADIUS_SHARE = 0.5  # of the radius of convergence that a step may use, whatever the estimate says
-MOST_EXPANSIONS = 1_000_000  # of one step
+_MOST_EXPANSIONS = 1_000_000  # of one step
 _DENOMINATOR_LEFT = 0.2  # a Padé denominator may fall from 1 to no less than this within the step
 
 
@@ -279,7 +276,7 @@ def advance(
     ``powers`` and ``matrices`` are those of :class:`~slam.odometry.differential_transform.PowerModel`.
     """
     end, now = t + span, t
-    for count in range(1, MOST_EXPANSIONS):
+    for count in range(1, _MOST_EXPANSIONS):
         h = end - now
         fill_model(powers, matrices, now, h, work.column, work.f)
         share = expand(work.f, noise, inverse_r, h, work, rules)

@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam.odometry.differential_transform import Model, PowerModel, make_model
-from slam.odometry.riccati import MOST_EXPANSIONS, Tolerances, Workspace, advance, expand
+from slam.odometry.differential_transform import PowerModel, make_model
+from slam.odometry.riccati import Tolerances, Workspace, advance
 from slam.settings import require
 
 __all__ = ["KalmanBucyFilter"]
@@ -41,7 +41,7 @@ class KalmanBucyFilter:
     """
 
     def __init__(
-        self, model: Model | str, *, measurement: float, process: float, tolerances: Tolerances | None = None
+        self, model: PowerModel | str, *, measurement: float, process: float, tolerances: Tolerances | None = None
     ) -> None:
         require(math.isfinite(measurement) and measurement > 0, "the measurement noise's intensity must be > 0")
         require(math.isfinite(process) and process >= 0, "the process noise's intensity must be ≥ 0")
@@ -63,7 +63,7 @@ class KalmanBucyFilter:
         that is not finite, and a covariance that is not symmetric.
         """
         n, work = self.model.size, self._work
-        if isinstance(self.model, PowerModel) and self.model.needs_positive_time:
+        if self.model.needs_positive_time:
             require(time > 0, f"{self.model.name} has no meaning at t = {time:g}; start at a time above 0")
         start = np.zeros(n) if state is None else np.asarray(state, np.float64)
         first = np.zeros((n, n)) if cov is None else np.asarray(cov, np.float64)
@@ -98,33 +98,14 @@ class KalmanBucyFilter:
         require(math.isfinite(span) and span > 0, f"a step must be above 0 s, got {span}")
         z = self._last if measurement is None else float(measurement)
         require(math.isfinite(z), f"a measurement must be finite, got {z}")
-        work = self._work
+        model, work = self.model, self._work
         work.z[0], work.z[1] = self._last, z - self._last
-        count = self._compiled(span) if isinstance(self.model, PowerModel) else self._expand_one_by_one(span)
+        count = advance(
+            model.powers, model.matrices, self._noise, self._inverse_r, self.time, span, work,
+            self.tolerances.rules,
+        )  # fmt: skip
         if count < 0 or not np.all(np.isfinite(work.eta[0])):
-            raise ArithmeticError(f"{self.model.name}: no solution at this tolerance beyond t = {self.time:g} s")
+            raise ArithmeticError(f"{model.name}: no solution at this tolerance beyond t = {self.time:g} s")
         self.expansions += count
         self.time += span
         self._last = z
-
-    def _compiled(self, span: float) -> int:
-        model = self.model
-        assert isinstance(model, PowerModel)
-        return int(advance(
-            model.powers, model.matrices, self._noise, self._inverse_r, self.time, span, self._work,
-            self.tolerances.rules,
-        ))  # fmt: skip
-
-    def _expand_one_by_one(self, span: float) -> int:
-        """Do what :func:`advance` does for a model that only Python can expand."""
-        now, end, rules = self.time, self.time + span, self.tolerances.rules
-        for count in range(1, MOST_EXPANSIONS):
-            h = end - now
-            spectra = self.model.spectrum(now, h, self.tolerances.order + 1)
-            share = expand(spectra, self._noise, self._inverse_r, h, self._work, rules)
-            if share >= 1.0:
-                return count
-            now += share * h
-            if not share * h > 0.0:
-                break
-        return -1

@@ -257,6 +257,9 @@ def test_images_of_all_kinds_are_read_alike(tmp_path):
     assert np.array_equal(rooms.load(tmp_path / "f.pgm").free, expected)
     (tmp_path / "g.pgm").write_bytes(b"P5 80 60 65535\n" + (image.astype(">u2") * 257).tobytes())
     assert np.array_equal(rooms.load(tmp_path / "g.pgm").free, expected)
+    # Scaled by the largest value; what is above it counts as that.
+    (tmp_path / "h.pgm").write_bytes(b"P5 80 60 15\n" + (image // 255 * 200).tobytes())
+    assert np.array_equal(rooms.load(tmp_path / "h.pgm").free, expected)
 
 
 def test_resolution_of_an_image(tmp_path):
@@ -316,28 +319,32 @@ def png_header(width, height):
     )
 
 
+def bmp_header(width, height):
+    """A BMP of 24 bits a pixel that claims a size and has a few bytes of pixels."""
+    return b"BM" + struct.pack("<IIIIiiHHIIiiII", 94, 0, 54, 40, width, height, 1, 24, *(0,) * 6) + bytes(40)
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (b"", "damaged or no image"),
-        (b"hello", "neither PNG, PGM"),
-        (png_header(100, 100)[:60], "damaged or no image"),
-        (png_header(100, 100)[:-20] + b"x" * 20, "damaged or no image"),
+        (b"", "damaged"),
+        (b"hello", "damaged"),
+        (png_header(100, 100)[:60], "damaged"),
+        (png_header(100, 100)[:-20] + b"x" * 20, "damaged"),
         (png_header(20_000, 100), "too large"),
         (png_header(9_000, 9_000), "too large"),
         (png_header(2**31, 2**31), "too large"),
-        (png_header(0, 10), "no pixels"),
+        (png_header(0, 10), "damaged"),
         (b"P5 99999 99999 255\n", "too large"),
-        (b"P5 100 100 255\n" + bytes(9_999), "cut short"),
-        (b"P5 100", "header is incomplete"),
-        (b"P5 10 10 0\n" + bytes(100), "largest value"),
-        (b"P5 10 10 15\n" + bytes([200]) * 100, "cannot be decoded"),
-        (b"P2 3 1 9\n1 x 3", "cannot be decoded"),
-        (b"P2 3 1 9\n1 nan 3", "cannot be decoded"),
-        (b"P2 9 1 9\n1 2 3 4  5                 ", "cannot be decoded"),
-        (b"BM" + struct.pack("<I", 10**6) + bytes(12) + struct.pack("<ii", 10, 10) + bytes(40), "cut short"),
-        (b"BM" + struct.pack("<I", 20) + bytes(12) + struct.pack("<ii", 30_000, 10) + bytes(40), "too large"),
-        (b"\xff\xd8\xff\xe0", "damaged or no image"),
+        (b"P5 100 100 255\n" + bytes(9_999), "damaged"),
+        (b"P5 100", "damaged"),
+        (b"P5 10 10 0\n" + bytes(100), "damaged"),
+        (b"P2 3 1 9\n1 x 3", "damaged"),
+        (b"P2 3 1 9\n1 nan 3", "damaged"),
+        (b"P2 9 1 9\n1 2 3 4  5                 ", "damaged"),
+        (bmp_header(10, 10), "damaged"),
+        (bmp_header(30_000, 10), "too large"),
+        (b"\xff\xd8\xff\xe0", "damaged"),
         (b"\xff\xd8\xff\xc0\x00\x0b\x08\xff\xff\xff\xff\x01\x01\x11\x00\xff\xd9", "too large"),
         (b"\xff\xd8" + b"\xff" * 50 + b"\xff\xd9", "damaged"),
     ],

@@ -36,14 +36,16 @@ def test_round_trip(tmp_path: Path) -> None:
     write_landmark_map(path, **written)
     read = read_landmark_map(path)
     order = np.argsort(written["ids"])
-    np.testing.assert_array_equal(read.ids, written["ids"][order])
-    np.testing.assert_array_equal(read.kinds, written["kinds"][order])
-    np.testing.assert_array_equal(read.positions, written["positions"][order])
-    np.testing.assert_array_equal(read.cov, written["cov"][order])
-    np.testing.assert_array_equal(read.angles, written["angles"][order])
-    np.testing.assert_array_equal(read.times_seen, written["times_seen"][order])
+    landmarks = read.landmarks
+    np.testing.assert_array_equal(landmarks["id"], written["ids"][order])
+    assert landmarks["kind"].tolist() == ["convex", "concave", "unknown", "convex", "unknown"]
+    np.testing.assert_array_equal(np.array([landmarks["x"], landmarks["y"]]).T, written["positions"][order])
+    cov = np.array([[landmarks["var_x"], landmarks["cov_xy"]], [landmarks["cov_xy"], landmarks["var_y"]]])
+    np.testing.assert_array_equal(cov.transpose(2, 0, 1), written["cov"][order])
+    np.testing.assert_array_equal(landmarks["angle"], written["angles"][order])
+    np.testing.assert_array_equal(landmarks["times_seen"], written["times_seen"][order])
     assert read.meta == {"schema_version": "1", "frame": "start", "units": "m, rad", "backend": "ekf"}
-    assert len(read.pairs) == 10 and (read.pairs[:, 0] < read.pairs[:, 1]).all()
+    assert len(read.relations) == 10 and (read.relations["a"] < read.relations["b"]).all()
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -53,9 +55,7 @@ def test_relations_are_keyed_by_id_whatever_the_order(tmp_path: Path) -> None:
     read = read_landmark_map(path)
     place = {int(k): i for i, k in enumerate(written["ids"])}
     joint, positions = written["joint_cov"], written["positions"]
-    for (a, b), distance, sigma, rho in zip(
-        read.pairs.tolist(), read.distances, read.distance_sigmas, read.correlations, strict=True
-    ):
+    for a, b, distance, sigma, rho in read.relations.tolist():
         i, j = place[a], place[b]
         line = positions[j] - positions[i]
         assert distance == pytest.approx(np.linalg.norm(line))
@@ -117,9 +117,10 @@ def test_empty_single_and_defaults(tmp_path: Path) -> None:
     for n in (0, 1):
         write_landmark_map(path, np.zeros((n, 2)), cov=np.zeros((n, 2, 2)), kinds=np.zeros(0, np.int8))
         read = read_landmark_map(path)
-        assert read.positions.shape == (n, 2) and read.cov.shape == (n, 2, 2)
-        assert read.pairs.shape == (0, 2) and read.distances.shape == (0,)
-        assert np.isnan(read.angles).all() and (read.kinds == 0).all() and (read.times_seen == 0).all()
+        landmarks = read.landmarks
+        assert landmarks.shape == (n,) and read.relations.shape == (0,)
+        assert np.isnan(landmarks["angle"]).all() and (landmarks["kind"] == "unknown").all()
+        assert (landmarks["times_seen"] == 0).all()
 
 
 def test_tables_are_readable_with_plain_sql(tmp_path: Path) -> None:

@@ -84,9 +84,10 @@ def test_bad_names_and_numbers(
 
 def huge_png() -> bytes:
     """Return a PNG that announces 20,000 × 20,000 pixels."""
-    header = struct.pack(">IIBBBBB", 20_000, 20_000, 8, 0, 0, 0, 0)
-    chunk = b"IHDR" + header
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    chunks = b"IHDR" + struct.pack(">IIBBBBB", 20_000, 20_000, 8, 0, 0, 0, 0), b"IDAT" + zlib.compress(bytes(100))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
+    )
 
 
 def write_plan(kind: str, folder: Path) -> Path:
@@ -105,7 +106,7 @@ def write_plan(kind: str, folder: Path) -> Path:
     [
         ("missing", ["does not exist", "check the path"]),
         ("damaged", ["damaged"]),
-        ("too large", ["20000 × 20000", "too large", "scale it down"]),
+        ("too large", ["400000000 pixels", "too large", "scale it down"]),
         ("all walls", ["no free space"]),
     ],
 )

@@ -108,12 +108,13 @@ def test_the_map_is_the_room_seen_from_the_start(episode: tuple[Path, dict[str, 
 
 def test_the_landmarks_are_the_corners(episode: tuple[Path, dict[str, Any]]) -> None:
     folder, printed = episode
-    landmarks = read_landmark_map(folder / "landmarks.db")
-    assert len(landmarks.ids) == printed["landmarks"] >= 4
-    assert landmarks.meta["backend"] == "ekf" and np.all(landmarks.times_seen > 0)
+    landmarks, _, meta = read_landmark_map(folder / "landmarks.db")
+    assert len(landmarks) == printed["landmarks"] >= 4
+    assert meta["backend"] == "ekf" and np.all(landmarks["times_seen"] > 0)
+    positions = np.array([landmarks["x"], landmarks["y"]]).T
     corners = np.array([(x, y) for x in (0.25, 4.25) for y in (0.25, 3.25)]) - (1.0, 0.9)
     corners = corners @ np.array([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
-    nearest = np.linalg.norm(corners[:, None] - landmarks.positions[None], axis=2).min(axis=1)
+    nearest = np.linalg.norm(corners[:, None] - positions[None], axis=2).min(axis=1)
     assert nearest.max() < 0.1
 
 

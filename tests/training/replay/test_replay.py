@@ -71,13 +71,12 @@ def test_a_replay_writes_every_file_of_one_run(
     true_times, true = read_tum(out / "trajectory_true.tum")
     assert len(true) == found["samples"] and np.isin(true_times, times).all()
     assert np.allclose(estimate[np.isin(times, true_times)], true, atol=1e-3)
-    landmarks = read_landmark_map(out / "landmarks.db")
+    landmarks = read_landmark_map(out / "landmarks.db").landmarks
+    positions = np.array([landmarks["x"], landmarks["y"]]).T
     rows = list(csv.DictReader(io.StringIO((out / "landmarks.csv").read_text())))
-    assert [int(row["id"]) for row in rows] == landmarks.ids.tolist() == [6, 7, 8, 9]
-    assert np.allclose([[float(r["x_m"]), float(r["y_m"])] for r in rows], landmarks.positions)
-    assert np.allclose(
-        [[float(r["true_x_m"]), float(r["true_y_m"])] for r in rows], landmarks.positions, atol=1e-3
-    )
+    assert [int(row["id"]) for row in rows] == landmarks["id"].tolist() == [6, 7, 8, 9]
+    assert np.allclose([[float(r["x_m"]), float(r["y_m"])] for r in rows], positions)
+    assert np.allclose([[float(r["true_x_m"]), float(r["true_y_m"])] for r in rows], positions, atol=1e-3)
     picture = cv2.imread(str(out / "trajectory.png"))
     assert picture is not None and np.count_nonzero(picture < 255) > 1000
 
