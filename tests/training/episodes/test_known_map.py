@@ -10,13 +10,13 @@ from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
-from training.episodes.explore import ExploreOptions, prepare, run
+from training.episodes.explore import prepare, run
 from training.episodes.known_map import NAME, _greedy, _way_until
 from training.episodes.true_places import TruePlaces, cells_per_tile
 
 
 def episode(tmp_path, agent, rooms="apartment", seed=5):
-    it = prepare(ExploreOptions(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth"))
+    it = prepare(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth")
     run(it, lambda **_: None)
     return it.metrics()
 
