@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.metrics.measures import ate_aligned
-from training.episodes.explore import Episode, ExploreOptions, prepare, run
+from training.episodes.explore import Episode, prepare, run
 from training.runs.errors import one_line
 from training.runs.running import plain
 
@@ -82,11 +82,10 @@ def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
     """
     try:
         # Nothing is written there.
-        options = ExploreOptions(
+        episode = prepare(
             out=Path(tempfile.gettempdir()), agent=job.agent, rooms=job.rooms, slam=job.slam, noise=job.noise,
             seed=job.seed, floor_plan=job.floor_plan, max_steps=job.max_steps,
         )  # fmt: skip
-        episode = prepare(options)
         run(episode, lambda **_: None)
         row = None if episode.interrupted else _row(episode)
     except Exception as error:

@@ -19,7 +19,7 @@ import typer
 import agents
 from mecanum_env.arguments import make_config
 from slam.formats import atomic_write
-from training.episodes.explore import ExploreOptions, prepare, run
+from training.episodes.explore import prepare, run
 from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number
@@ -42,8 +42,7 @@ def run_job(job: Job) -> Row:
     """Run one episode; return its metrics, and its pose NEES once a simulated second."""
     rooms, backend, seed, agent, noise = job
     with tempfile.TemporaryDirectory() as folder:
-        options = ExploreOptions(out=Path(folder), agent=agent, rooms=rooms, slam=backend, seed=seed, noise=noise)
-        episode = prepare(options)
+        episode = prepare(out=Path(folder), agent=agent, rooms=rooms, slam=backend, seed=seed, noise=noise)
         run(episode, lambda **_: None)
     every = round(1.0 / episode.config.step_s)
     nees = [round(float(v), 4) for v in episode.env.truth.record.nees[every::every]]

@@ -27,7 +27,7 @@ from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
 from training.episodes.room_pictures import parse_seeds
-from training.runs.campaign import backend_names, check_settings, run_all, write_settings
+from training.runs.campaign import backend_names, keep_settings, run_all
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
 from training.runs.running import versions
@@ -164,10 +164,8 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int | None) -> Report:
     EpisodesFailed
         After the tables of the other episodes are written.
     """
-    settings = plan.settings()
-    check_settings(out, settings, FILES)
     made_by = plan.made_by()
-    write_settings(out, settings)
+    keep_settings(out, plan.settings(), FILES)
     failures: list[tuple[EpisodeJob, str]] = []
     with benchmark_store.Store(out / benchmark_store.FILE) as store:
         missing = _missing(plan, store, made_by, out)

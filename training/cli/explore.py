@@ -71,14 +71,13 @@ def explore(
     from training.views.episode_files import check_extras, write_episode
     from training.views.film import filmed
 
-    options = task.ExploreOptions(
-        out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
-        start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
-    )  # fmt: skip
     asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
     extras = [name for name, wanted in asked.items() if wanted]
     check_extras(extras)
-    episode, recorder = task.prepare(options), Recorder()
+    episode, recorder = task.prepare(
+        out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
+        start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
+    ), Recorder()  # fmt: skip
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
         witnesses: list[task.Witness] = [recorder]

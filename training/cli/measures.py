@@ -70,12 +70,12 @@ def consistency(
       mecanum consistency --slam ekf,odometry --rooms circle --runs 50 --out out/circle
       mecanum consistency --rooms rectangular --noise 3 --runs 20 --workers 2 --out out/rectangular --json
     """  # noqa: D301
-    from training.studies.consistency import Plan, table
-    from training.studies.consistency import consistency as measure
+    from training.studies import consistency as study
 
-    plan = Plan.parse(slam=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0)
-    result = measure(plan, out=out, workers=workers)
-    print(json.dumps(result) if as_json else table(result))
+    result = study.consistency(
+        backends=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0, out=out, workers=workers
+    )
+    print(json.dumps(result) if as_json else study.table(result))
 
 
 def complexity(
@@ -97,8 +97,7 @@ def complexity(
       mecanum complexity
       mecanum complexity --slam ekf,odometry --landmarks 25,50,100 --out out/complexity --json
     """  # noqa: D301
-    from training.studies.complexity import Plan, table
-    from training.studies.complexity import complexity as measure
+    from training.studies import complexity as study
 
-    result = measure(Plan.parse(slam=slam, landmarks=landmarks, steps=steps), out=out)
-    print(json.dumps(result) if as_json else table(result))
+    result = study.complexity(backends=slam, landmarks=landmarks, steps=steps, out=out)
+    print(json.dumps(result) if as_json else study.table(result))

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.errors import BadInput, bad_input, check_writable, needs_extra
 
 __all__ = ["policy"]
 
@@ -45,10 +45,8 @@ def policy(
     if member is not None and kinds[1] != ".zip":
         raise BadInput("--member says which network of a .safetensors becomes a .zip")
     check_writable(target.parent)
-    try:
+    with needs_extra("train"):
         from training.learning import networks, policies
-    except ModuleNotFoundError as error:
-        raise BadInput(f"this needs {error.name}; install it with pip install 'mecanum-slam[train]'") from error
     with bad_input():
         if kinds[0] == ".run":
             policies.export_run(source, target)

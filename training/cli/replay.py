@@ -56,11 +56,10 @@ def replay(
     from training.replay import report as replay_report
     from training.replay import run as task
 
-    options = task.ReplayOptions(
-        log=log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
+    prepared = task.prepare(
+        log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
         limit_s=limit_s, config=config,
     )  # fmt: skip
-    prepared = task.prepare(options)
     whole_s = prepared.log.duration_s
     with Progress("replaying", whole_s) as progress:
         task.run(prepared, lambda time_s: progress.show(time_s, f"{time_s:.0f} of {whole_s:.0f} s"))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from training.runs.errors import BadInput, Interrupted, bad_input, check_writable, suggestion
+from training.runs.errors import BadInput, Interrupted, bad_input, check_writable, needs_extra, suggestion
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,12 +60,8 @@ def train(
         raise BadInput(f"{out} holds a run already; go on with it by --resume, or choose another --out")
     if resume and not begun:
         raise BadInput(f"{out} holds no run to go on with; leave out --resume")
-    try:
+    with needs_extra("train", "training"):
         make_run = _runner(settings)
-    except ModuleNotFoundError as error:
-        raise BadInput(
-            f"training needs {error.name}; install it with pip install 'mecanum-slam[train]'"
-        ) from error
     with bad_input():
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
         run = make_run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)

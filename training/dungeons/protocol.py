@@ -25,7 +25,7 @@ from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import Dungeon, layout, load
 from training.figures.tables import csv_table, markdown_table, number
-from training.runs.campaign import check_settings, installed_version, write_settings
+from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
 from training.runs.rows import resume
 
@@ -76,14 +76,13 @@ def run_dungeons(
     if scan not in SCANS:
         raise BadInput(str(unknown_name("--scan", scan, SCANS)))
     paths = _maps(maps)
-    settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
-    check_settings(out, settings, [_STORE, _CSV, _SUMMARY])
     if (out / _STORE).exists() and (out / _STORE).read_text("utf-8").startswith("{"):
         raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
     # A map that cannot be used is found before any work is lost.
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
-    write_settings(out, settings)
+    settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
+    keep_settings(out, settings, [_STORE, _CSV, _SUMMARY])
     files = {digests[path]: path for path in paths}
     asked = [(path, (name, digests[path], scan)) for path in paths for name in dict.fromkeys(agent_names)]
     done = resume(out / _STORE, [job for _, job in asked], partial(_run, files), workers=workers, what="episodes")

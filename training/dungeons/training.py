@@ -31,7 +31,7 @@ from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork
 from training.dungeons.plans import dungeon_plan
-from training.runs.campaign import check_settings, installed_version, write_settings
+from training.runs.campaign import installed_version, keep_settings
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
@@ -263,8 +263,7 @@ def study(
 def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
     """Gather lessons, train and write the policy."""
     settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
-    check_settings(out, settings, [_WEIGHTS])
-    write_settings(out, settings)
+    keep_settings(out, settings, [_WEIGHTS])
     policy: Path | None = None
     curves = []
     for number in range(1, config.rounds + 1):

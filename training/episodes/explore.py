@@ -32,7 +32,6 @@ __all__ = [
     "EXTRAS",
     "FILES",
     "Episode",
-    "ExploreOptions",
     "Progress",
     "Witness",
     "make_agent",
@@ -63,24 +62,6 @@ ENDINGS = {
 _DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
 _RUN_KINDS = {"agent": (str,), "seed": (int,), "start": (list,), "max_steps": (int,)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExploreOptions:
-    """What was asked for; ``None`` where the config file or the default decides."""
-
-    out: Path
-    agent: str | None = None
-    rooms: str | None = None
-    slam: str | None = None
-    robot: str | None = None
-    noise: str | None = None
-    seed: int | None = None
-    floor_plan: Path | None = None
-    start: tuple[float, float, float] | None = None
-    config: Path | None = None
-    max_steps: int | None = None
-    coverage_target: float | None = None
 
 
 class Progress(Protocol):
@@ -136,8 +117,15 @@ class Episode:
 # ---- before --------------------------------------------------------------------------------------------------
 
 
-def prepare(options: ExploreOptions) -> Episode:
+def prepare(
+    *, out: Path, agent: str | None = None, rooms: str | None = None, slam: str | None = None,
+    robot: str | None = None, noise: str | None = None, seed: int | None = None, floor_plan: Path | None = None,
+    start: tuple[float, float, float] | None = None, config: Path | None = None, max_steps: int | None = None,
+    coverage_target: float | None = None,
+) -> Episode:  # fmt: skip
     """Check everything that can be checked, and place the robot; nothing is written.
+
+    Of what is ``None`` the config file or the default decides.
 
     Raises
     ------
@@ -145,41 +133,39 @@ def prepare(options: ExploreOptions) -> Episode:
         In one line: which option, file or name is wrong, and what to do.
     """
     with bad_input():
-        past = _read_run_table(options.config) if options.config is not None else {}
-        if any(v is not None for v in (options.rooms, options.floor_plan, options.seed)):
+        past = _read_run_table(config) if config is not None else {}
+        if any(v is not None for v in (rooms, floor_plan, seed)):
             # Other rooms: neither the start nor the step limit is meant for them.
             past = {name: value for name, value in past.items() if name in _DEFAULTS}
-        run = _DEFAULTS | past | _given(options, ("agent", "seed", "start", "max_steps"))
+        given = {"agent": agent, "seed": seed, "start": start, "max_steps": max_steps}
+        run = _DEFAULTS | past | {name: value for name, value in given.items() if value is not None}
         agents.check(run["agent"], KNOWN_MAP)
         if run["agent"].endswith(".safetensors"):
             run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
-        config = make_config(
-            config=options.config, rooms=options.rooms, slam=options.slam, robot=options.robot,
-            noise=options.noise, floor_plan=options.floor_plan,
-        )  # fmt: skip
-        if options.rooms is not None and options.floor_plan is None:
-            config = replace(config, floor_plan=None)
-        elif config.floor_plan is not None:
-            config = replace(config, floor_plan=str(Path(config.floor_plan).absolute()))
-        if options.coverage_target is not None:
-            config = replace(config, coverage_target=options.coverage_target)
-        check_writable(options.out, [*FILES, *EXTRAS.values()])
-        plan = _make_plan(config, run["seed"])
+        world = make_config(config=config, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan)
+        if rooms is not None and floor_plan is None:
+            world = replace(world, floor_plan=None)
+        elif world.floor_plan is not None:
+            world = replace(world, floor_plan=str(Path(world.floor_plan).absolute()))
+        if coverage_target is not None:
+            world = replace(world, coverage_target=coverage_target)
+        check_writable(out, [*FILES, *EXTRAS.values()])
+        plan = _make_plan(world, run["seed"])
         # An agent maps all that it can reach; what counts as success is judged at the end.
         limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
         wrapped = gymnasium.make(
-            "mecanum_env:mecanum_env/Explore-v0", config=replace(config, coverage_target=1.0),
+            "mecanum_env:mecanum_env/Explore-v0", config=replace(world, coverage_target=1.0),
             max_episode_steps=limit, disable_env_checker=True,
         )  # fmt: skip
-        start = run.get("start")
-        reset_options = {"floor_plan": plan} | ({"start_pose": tuple(start)} if start is not None else {})
+        placed = run.get("start")
+        reset_options = {"floor_plan": plan} | ({"start_pose": tuple(placed)} if placed is not None else {})
         observation, _ = wrapped.reset(seed=run["seed"], options=reset_options)
         env = wrapped.unwrapped
         assert isinstance(env, ExploreEnv)
-        agent = make_agent(run["agent"], env)
-        agent.reset(env.belief, run["seed"])
+        explorer = make_agent(run["agent"], env)
+        explorer.reset(env.belief, run["seed"])
     run |= {"max_steps": limit}
-    return Episode(env, wrapped, agent, observation, config, run, options.out)
+    return Episode(env, wrapped, explorer, observation, world, run, out)
 
 
 def make_agent(name: str, env: ExploreEnv) -> Agent:
@@ -187,10 +173,6 @@ def make_agent(name: str, env: ExploreEnv) -> Agent:
     config = env.config
     body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
     return KnownMap(env.truth.ground, **body) if name == KNOWN_MAP else agents.make(name, **body)
-
-
-def _given(options: ExploreOptions, names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in names if getattr(options, name) is not None}
 
 
 def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:

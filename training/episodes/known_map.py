@@ -22,7 +22,7 @@ from agents.ways.planning import shortest_path, travel_costs
 from agents.ways.routing import best_tour, draw_luck
 from mecanum_env.ground_truth import GroundTruth
 from slam.belief import Belief
-from training.episodes.true_places import TruePlaces
+from training.episodes.true_places import TruePlaces, greedy_tour
 
 __all__ = ["NAME", "KnownMap"]
 
@@ -89,7 +89,11 @@ class KnownMap(Explorer):
         share = seen @ cells / cells.sum()
         luck = draw_luck(_TRIES, len(seen))
         tours = [best_tour(seen, distance, soon * share, luck)[0] for soon in _SOON]
-        return tours + [_greedy(seen, distance, cells, offset) for offset in _OFFSETS_M]
+        tiles = np.ascontiguousarray(seen.T)
+        for offset in _OFFSETS_M:
+            order, _ = greedy_tour(tiles, distance, cells.copy(), cells @ tiles, cells.sum(), 0, -1.0, offset)
+            tours.append(order)
+        return tours
 
     def _way(self, order: Cells, seen: NDArray[np.bool_], distance: Array, cells: Array) -> float:
         """Return how far [weighted m] a tour goes until 95 % is seen; all of it, where that much is."""
@@ -135,26 +139,3 @@ def _way_until(seen: NDArray[np.bool_], distance: Array, cells: Array, order: Ce
         if total <= spare + 0.5:
             return float(way)
     return np.inf
-
-
-@njit(cache=True, nogil=True)
-def _greedy(seen: NDArray[np.bool_], distance: Array, cells: Array, offset: float) -> Cells:
-    """Return the tour that goes on to where most new cells are in view for the way there and ``offset`` [m]."""
-    left = cells.copy()
-    order = [0]
-    while True:
-        best, most = -1, 0.0
-        for i in range(1, len(seen)):
-            new = 0.0
-            for j in range(len(left)):
-                if seen[i, j]:
-                    new += left[j]
-            value = new / (distance[order[-1], i] + offset)
-            if value > most:
-                best, most = i, value
-        if best < 0:
-            return np.array(order)
-        order.append(best)
-        for j in range(len(left)):
-            if seen[best, j]:
-                left[j] = 0.0

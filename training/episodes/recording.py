@@ -24,6 +24,7 @@ __all__ = ["Recorded", "Recorder", "Recording"]
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
+_Notes = dict[int, NDArray[Any]]  # by the step that they were noted in
 
 _SCAN_EVERY = 2  # steps
 _MAP_EVERY = 5
@@ -80,10 +81,10 @@ class Recorder:
         self._covs: list[Array] = []
         self._twists: list[tuple[float, float, float] | Array] = []
         self._collisions: list[int] = []
-        self._scans = _Notes()
-        self._goals = _Notes()
-        self._landmarks = _Notes()
-        self._maps = _Notes()
+        self._scans: _Notes = {}
+        self._goals: _Notes = {}
+        self._landmarks: _Notes = {}
+        self._maps: _Notes = {}
         self._map = _MapFollower()
         self._goal: Goal | None = None
 
@@ -99,9 +100,9 @@ class Recorder:
         self._map.follow(env.map_changes)
         if goal is not self._goal or step == 0:
             self._goal = goal
-            self._goals.add(step, np.zeros((0, 2), np.float32) if goal is None else goal.path.astype(np.float32))
+            self._goals[step] = np.zeros((0, 2), np.float32) if goal is None else goal.path.astype(np.float32)
         if step % _SCAN_EVERY == 0:
-            self._scans.add(step, env.truth.scan.ranges.astype(np.float32))
+            self._scans[step] = env.truth.scan.ranges.astype(np.float32)
         if step % _MAP_EVERY == 0:
             self._note_map(step)
         if step % _LANDMARKS_EVERY == 0:
@@ -117,38 +118,24 @@ class Recorder:
             step_s=env.config.step_s, times=record.times, true_poses=record.true_poses, estimates=record.estimates,
             pose_covs=np.array(self._covs), twists=np.array(self._twists), coverage=record.coverage,
             nees=record.nees, collisions=np.array(self._collisions, np.int32),
-            resolution=env.backend.grid.resolution, scan=self._scan, scans=self._scans.recorded(),
-            goals=self._goals.recorded(), landmarks=self._landmarks.recorded(), map_changes=self._maps.recorded(),
+            resolution=env.backend.grid.resolution, scan=self._scan, scans=_recorded(self._scans),
+            goals=_recorded(self._goals), landmarks=_recorded(self._landmarks), map_changes=_recorded(self._maps),
         )  # fmt: skip
 
     def _note_map(self, step: int) -> None:
         changes = self._map.take(self._env.backend.grid)
         if len(changes):
-            self._maps.add(step, changes)
+            self._maps[step] = changes
 
     def _note_landmarks(self, step: int) -> None:
         belief = self._env.belief
         cov = belief.landmark_cov
         rows = np.column_stack([belief.landmarks, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]])
-        self._landmarks.add(step, rows.astype(np.float32))
+        self._landmarks[step] = rows.astype(np.float32)
 
 
-class _Notes:
-    """Arrays and the steps that they were noted in."""
-
-    def __init__(self) -> None:
-        self._steps: list[int] = []
-        self._values: list[NDArray[np.generic]] = []
-
-    def add(self, step: int, value: NDArray[np.generic]) -> None:
-        if self._steps and self._steps[-1] == step:  # the last row, asked for twice
-            self._steps.pop()
-            self._values.pop()
-        self._steps.append(step)
-        self._values.append(value)
-
-    def recorded(self) -> Recorded:
-        return Recorded(np.array(self._steps, np.int32), tuple(self._values))
+def _recorded(notes: _Notes) -> Recorded:
+    return Recorded(np.array(list(notes), np.int32), tuple(notes.values()))
 
 
 class _MapFollower:

@@ -20,7 +20,7 @@ from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
-__all__ = ["TILE", "TruePlaces", "cells_per_tile"]
+__all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from"]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -135,3 +135,56 @@ def _tiles_in_view(free: NDArray[np.bool_], eyes: Array, reach: float) -> NDArra
                     seen[i, (row // TILE) * across + col // TILE] += 1
                 away += 0.7
     return seen
+
+
+@njit(cache=True, nogil=True)
+def greedy_tour(
+    seen: NDArray[np.bool_], distance: Array, left: Array, gains: Array, total: float, place: int, spare: float,
+    offset: float,
+) -> tuple[Cells, float]:  # fmt: skip
+    """Return the places in turn until enough is seen, each where most is new for the way there, and the way.
+
+    Parameters
+    ----------
+    seen
+        ``(tiles, places)``.
+    distance
+        ``(places, places)`` [weighted m].
+    left, gains
+        ``(tiles,)`` missing in each, and ``(places,)`` those in sight of each place; both are used up.
+    total, place
+        Cells missing in all, and the place to begin at.
+    spare
+        That many cells need not be seen; below 0 the tour goes on while anything is to be seen.
+    offset
+        Added to every way [weighted m].
+    """
+    order, count, way = np.empty(len(gains) + 1, dtype=np.int64), 1, 0.0
+    order[0] = place
+    while total > spare + 0.5:
+        best, most = -1, 0.0
+        for i in range(len(gains)):
+            value = gains[i] / (distance[place, i] + offset)
+            if gains[i] > 0.5 and value > most:
+                best, most = i, value
+        if best < 0:
+            break
+        way += distance[place, best]
+        place = best
+        order[count] = place
+        count += 1
+        total -= see_from(seen, place, left, gains)
+    return order[:count], way
+
+
+@njit(cache=True, nogil=True)
+def see_from(seen: NDArray[np.bool_], place: int, left: Array, gains: Array) -> float:
+    """Strike out what is seen from a place; return how many cells that is."""
+    new = 0.0
+    for j in range(len(left)):
+        if left[j] > 0.0 and seen[j, place]:
+            new += left[j]
+            for i in range(len(gains)):
+                gains[i] -= left[j] * seen[j, i]
+            left[j] = 0.0
+    return new

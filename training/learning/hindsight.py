@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from agents.ways.routing import improve
 from slam.belief import Belief
-from training.episodes.true_places import TruePlaces
+from training.episodes.true_places import TruePlaces, greedy_tour, see_from
 
 __all__ = ["Hindsight"]
 
@@ -70,39 +70,15 @@ def _price(seen: NDArray[np.bool_], distance: Array, left: Array, gains: Array, 
         That many cells need not be seen.
     """
     total = left.sum()
-    total -= _look(seen, place, left, gains)
+    total -= see_from(seen, place, left, gains)
     if total <= spare + 0.5:
         return 0.0
     lowest, best = np.inf, np.array([place])
     for offset in _OFFSETS_M:
-        order, way = _greedy_tour(seen, distance, left.copy(), gains.copy(), total, place, spare, offset)
+        order, way = greedy_tour(seen, distance, left.copy(), gains.copy(), total, place, spare, offset)
         if way < lowest:
             lowest, best = way, order
     return min(lowest, _improved(seen, distance, left, total, best, spare))
-
-
-@njit(cache=True, nogil=True)
-def _greedy_tour(
-    seen: NDArray[np.bool_], distance: Array, left: Array, gains: Array, total: float, place: int, spare: float,
-    offset: float,
-) -> tuple[Cells, float]:  # fmt: skip
-    """Return the places in turn until enough is seen, each where most is new for the way there, and the way."""
-    order, count, way = np.empty(len(gains) + 1, dtype=np.int64), 1, 0.0
-    order[0] = place
-    while total > spare + 0.5:
-        best, most = -1, 0.0
-        for i in range(len(gains)):
-            value = gains[i] / (distance[place, i] + offset)
-            if gains[i] > 0.5 and value > most:
-                best, most = i, value
-        if best < 0:
-            break
-        way += distance[place, best]
-        place = best
-        order[count] = place
-        count += 1
-        total -= _look(seen, place, left, gains)
-    return order[:count], way
 
 
 @njit(cache=True, nogil=True)
@@ -126,16 +102,3 @@ def _improved(
                 total -= left[j]
                 left[j] = 0.0
     return way
-
-
-@njit(cache=True, nogil=True)
-def _look(seen: NDArray[np.bool_], place: int, left: Array, gains: Array) -> float:
-    """Strike out what is seen from a place; return how many cells that is."""
-    new = 0.0
-    for j in range(len(left)):
-        if left[j] > 0.0 and seen[j, place]:
-            new += left[j]
-            for i in range(len(gains)):
-                gains[i] -= left[j] * seen[j, i]
-            left[j] = 0.0
-    return new

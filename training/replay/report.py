@@ -6,10 +6,8 @@ import csv
 import io
 import json
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import cv2
@@ -27,7 +25,7 @@ from training.figures.charts import png
 from training.replay.picture import draw_belief, draw_replay
 from training.replay.run import FILES, Replay
 from training.replay.scans import scan_metrics
-from training.runs.running import interrupt_flag, plain, versions
+from training.runs.running import plain, versions, written_together
 
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
 
@@ -85,22 +83,9 @@ def surveyed_places(replay: Replay, ids: NDArray[np.int64]) -> Array:
 
 
 def write(replay: Replay) -> dict[str, Any]:
-    """Write every file of a replay and return its metrics.
-
-    The files are made in a folder beside their place and then renamed, one after the other: a run that fails
-    while writing leaves the results of an earlier one as they were.
-    """
-    out = replay.out
-    out.mkdir(parents=True, exist_ok=True)
-    folder = Path(mkdtemp(prefix=".writing-", dir=out))
-    try:
-        with interrupt_flag():  # one Ctrl-C does not leave half the files of this replay, half of another
-            found = _write_into(folder, replay)
-            for name in replay.files:
-                (folder / name).replace(out / name)
-        return found
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    """Write every file of a replay and return its metrics."""
+    with written_together(replay.out) as folder:
+        return _write_into(folder, replay)
 
 
 def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import slam
 from slam.backend import Backend
 from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_reference
 from slam.metrics.measures import nees_pose
 from slam.motion import move
+from slam.registry import config_type, make
 from slam.settings import from_mapping, require, to_mapping, unknown_name
 from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
@@ -27,7 +27,6 @@ __all__ = [
     "MAP_FILES",
     "Replay",
     "ReplayConfig",
-    "ReplayOptions",
     "prepare",
     "run",
     "sample_times",
@@ -51,21 +50,6 @@ SAMPLE_S = 0.1
 _RUN_KINDS: dict[str, tuple[type, ...]] = {
     "association": (str,), "seed": (int,), "limit_s": (int, float), "reference": (str,),
 }  # fmt: skip
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayOptions:
-    """What was asked for; ``None`` where the config file, the log or the default decides."""
-
-    log: Path
-    out: Path
-    robot: int | None = None
-    reference: Path | None = None  # of a log of scans
-    slam: str | None = None
-    association: str | None = None
-    seed: int | None = None
-    limit_s: float | None = None
-    config: Path | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,8 +101,14 @@ class Replay:
 # ---- before --------------------------------------------------------------------------------------------------
 
 
-def prepare(options: ReplayOptions) -> Replay:
+def prepare(
+    path: Path, *, out: Path, robot: int | None = None, reference: Path | None = None, slam: str | None = None,
+    association: str | None = None, seed: int | None = None, limit_s: float | None = None,
+    config: Path | None = None,
+) -> Replay:  # fmt: skip
     """Read the log, check everything that can be checked, and set the backend at the start; nothing is written.
+
+    Of what is ``None`` the config file, the log or the default decides; ``reference`` is of a log of scans.
 
     Raises
     ------
@@ -126,37 +116,40 @@ def prepare(options: ReplayOptions) -> Replay:
         In one line: which option, file, line or name is wrong, and what to do.
     """
     with bad_input():
-        if options.slam is not None:
-            slam.config_type(options.slam)  # before a log is read in vain
-        check_writable(options.out, (*MAP_FILES, *FILES))
-        values, past = read_config(options.config, _RUN_KINDS) if options.config is not None else ({}, {})
-        run = {"seed": 0} | past | {key: v for key in _RUN_KINDS if (v := getattr(options, key)) is not None}
-        log = open_log(options.log, robot=options.robot)
+        if slam is not None:
+            config_type(slam)  # before a log is read in vain
+        check_writable(out, (*MAP_FILES, *FILES))
+        values, past = read_config(config, _RUN_KINDS) if config is not None else ({}, {})
+        given = {"association": association, "seed": seed, "limit_s": limit_s, "reference": reference}
+        run = {"seed": 0} | past | {name: value for name, value in given.items() if value is not None}
+        log = open_log(path, robot=robot)
         if "reference" in run:
             log = with_reference(log, run["reference"])
             run["reference"] = str(Path(run["reference"]).absolute())
-        association = run.setdefault("association", "unknown" if log.ids is None else "known")
-        if association not in ASSOCIATIONS:
-            raise unknown_name("association", association, ASSOCIATIONS)
-        if association == "known" and log.ids is None:
+        known = run.setdefault("association", "unknown" if log.ids is None else "known")
+        if known not in ASSOCIATIONS:
+            raise unknown_name("association", known, ASSOCIATIONS)
+        if known == "known" and log.ids is None:
             raise ValueError(f"log {log.name} does not tell landmarks apart; give --association unknown")
         limit = run.get("limit_s")
         if limit is not None:
             require(0 < limit < math.inf, f"--limit-s must be above 0 and finite, got {limit}")
             log = log.until(float(limit))
-        config = _make_config(log, values, options.slam)
-        backend = slam.make(config.slam, config=config.slam_config)
+        effective = _make_config(log, values, slam)
+        backend = make(effective.slam, config=effective.slam_config)
         if hasattr(backend, "give_pose") and not log.has_heading:
             lacks = "none: give --reference" if isinstance(log, ScanLog) else "only positions"
-            raise ValueError(f"--slam {config.slam} needs true poses; log {log.name} has {lacks}")
+            raise ValueError(f"--slam {effective.slam} needs true poses; log {log.name} has {lacks}")
         if not (backend.observes_landmarks or isinstance(log, ScanLog)):
-            raise ValueError(f"--slam {config.slam} takes scans; log {log.name} holds landmark observations only")
+            raise ValueError(
+                f"--slam {effective.slam} takes scans; log {log.name} holds landmark observations only"
+            )
         backend.reset(log.start_pose, seed=run["seed"])
-    run |= {"log": str(options.log.absolute()), "clock_start_s": log.clock_start_s}
-    if options.robot is not None:
-        run["robot"] = options.robot
+    run |= {"log": str(path.absolute()), "clock_start_s": log.clock_start_s}
+    if robot is not None:
+        run["robot"] = robot
     times, rows = sample_times(log)
-    return Replay(log, config, backend, run, options.out, times, rows)
+    return Replay(log, effective, backend, run, out, times, rows)
 
 
 def sample_times(log: AnyLog) -> tuple[Array, NDArray[np.int64]]:
@@ -190,7 +183,7 @@ def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) ->
         raise ValueError(f"log {log.name} holds scans, no observations; take [observation] out of the config")
     config = from_mapping(ReplayConfig, values, base=ReplayConfig(observation=log.observation_noise))
     name = backend or config.slam
-    kind = slam.config_type(name)
+    kind = config_type(name)
     known = {key: value for key, value in log.settings.items() if key in kind.__dataclass_fields__}
     settings = from_mapping(kind, config.slam_config, base=from_mapping(kind, known))
     return ReplayConfig(observation=config.observation, slam=name, slam_config=to_mapping(settings))

@@ -24,13 +24,12 @@ from training.runs.running import versions
 
 __all__ = [
     "backend_names",
-    "check_settings",
     "installed_version",
+    "keep_settings",
     "one_thread_each",
     "run_all",
     "start_worker",
     "worker_pool",
-    "write_settings",
 ]
 
 Job = TypeVar("Job")
@@ -75,8 +74,10 @@ def installed_version() -> str:
     return versions().get("mecanum-slam", "not installed")
 
 
-def check_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:
-    """Refuse a folder that cannot be written to, or whose runs were made with other settings; write nothing.
+def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:
+    """Make a folder, and note in it what its runs are made with.
+
+    Refused, with nothing written, is one that is not to be written to, or holds runs of other settings.
 
     Raises
     ------
@@ -85,26 +86,19 @@ def check_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str])
     """
     check_writable(out, [SETTINGS, *files])
     path = out / SETTINGS
-    if not path.exists():
-        return
+    now = json.loads(json.dumps(settings))
     try:
-        before = json.loads(path.read_text("utf-8"))
+        before = json.loads(path.read_text("utf-8")) if path.exists() else now
     except (OSError, ValueError) as error:
         raise BadInput(f"cannot read {path} ({error}); choose another --out, or remove that one") from error
-    now = json.loads(json.dumps(settings))
-    if before == now:
-        return
-    old = before if isinstance(before, dict) else {}
-    keys = [key for key in (*now, *old) if now.get(key) != old.get(key)]
-    key = keys[0] if keys else "other settings"
-    raise BadInput(
-        f"{out} holds runs with {key} = {json.dumps(old.get(key))}, not {json.dumps(now.get(key))}; "
-        "choose another --out, or give the same to go on"
-    )
-
-
-def write_settings(out: Path, settings: Mapping[str, Any]) -> None:
-    """Make the folder, and note in it what its runs are made with."""
+    if before != now:
+        old = before if isinstance(before, dict) else {}
+        keys = [key for key in (*now, *old) if now.get(key) != old.get(key)]
+        key = keys[0] if keys else "other settings"
+        raise BadInput(
+            f"{out} holds runs with {key} = {json.dumps(old.get(key))}, not {json.dumps(now.get(key))}; "
+            "choose another --out, or give the same to go on"
+        )
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / SETTINGS, json.dumps(settings, indent=1) + "\n")
 

@@ -6,15 +6,17 @@ import math
 import platform
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
-__all__ = ["interrupt_flag", "plain", "versions"]
+__all__ = ["interrupt_flag", "plain", "versions", "written_together"]
 
 _LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
 
@@ -37,6 +39,24 @@ def interrupt_flag() -> Iterator[threading.Event]:
         yield flag
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def written_together(out: Path, *, without: Iterable[str] = ()) -> Iterator[Path]:
+    """Give a folder within ``out`` whose files come to lie in ``out`` when the block ends.
+
+    They are renamed one after the other, ``metrics.json`` last, once an earlier one and the files that shall be
+    there no more (``without``) are taken away: a run that fails while writing leaves the results of an earlier one
+    as they were, and one Ctrl-C does not leave half the files of this run, half of another.
+    """
+    last = "metrics.json"
+    out.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".writing-", dir=out, ignore_cleanup_errors=True) as folder, interrupt_flag():
+        yield Path(folder)
+        for name in (last, *without):
+            (out / name).unlink(missing_ok=True)
+        for path in sorted(Path(folder).iterdir(), key=lambda path: path.name == last):
+            path.replace(out / path.name)
 
 
 def versions() -> dict[str, str]:

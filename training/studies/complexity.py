@@ -10,7 +10,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +25,13 @@ from slam.motion import move
 from slam.types import Observations, Odometry
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
-from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
+from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.options import whole_numbers
 from training.runs.rows import resume
-from training.studies.circle_world import check_observes
+from training.studies.circle_world import not_observing
 
-__all__ = ["REFERENCE", "SEEN", "Plan", "complexity", "exponent", "run_job", "table"]
+__all__ = ["REFERENCE", "SEEN", "complexity", "exponent", "run_job", "table"]
 
 Array = NDArray[np.float64]
 Job = tuple[str, int, int]  # backend or REFERENCE, landmarks, steps
@@ -48,34 +47,6 @@ STORE = "points.jsonl"  # what was measured
 _MOST_LANDMARKS = 2000  # the joint covariance of so many takes 130 MB
 _DT, _SPEED, _TURN = 0.1, 0.3, 0.2
 _SIGMAS = np.array([0.02, math.radians(1.0)])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What was asked for, checked."""
-
-    backends: tuple[str, ...]
-    landmarks: tuple[int, ...]
-    steps: int
-
-    @classmethod
-    def parse(cls, *, slam: str, landmarks: str, steps: int) -> Plan:
-        """Check options as typed; :class:`BadInput` says what is allowed."""
-        with bad_input():
-            backends = tuple(backend_names(slam))
-        sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
-        return cls(backends=backends, landmarks=tuple(sizes), steps=steps)
-
-    def settings(self) -> dict[str, Any]:
-        """Return what every point depends on."""
-        return {
-            "version": installed_version(), "steps": self.steps, "repeats": REPEATS, "seen": SEEN,
-            "reference": "dsyrk",
-        }  # fmt: skip
-
-    def jobs(self) -> list[Job]:
-        """Return every point to measure, the reference among them."""
-        return [(name, n, self.steps) for n in self.landmarks for name in (*self.backends, REFERENCE)]
 
 
 # ---- one point -------------------------------------------------------------------------------------------------
@@ -191,8 +162,10 @@ def _time_reference(landmarks: int) -> float:
 # ---- all of them -----------------------------------------------------------------------------------------------
 
 
-def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
+def complexity(*, backends: str, landmarks: str, steps: int, out: Path) -> dict[str, Any]:
     """Measure the points that ``out`` does not hold yet, one at a time; write and return ``complexity.json``.
+
+    Backends and numbers of landmarks are given as typed.
 
     Raises
     ------
@@ -201,22 +174,24 @@ def complexity(plan: Plan, *, out: Path) -> dict[str, Any]:
     Interrupted
         On Ctrl-C; running it again goes on.
     """
-    settings = plan.settings()
-    check_settings(out, settings, FILES)
-    for name in plan.backends:
-        check_observes(name)
-    write_settings(out, settings)
-    points = resume(out / STORE, plan.jobs(), run_job, workers=1, what="points", apart=True)
+    with bad_input():
+        names = (*backend_names(backends, without=not_observing()), REFERENCE)
+    sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
+    settings = {
+        "version": installed_version(), "steps": steps, "repeats": REPEATS, "seen": SEEN, "reference": "dsyrk"
+    }  # fmt: skip
+    keep_settings(out, settings, FILES)
+    jobs = [(name, n, steps) for n in sizes for name in names]
+    points = resume(out / STORE, jobs, run_job, workers=1, what="points", apart=True)
     result: dict[str, Any] = {}
-    for name in (*plan.backends, REFERENCE):
-        rows = [{"landmarks": n, **points[name, n, plan.steps]} for n in plan.landmarks]
+    figure, (axes,) = chart()
+    for name in names:
+        rows = [{"landmarks": n, **points[name, n, steps]} for n in sizes]
         times = [float(row["us_per_step"] or 0.0) for row in rows]
-        result[name] = {"times": rows, "exponent": exponent(plan.landmarks, times)}
+        result[name] = {"times": rows, "exponent": exponent(sizes, times)}
+        axes.plot(sizes, times, "o-", label=name)
     result["config"] = settings
     atomic_write(out / "complexity.json", json.dumps(result, indent=1) + "\n")
-    figure, (axes,) = chart()
-    for name in (*plan.backends, REFERENCE):
-        axes.plot(plan.landmarks, [p["us_per_step"] for p in result[name]["times"]], "o-", label=name)
     label(axes, f"Time per step: predict, and observe {SEEN} of n landmarks", "landmarks n", "µs", log="xy")
     atomic_write(out / "complexity.png", png(figure))
     return result

@@ -10,7 +10,6 @@ import dataclasses
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +29,13 @@ from slam.settings import unknown_name
 from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
 from training.figures.tables import number, text_table
-from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
+from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.rows import resume
-from training.studies.circle_world import WORLDS, check_observes, drive
+from training.studies.circle_world import WORLDS, drive, not_observing
 from training.studies.exploring import AGENT, exploring
 
-__all__ = ["Plan", "Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
+__all__ = ["Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
 
 Array = NDArray[np.float64]
 Job = tuple[str, str, int, int, float]  # backend, rooms, seed, steps, noise
@@ -48,47 +47,6 @@ STORE = "runs.jsonl"  # what each run left
 _IDLE_STEPS = 20  # an agent without a goal for so long has nothing left to do
 _SCALED = ("range_sigma_m", "dropout", "encoder", "radius_error", "base_error", "slip")
 _NOT_HERE = {"truth": "is given the pose, so there is nothing to be consistent about"}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What was asked for, checked."""
-
-    backends: tuple[str, ...]
-    rooms: str
-    runs: int
-    steps: int  # of each run, at most
-    noise: float  # times the noise of the world, or of the nominal robot
-    seed0: int
-
-    @classmethod
-    def parse(cls, *, slam: str, rooms: str, runs: int, steps: int | None, noise: float, seed0: int) -> Plan:
-        """Check options as typed; :class:`BadInput` says what is allowed."""
-        with bad_input():
-            backends = tuple(backend_names(slam, without=_NOT_HERE))
-            if rooms not in WORLDS and rooms not in room_registry.names():
-                raise unknown_name("rooms", rooms, (*WORLDS, *room_registry.names()))
-            if not (math.isfinite(noise) and noise > 0):
-                raise ValueError(f"--noise must be a finite number above 0, got {noise}")
-            if rooms not in WORLDS:
-                scaled_noise(noise)
-        if steps is None:
-            steps = WORLDS[rooms].steps if rooms in WORLDS else MAX_EPISODE_STEPS
-        return cls(backends=backends, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0)
-
-    def settings(self) -> dict[str, Any]:
-        """Return what every run depends on, whatever its backend and seed."""
-        out: dict[str, Any] = {
-            "version": installed_version(), "rooms": self.rooms, "steps": self.steps, "noise": self.noise,
-        }  # fmt: skip
-        if self.rooms in WORLDS:
-            return out | {"world": WORLDS[self.rooms].scaled(self.noise).settings()}
-        return out | {"agent": AGENT, "noise_config": dataclasses.asdict(scaled_noise(self.noise))}
-
-    def jobs(self) -> list[Job]:
-        """Return every run, all backends on one seed before the next seed."""
-        seeds = range(self.seed0, self.seed0 + self.runs)
-        return [(name, self.rooms, seed, self.steps, self.noise) for seed in seeds for name in self.backends]
 
 
 def scaled_noise(scale: float) -> NoiseConfig:
@@ -141,8 +99,26 @@ def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> Row
 # ---- all of them -----------------------------------------------------------------------------------------------
 
 
-def consistency(plan: Plan, *, out: Path, workers: int | None) -> dict[str, Any]:
+def consistency(
+    *, backends: str, rooms: str, runs: int, steps: int | None, noise: float, seed0: int, out: Path,
+    workers: int | None,
+) -> dict[str, Any]:  # fmt: skip
     """Do the runs that ``out`` does not hold yet, write ``consistency.json`` and ``.png``, return the former.
+
+    Parameters
+    ----------
+    backends
+        As typed.
+    rooms
+        A name in :data:`WORLDS`, or a generator of rooms.
+    runs, seed0
+        How many for each backend, and the seed of the first.
+    steps
+        Of each run, at most; None: the world's, or those of an episode.
+    noise
+        Times the noise of the world, or of the nominal robot.
+    out, workers
+        Folder of the results, and processes.
 
     Raises
     ------
@@ -151,18 +127,30 @@ def consistency(plan: Plan, *, out: Path, workers: int | None) -> dict[str, Any]
     Interrupted
         On Ctrl-C; running it again goes on.
     """
-    settings = plan.settings()
-    check_settings(out, settings, FILES)
-    if plan.rooms in WORLDS:
-        for name in plan.backends:
-            check_observes(name)
-    write_settings(out, settings)
-    rows = resume(out / STORE, plan.jobs(), run_job, workers=workers)
-    groups = {name: [_record(row) for job, row in rows.items() if job[0] == name] for name in plan.backends}
+    world = WORLDS.get(rooms)
+    with bad_input():
+        names = backend_names(backends, without=_NOT_HERE | (not_observing() if world else {}))
+        if world is None and rooms not in room_registry.names():
+            raise unknown_name("rooms", rooms, (*WORLDS, *room_registry.names()))
+        if not (math.isfinite(noise) and noise > 0):
+            raise ValueError(f"--noise must be a finite number above 0, got {noise}")
+        if world is not None:
+            where: dict[str, Any] = {"world": world.scaled(noise).settings()}
+        else:
+            where = {"agent": AGENT, "noise_config": dataclasses.asdict(scaled_noise(noise))}
+    if steps is None:
+        steps = world.steps if world is not None else MAX_EPISODE_STEPS
+    settings = {"version": installed_version(), "rooms": rooms, "steps": steps, "noise": noise, **where}
+    keep_settings(out, settings, FILES)
+    # All backends on one seed before the next seed.
+    jobs = [(name, rooms, seed, steps, noise) for seed in range(seed0, seed0 + runs) for name in names]
+    rows = resume(out / STORE, jobs, run_job, workers=workers)
+    groups = {name: [_record(row) for job, row in rows.items() if job[0] == name] for name in names}
     result: dict[str, Any] = {name: summarise(group) for name, group in groups.items()}
-    result["config"] = settings | {"seeds": [plan.seed0, plan.seed0 + plan.runs - 1]}
+    result["config"] = settings | {"seeds": [seed0, seed0 + runs - 1]}
     atomic_write(out / "consistency.json", json.dumps(result, indent=1) + "\n")
-    atomic_write(out / "consistency.png", png(_chart(plan, groups)))
+    title = f"Pose NEES / 3, average of {runs} runs: {rooms}, noise × {noise:g}"
+    atomic_write(out / "consistency.png", png(_chart(title, groups, nees_band(3, runs))))
     return result
 
 
@@ -207,15 +195,14 @@ def table(result: dict[str, Any]) -> str:
     )
 
 
-def _chart(plan: Plan, groups: dict[str, list[Record]]) -> Figure:
+def _chart(title: str, groups: dict[str, list[Record]], band: tuple[float, float]) -> Figure:
     figure, (axes,) = chart()
-    axes.axhspan(*nees_band(3, plan.runs), color=COLOURS[2], alpha=0.2, linewidth=0, label="95 % band")
+    axes.axhspan(*band, color=COLOURS[2], alpha=0.2, linewidth=0, label="95 % band")
     highest = 0.0
     for name, group in groups.items():
         average, _, _ = step_averages([record["nees"] for record in group])
         axes.plot(np.arange(1, len(average) + 1), average, linewidth=1, label=name)
         highest = max(highest, float(np.max(average[np.isfinite(average)], initial=0.0)))
-    title = f"Pose NEES / 3, average of {plan.runs} runs: {plan.rooms}, noise × {plan.noise:g}"
     label(axes, title, "step", "1 is consistent, above it too sure", log="y" if highest > 10 else "")
     if highest <= 10:
         axes.set_ylim(bottom=0.0)

@@ -11,14 +11,12 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
-import gymnasium as gym
 import numpy as np
 import typer
 
 import agents
-import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import registry as room_registry
 from mecanum_env.sensing.calibration import backend_settings
@@ -42,8 +40,7 @@ _KINDS = ("shared", "copies")
 
 def record(rooms: str, *, seed: int, steps: int) -> tuple[Drive, dict[str, Any]]:
     """Drive with the true pose given; return what the sensors said, and the settings of a backend for it."""
-    mecanum_env.register_envs()
-    env = cast("ExploreEnv", gym.make("mecanum_env/Explore-v0", rooms=rooms, slam="truth").unwrapped)
+    env = ExploreEnv(rooms=rooms, slam="truth")
     observation, _ = env.reset(seed=seed)
     agent = agents.make("nearest-frontier")
     agent.reset(env.belief)

@@ -20,7 +20,7 @@ from mecanum_env.rooms import PAPER_D
 from slam.formats import atomic_write
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
-from training.runs.campaign import backend_names, check_settings, installed_version, write_settings
+from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Seeds, Workers
 from training.runs.rows import resume
@@ -111,9 +111,8 @@ def study(
     with bad_input():
         backends = backend_names(slam)
         chosen = parse_seeds(seeds)
-        settings = {"version": installed_version(), "max_steps": MAX_STEPS}
-        check_settings(out, settings, FILES)
-    write_settings(out, settings)
+    settings = {"version": installed_version(), "max_steps": MAX_STEPS}
+    keep_settings(out, settings, FILES)
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
     rows = resume(out / "episodes.jsonl", jobs, run_job, workers=workers, what="episodes")
     summaries = summarise(rows, backends)

@@ -15,8 +15,9 @@ import multiprocessing
 import os
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig
     from mecanum_env.rooms import FloorPlan
 
-__all__ = ["PEERS", "ROUNDS", "Drive", "PeerProcess", "compare", "peer_setup", "require"]
+__all__ = ["PEERS", "ROUNDS", "Drive", "compare", "peer_process", "peer_setup", "require"]
 
 PEERS: dict[str, tuple[str, ...]] = {"navground": ("navground", "navground-learning")}
 """Peers by name: the distributions that must be installed."""
@@ -117,14 +118,12 @@ def compare(peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Call
     RuntimeError
         If the peer's process breaks down.
     """
-    versions = require(peer)
-    setup = peer_setup(config)
+    versions, setup = require(peer), peer_setup(config)
     measured: list[dict[str, float]] = []
-    with PeerProcess(setup, drives) as process:
+    with peer_process(setup, drives) as (ready, their_rate):
         for _ in range(ROUNDS):
             our_rate = ours()
-            measured.append({"ours": our_rate, "theirs": process.steps_per_second()})
-        ready = process.ready
+            measured.append({"ours": our_rate, "theirs": their_rate()})
     our_median, their_median = (statistics.median(r[side] for r in measured) for side in ("ours", "theirs"))
     return {
         "name": peer,
@@ -138,48 +137,25 @@ def compare(peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Call
     }
 
 
-class PeerProcess:
-    """The peer in its own process: a context manager that ends it.
+@contextmanager
+def peer_process(
+    setup: dict[str, Any], drives: Sequence[Drive]
+) -> Iterator[tuple[dict[str, Any], Callable[[], float]]]:
+    """Give what the peer makes of it, in a process of its own, and what drives one round there.
 
-    Parameters
-    ----------
-    setup : dict
-        See :func:`peer_setup`.
-    drives : sequence of Drive
-        What every round drives.
-
-    Notes
-    -----
-    ``ready`` holds what the peer made of it: ``walls`` and ``discs`` (in the first room), and ``scan``, the
-    ranges [m] that its lidar measures at the first start.
+    The former: ``walls`` and ``discs`` (in the first room), and ``scan``, the ranges [m] that its lidar measures
+    at the first start. The latter returns the peer's complete steps per second.
     """
 
-    def __init__(self, setup: dict[str, Any], drives: Sequence[Drive]) -> None:
-        self._load = setup, drives
-
-    def __enter__(self) -> PeerProcess:
-        context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(1, mp_context=context, initializer=start_worker)
+    def ask(what: Callable[..., Any], *load: Any) -> Any:
         try:
-            self.ready = self._ask(_get_ready, *self._load)
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._pool.shutdown()
-
-    def steps_per_second(self) -> float:
-        """Let the peer drive one round; return its complete steps per second."""
-        answer = self._ask(_drive_round)
-        return float(answer["steps"] / answer["seconds"])
-
-    def _ask(self, what: Callable[..., dict[str, Any]], *load: Any) -> dict[str, Any]:
-        try:
-            return self._pool.submit(what, *load).result()
+            return pool.submit(what, *load).result()
         except Exception as error:
             raise RuntimeError(f"the peer broke down: {type(error).__name__}: {one_line(error)}") from error
+
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=start_worker) as pool:
+        yield ask(_get_ready, setup, drives), lambda: float(ask(_drive_round))
 
 
 # ---- in the peer's process ---------------------------------------------------------------------------------
@@ -255,8 +231,8 @@ def _navground_sensors(setup: dict[str, Any]) -> list[dict[str, Any]]:
     return [lidar, odometry, grid_map]  # in the order in which each feeds on those before
 
 
-def _drive(env: Any, drives: Sequence[Drive]) -> dict[str, Any]:
-    """Drive every episode with random actions; return the steps and the seconds spent within them."""
+def _drive(env: Any, drives: Sequence[Drive]) -> float:
+    """Drive every episode with random actions; return the steps per second, of the time spent within them."""
     clock = time.perf_counter
     steps, seconds = 0, 0.0
     for drive in drives:
@@ -269,7 +245,7 @@ def _drive(env: Any, drives: Sequence[Drive]) -> dict[str, Any]:
             steps += 1
             if terminated or truncated:  # a robot that has ended is not simulated: its steps would cost nothing
                 raise RuntimeError(f"navground ended the episode at step {steps}")
-    return {"steps": steps, "seconds": seconds}
+    return steps / seconds
 
 
 _load: list[Any] = []  # of this process: the environment, and what every round drives
@@ -289,5 +265,5 @@ def _get_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> dict[str, Any]
     return answer
 
 
-def _drive_round() -> dict[str, Any]:
+def _drive_round() -> float:
     return _drive(*_load)

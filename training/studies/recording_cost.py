@@ -25,11 +25,14 @@ from training.views.report_page import episode_page
 __all__ = ["measure", "study"]
 
 
-def measure(options: explore.ExploreOptions) -> dict[str, Any]:
-    """Return CPU seconds of an episode without and with recording, of its report, and the report's size."""
+def measure(**options: Any) -> dict[str, Any]:
+    """Return CPU seconds of an episode without and with recording, of its report, and the report's size.
+
+    The options are those of :func:`training.episodes.explore.prepare`.
+    """
     spent: dict[bool, list[float]] = {False: [], True: []}
     for recorded in (False, True, True, False):
-        episode, recorder = explore.prepare(options), Recorder()
+        episode, recorder = explore.prepare(**options), Recorder()
         began = time.process_time()
         explore.run(episode, lambda **_: None, [recorder] if recorded else [])
         spent[recorded].append(time.process_time() - began)
@@ -41,8 +44,8 @@ def measure(options: explore.ExploreOptions) -> dict[str, Any]:
     page = episode_page(kept.env, recording, title="", metrics=kept.metrics(), ending="", config="", command="")
     without, with_it = (statistics.mean(spent[recorded]) for recorded in (False, True))
     return {
-        "seed": options.seed, "episode_s": float(recording.times[-1]), "cpu_s": without, "recorded_cpu_s": with_it,
-        "ratio": with_it / without, "report_cpu_s": time.process_time() - began,
+        "seed": options["seed"], "episode_s": float(recording.times[-1]), "cpu_s": without,
+        "recorded_cpu_s": with_it, "ratio": with_it / without, "report_cpu_s": time.process_time() - began,
         "report_bytes": len(page.encode()),
     }  # fmt: skip
 
@@ -59,13 +62,13 @@ def study(
         chosen = parse_seeds(seeds, most=1000)
     rows: list[dict[str, Any]] = []
     for seed in chosen:
-        given = explore.ExploreOptions(
-            out=Path("out/recording_cost"), agent=agent, rooms=rooms, seed=seed,
-            floor_plan=floor_plan, max_steps=max_steps,
-        )  # fmt: skip
+        given: dict[str, Any] = {
+            "out": Path("out/recording_cost"), "agent": agent, "rooms": rooms, "seed": seed,
+            "floor_plan": floor_plan, "max_steps": max_steps,
+        }  # fmt: skip
         if not rows:
-            explore.run(explore.prepare(given), lambda **_: None, [Recorder()])  # compile first
-        rows.append(measure(given))
+            explore.run(explore.prepare(**given), lambda **_: None, [Recorder()])  # compile first
+        rows.append(measure(**given))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     medians = {key: statistics.median(row[key] for row in rows) for key in rows[0] if key != "seed"}
     print(json.dumps({"episodes": len(rows), "median": medians, "worst_ratio": max(r["ratio"] for r in rows)}))

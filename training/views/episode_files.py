@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Collection
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import cv2
@@ -18,7 +16,7 @@ from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
 from training.episodes.explore import ENDINGS, EXTRAS, Episode
 from training.episodes.recording import Recording
-from training.runs.running import interrupt_flag, versions
+from training.runs.running import versions, written_together
 from training.views.film import check_video
 from training.views.mcap_file import check_mcap, write_mcap
 from training.views.report_page import episode_page
@@ -41,25 +39,14 @@ def write_episode(
 
     Of the extras those are written that need no more than the recording; the film, made while it ran, is moved to
     its place. Extras not asked for are taken away: they would be another episode's.
-
-    The files are made in a folder beside their place and then renamed, one after the other, ``metrics.json`` last:
-    a run that fails while writing leaves the results of an earlier one as they were.
     """
-    out = episode.out
-    out.mkdir(parents=True, exist_ok=True)
-    folder = Path(mkdtemp(prefix=".writing-", dir=out))
-    try:
-        with interrupt_flag():  # one Ctrl-C does not leave half the files of this episode, half of another
-            metrics = _write_into(folder, episode, recording, extras)
-            if film is not None:
-                film.replace(folder / EXTRAS["video"])
-            for name in ("metrics.json", *(file for extra, file in EXTRAS.items() if extra not in extras)):
-                (out / name).unlink(missing_ok=True)
-            for path in sorted(folder.iterdir(), key=lambda path: path.name == "metrics.json"):
-                path.replace(out / path.name)
-        return metrics
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with written_together(
+        episode.out, without=[file for extra, file in EXTRAS.items() if extra not in extras]
+    ) as folder:
+        metrics = _write_into(folder, episode, recording, extras)
+        if film is not None:
+            film.replace(folder / EXTRAS["video"])
+    return metrics
 
 
 def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:

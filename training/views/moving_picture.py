@@ -27,10 +27,9 @@ _FILTER = (
 )
 
 
-def moving_picture(options: explore.ExploreOptions, path: Path, *, speed: int, width: int, until: float) -> int:
+def moving_picture(episode: explore.Episode, path: Path, *, speed: int, width: int, until: float) -> int:
     """Write an animated GIF of an episode until its coverage is ``until``; return the number of frames."""
     frames: list[NDArray[np.uint8]] = []
-    episode = explore.prepare(options)
 
     def keep(frame: NDArray[np.uint8]) -> None:
         height = 2 * round(width * frame.shape[0] / frame.shape[1] / 2)
@@ -68,8 +67,8 @@ def study(
     out: Annotated[Path, typer.Option(metavar="FILE.gif")] = Path("out/explore.gif"),
 ) -> None:
     """Make the README's moving picture of one episode."""
-    given = explore.ExploreOptions(out=out.parent, agent=agent, rooms=rooms, seed=seed)
     with bad_input():
         out.parent.mkdir(parents=True, exist_ok=True)
-        count = moving_picture(given, out, speed=speed, width=width, until=until)
+        episode = explore.prepare(out=out.parent, agent=agent, rooms=rooms, seed=seed)
+        count = moving_picture(episode, out, speed=speed, width=width, until=until)
     print(f"{out}: {count} frames, {out.stat().st_size / 1e6:.1f} MB")

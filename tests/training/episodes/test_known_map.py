@@ -10,13 +10,13 @@ from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
-from training.episodes.explore import ExploreOptions, prepare, run
-from training.episodes.known_map import NAME, _greedy, _way_until
-from training.episodes.true_places import TruePlaces, cells_per_tile
+from training.episodes.explore import prepare, run
+from training.episodes.known_map import NAME, _way_until
+from training.episodes.true_places import TruePlaces, cells_per_tile, greedy_tour
 
 
 def episode(tmp_path, agent, rooms="apartment", seed=5):
-    it = prepare(ExploreOptions(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth"))
+    it = prepare(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth")
     run(it, lambda **_: None)
     return it.metrics()
 
@@ -64,8 +64,13 @@ def test_ways_and_greedy_tours_by_hand():
     distance = np.abs(at[:, None] - at)
     seen = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 0, 1]], dtype=bool)
     cells = np.array([10.0, 5.0, 5.0])
-    np.testing.assert_array_equal(_greedy(seen, distance, cells, 0.5), [0, 1, 2, 3])
-    np.testing.assert_array_equal(_greedy(seen, distance, cells, 5.0), [0, 2, 3])
+
+    def greedy(offset: float) -> np.ndarray:
+        tiles = np.ascontiguousarray(seen.T)
+        return greedy_tour(tiles, distance, cells.copy(), cells @ tiles, cells.sum(), 0, -1.0, offset)[0]
+
+    np.testing.assert_array_equal(greedy(0.5), [0, 1, 2, 3])
+    np.testing.assert_array_equal(greedy(5.0), [0, 2, 3])
     tour = np.array([0, 2, 3])
     assert _way_until(seen, distance, cells, tour, 5.0) == pytest.approx(2.0)
     assert _way_until(seen, distance, cells, tour, 0.0) == pytest.approx(10.0)

@@ -101,8 +101,7 @@ def test_options_and_config_lie_over_the_logs_own_values(logs: Path, tmp_path: P
         "slam = 'odometry'\n[observation]\nrange_m = 0.5\n[slam_config]\ngate = 7\n"
         "[slam_config.odometry]\nturn_share_rad_m = 1\n[run]\nassociation = 'unknown'\nlimit_s = 3\n"
     )
-    options = task.ReplayOptions(log=logs / "utias", out=tmp_path / "out", slam="ekf", limit_s=2.0, config=path)
-    prepared = task.prepare(options)
+    prepared = task.prepare(logs / "utias", out=tmp_path / "out", slam="ekf", limit_s=2.0, config=path)
     assert prepared.config.slam == "ekf" and prepared.run["association"] == "unknown"
     assert prepared.log.duration_s == 2.0
     assert prepared.config.observation.range_m == 0.5 and prepared.config.observation.bearing_deg == 1.1
@@ -130,7 +129,7 @@ def test_every_backend_replays(name: str, logs: Path, tmp_path: Path, capsys: py
 
 
 def test_a_backends_own_nees_is_asked(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    prepared = task.prepare(task.ReplayOptions(log=logs / "utias", out=tmp_path, limit_s=2.0))
+    prepared = task.prepare(logs / "utias", out=tmp_path, limit_s=2.0)
     monkeypatch.setattr(prepared.backend, "pose_nees", lambda true_pose: 6.0 + 0.0 * true_pose[0], raising=False)
     task.run(prepared, lambda time_s: None)
     assert replay_report.metrics(prepared)["anees"] == pytest.approx(2.0)

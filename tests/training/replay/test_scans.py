@@ -93,9 +93,7 @@ def test_a_backends_final_trajectory_is_what_relations_are_of(
     logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     prepared = task.prepare(
-        task.ReplayOptions(
-            log=logs / "room.log.gz", reference=logs / "truth.log", slam="odometry", out=tmp_path, limit_s=10.0
-        )
+        logs / "room.log.gz", reference=logs / "truth.log", slam="odometry", out=tmp_path, limit_s=10.0
     )
     task.run(prepared, lambda time_s: None)
     assert replay_report.metrics(prepared)["relations_trans_m"] > 1e-4

@@ -98,11 +98,12 @@ def test_peer_stands_in_the_same_room() -> None:
             break  # a disc is seen from the start, too
     else:
         pytest.fail("no disc to be seen from any start")
-    with peers.PeerProcess(peers.peer_setup(config), [peers.Drive(seed=5, steps=20, plan=plan)]) as process:
-        assert process.ready["walls"] == len(plan.segments)
-        assert process.ready["discs"] == len(plan.circles)
-        theirs = np.array(process.ready["scan"])
-        assert process.steps_per_second() > 10
+    drives = [peers.Drive(seed=5, steps=20, plan=plan)]
+    with peers.peer_process(peers.peer_setup(config), drives) as (ready, steps_per_second):
+        assert ready["walls"] == len(plan.segments)
+        assert ready["discs"] == len(plan.circles)
+        theirs = np.array(ready["scan"])
+        assert steps_per_second() > 10
     hit = np.isfinite(truth)
     assert np.all(theirs[~hit] == config.lidar.range_max_m)
     # Beam by beam, within the noise, but for rounding (they compute in single precision) on slanting walls.
@@ -116,7 +117,7 @@ def test_peer_that_breaks_down_says_why() -> None:
     drive = peers.Drive(seed=0, steps=20, plan=rooms.make("rectangular", seed=0))
     with (
         pytest.raises(RuntimeError, match="broke down: KeyError: 'beams'"),
-        peers.PeerProcess(setup, [drive]),
+        peers.peer_process(setup, [drive]),
     ):
         pass
 

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from training.episodes import explore
-from training.episodes.explore import ExploreOptions
 from training.episodes.recording import Recorded as Recording_
 from training.episodes.recording import Recorder, Recording, _MapFollower
 from training.views.episode_files import write_episode
@@ -35,7 +34,7 @@ class Recorded(NamedTuple):
 
 
 def explored(out: Path, **options: Any) -> Recorded:
-    episode, recorder = explore.prepare(ExploreOptions(out=out, max_steps=STEPS, **options)), Recorder()
+    episode, recorder = explore.prepare(out=out, max_steps=STEPS, **options), Recorder()
     explore.run(episode, lambda **_: None, [recorder])
     recording = recorder.recording()
     write_episode(episode, recording)
@@ -204,7 +203,7 @@ def test_of_many_notes_the_first_and_the_last_stay() -> None:
 
 
 def test_a_recorder_is_ready_for_an_episode_of_no_step(tmp_path: Path) -> None:
-    episode = explore.prepare(ExploreOptions(out=tmp_path, rooms="rectangular"))
+    episode = explore.prepare(out=tmp_path, rooms="rectangular")
     recorder = Recorder()
     recorder.take(episode.env, None)
     header, arrays = pack(recorder.recording())
