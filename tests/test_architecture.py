@@ -155,10 +155,17 @@ def test_no_room_is_crowded_and_no_file_long() -> None:
         assert len(list(folder.glob("*.py"))) <= 16, folder  # a dozen, and the strategies that are picked by name
 
 
-def test_every_room_has_a_face_that_says_what_it_is_for() -> None:
+def test_every_room_has_a_face_that_names_what_is_in_it_and_nothing_else() -> None:
     for folder in {path.parent for floor in FLOORS for path in sources(floor)}:
         face = folder / "__init__.py"
-        assert face.is_file() and ast.get_docstring(ast.parse(face.read_text("utf-8"))), folder
+        says = face.is_file() and ast.get_docstring(ast.parse(face.read_text("utf-8")))
+        assert says, folder
+        if folder.name in FLOORS:
+            continue  # the page names its rooms
+        within = {path.stem for path in folder.glob("*.py")} | {
+            path.parent.name for path in folder.glob("*/__init__.py")
+        }
+        assert set(re.findall(r"``(\w+)``", says)) == within - {"__init__", "__main__"}, folder
 
 
 # ---- the page --------------------------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """Rooms to explore: generators by name, and plans read from files.
 
-``make("apartment", seed=3)`` draws a plan, ``load("floor.yaml")`` reads one; both give a :class:`FloorPlan`.
+``make("apartment", seed=3)`` draws a plan, ``load("floor.yaml")`` reads one; both give a ``floor_plan``.
+``rectangular``, ``apartment``, ``corridors``, ``cave`` and ``maze`` are the generators, ``registry`` has their
+names; ``layout`` and ``outlines`` are what they share, ``files`` reads.
 """
 
 from __future__ import annotations

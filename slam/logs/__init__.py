@@ -1,6 +1,7 @@
 """Recorded logs of real robots: one reader a format (``docs/how-to/replay.md``).
 
-Logs of landmark observations become a :class:`RecordedLog`, logs of laser scans a :class:`ScanLog`.
+``utias`` and ``victoria_park`` are logs of landmark observations and become a ``recorded`` log, ``carmen`` and
+``dpslam`` are logs of ``laser`` scans and become ``scans``; ``log`` is what both are, ``tables`` reads numbers.
 """
 
 from __future__ import annotations

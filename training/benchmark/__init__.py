@@ -1,5 +1,6 @@
 """``mecanum benchmark``: agents × backends × suites × seeds.
 
-``suites`` say what is run, ``run`` runs it, ``store`` keeps the rows, ``figures`` sums them up; ``output``,
-``markdown``, ``report`` and ``leaderboard`` show them. ``evaluate`` and ``ratios`` are tables of the studies.
+``suites`` say what is run, ``run`` runs it, an ``episode`` a row, ``store`` keeps the rows, ``figures`` sums them
+up. ``tables`` are made of those, for ``output``, ``report`` with its ``report_charts``, and ``leaderboard``.
+``evaluate`` and ``ratios`` are studies.
 """

@@ -1,5 +1,5 @@
 """The dungeons protocol: published maps, a lattice of stations, path lengths beside the published ones.
 
-``protocol`` runs it in ``world``, ``bound`` knows the map; ``plans``, ``walks``, ``lessons``, ``networks`` and
-``training`` make ``learned-tour``.
+``protocol`` runs it, an ``episode`` in a ``world``, ``bound`` knows the map; ``plans``, ``walks``, ``lessons``,
+``networks`` and ``training`` make ``learned-tour``.
 """

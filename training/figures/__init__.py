@@ -1,1 +1,5 @@
-"""Figures: statistics with intervals, line charts, and the style of our pages."""
+"""Figures, and how they look.
+
+``statistics`` are means with intervals, ``consistency`` is NEES over runs, ``tables`` are for terminals and pages,
+``charts`` and ``page_style`` the style of both.
+"""

@@ -1,1 +1,1 @@
-"""Floor plans from files: ROS map_server maps and plain images, read with distrust."""
+"""Floor plans from files, read with distrust: ``importers`` ROS maps, ``image_files`` what shows one."""

@@ -1,4 +1,5 @@
-"""Training of ``ppo``, which drives from the observation straight to the twist.
+"""Training of the agent ppo, which drives from the observation straight to the twist.
 
-``run`` goes through rounds of ``lessons`` learned by ``imitation``, then ``ppo``; ``rollouts`` are the episodes.
+``config`` says what is trained; ``run`` goes through rounds of ``lessons`` learned by ``imitation``, then ``ppo``;
+``rollouts`` are the episodes, ``networks`` what learns.
 """

@@ -1,4 +1,4 @@
 """Paper C's claims as figures (``theory.md`` C).
 
-``figures`` draws them, ``work`` and ``peers`` compare methods, ``odometry`` drives the simulated robot.
+``figures`` draws them, ``work`` compares methods, ``odometry`` drives the simulated robot.
 """
