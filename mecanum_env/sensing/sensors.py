@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
-from mecanum_env.sensing.noise import RandomNumbers
+from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
 from slam.odometry.filters import OdometryFilter
 from slam.types import Odometry, Scan
@@ -47,6 +47,18 @@ def _sweep(
         out[k] = measured
 
 
+@njit(cache=True, nogil=True)
+def _noisy_sweep(
+    segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, words: NDArray[np.uint64],
+    out: Array,
+) -> None:  # fmt: skip
+    """Draw the noise of a sweep from the words of a :class:`NoiseStream`, and do :func:`_sweep`."""
+    noise = np.empty((2, out.shape[0]))
+    fill_normal(words, noise[0])
+    fill_uniform(words, noise[1])
+    _sweep(segments, circles, pose, directions, limits, noise[0], noise[1], out)
+
+
 class Lidar:
     """A planar lidar at A, ``offset_m`` ahead of the robot's centre (theory.md A).
 
@@ -69,7 +81,6 @@ class Lidar:
             noise.range_sigma_m, noise.dropout,
         ])  # fmt: skip
         self._beams = config.beams
-        self._normals, self._uniforms = np.empty(config.beams), np.empty(config.beams)
         self._of_scan = self._angle_min, self._angle_increment, config.range_max_m, config.range_min_m
 
     def true_ranges(self, segments: Array, circles: Array, pose: ArrayLike) -> Array:
@@ -97,9 +108,11 @@ class Lidar:
         ``rng`` yields ``beams`` normal and ``beams`` uniform numbers.
         """
         ranges, pose = np.empty(self._beams), np.asarray(pose, dtype=np.float64)
-        rng.standard_normal(out=self._normals)
-        rng.random(out=self._uniforms)
-        _sweep(segments, circles, pose, self._directions, self._limits, self._normals, self._uniforms, ranges)
+        if isinstance(rng, NoiseStream):
+            _noisy_sweep(segments, circles, pose, self._directions, self._limits, rng.words, ranges)
+        else:
+            normals, uniforms = rng.standard_normal(self._beams), rng.random(self._beams)
+            _sweep(segments, circles, pose, self._directions, self._limits, normals, uniforms, ranges)
         return Scan(ranges, *self._of_scan)
 
 
@@ -161,11 +174,17 @@ class WheelEncoders:
             Yields four normal numbers: a measured increment is the true one times 1 + ``encoder`` · N(0, 1).
         """
         increments = np.asarray(wheel_increments, dtype=np.float64)
-        twist, normals = np.empty(3), np.empty(4)
-        rng.standard_normal(out=normals)
-        _read_encoders(
-            self._forward, increments, normals, self._sigma, self._rolling, self._creep, dt, self._last, twist
-        )
+        twist = np.empty(3)
+        if isinstance(rng, NoiseStream):
+            _read_noisy_encoders(
+                self._forward, increments, rng.words, self._sigma, self._rolling, self._creep, dt, self._last,
+                twist,
+            )  # fmt: skip
+        else:
+            _read_encoders(
+                self._forward, increments, rng.standard_normal(4), self._sigma, self._rolling, self._creep, dt,
+                self._last, twist,
+            )  # fmt: skip
         return Odometry(twist, dt)
 
 
@@ -201,3 +220,14 @@ def _read_encoders(
     twist[1] -= creep[1] * ((vy - last[1]) / dt + omega * vx)
     twist[2] -= creep[2] * ((omega - last[2]) / dt)
     last[0], last[1], last[2] = vx, vy, omega
+
+
+@njit(cache=True, nogil=True)
+def _read_noisy_encoders(
+    forward: Array, increments: Array, words: NDArray[np.uint64], sigma: float, rolling: float, creep: Array,
+    dt: float, last: Array, twist: Array,
+) -> None:  # fmt: skip
+    """Draw the normals from the words of a :class:`NoiseStream`, and do :func:`_read_encoders`."""
+    normals = np.empty(4)
+    fill_normal(words, normals)
+    _read_encoders(forward, increments, normals, sigma, rolling, creep, dt, last, twist)
