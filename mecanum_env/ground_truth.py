@@ -51,8 +51,8 @@ class GroundTruth:
     ) -> None:
         self.plan = plan
         self.start = np.asarray(start, dtype=np.float64)
-        self._start = self.start.tolist()
-        self._cos, self._sin = math.cos(self._start[2]), math.sin(self._start[2])
+        heading = float(self.start[2])
+        self._frame = np.array([*self.start, math.cos(heading), math.sin(heading)])
         self.resolution = resolution
         seen = self._view_from_everywhere(robot, lidar)
         self.lattice_origin = seen.lattice_origin
@@ -71,12 +71,9 @@ class GroundTruth:
 
     def in_start_frame(self, pose_world: Array) -> Array:
         """Return a world pose ``(3,)`` in the start frame."""
-        x, y, theta = pose_world.tolist()
-        x0, y0, theta0 = self._start
-        dx, dy = x - x0, y - y0
-        return np.array(
-            [self._cos * dx + self._sin * dy, -self._sin * dx + self._cos * dy, wrap_scalar(theta - theta0)]
-        )
+        out = np.empty(3)
+        _in_frame(pose_world, self._frame, out)
+        return out
 
     def _view_from_everywhere(self, robot: RobotConfig, lidar: LidarConfig) -> OccupancyGrid:
         """Map the plan without noise from all over the places that the robot's body can reach."""
@@ -162,6 +159,13 @@ def on_lattice(
     if r0 < r1 and c0 < c1:
         out[r0:r1, c0:c1] = raster[r0 - r : r1 - r, c0 - c : c1 - c]
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_frame(pose: Array, frame: Array, out: Array) -> None:
+    """Write a pose ``(3,)`` in a frame: x, y, θ of its origin, and θ's cosine and sine ``(5,)``."""
+    dx, dy, c, s = pose[0] - frame[0], pose[1] - frame[1], frame[3], frame[4]
+    out[0], out[1], out[2] = c * dx + s * dy, -s * dx + c * dy, wrap_scalar(pose[2] - frame[2])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -133,7 +133,7 @@ class LandmarkBook:
 
     def just_seen(self) -> NDArray[np.int64]:
         """Return the rows ``(k,)`` of the points that the last update showed."""
-        return np.flatnonzero((self.marks[:, _LAST_SEEN] == self._now) & (self.marks[:, _KIND] != LINE))
+        return _points_seen_at(self._marks, self.count, self._now)
 
     def _make_room(self, count: int) -> None:
         while count > len(self._ids):
@@ -161,10 +161,10 @@ class LandmarkBook:
         self._now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
-        ranges, first, step, _, _ = scan or _NO_SCAN
+        seen = scan or _NO_SCAN
         count, self._tentative_count, doubtful = _review(
-            x, offset, z, match, ranges, first, step, self._now, self.marks, self._tentative,
-            self._tentative_count, self._limits, at_once, self._new,
+            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, self._now,
+            self._marks[: self.count], self._tentative, self._tentative_count, self._limits, at_once, self._new,
         )  # fmt: skip
         return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
 
@@ -173,6 +173,16 @@ class LandmarkBook:
         passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
         overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
         return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
+
+
+@njit(cache=True, nogil=True)
+def _points_seen_at(marks: Array, count: int, now: float) -> NDArray[np.int64]:
+    out = np.empty(count, np.int64)
+    found = 0
+    for row in range(count):
+        out[found] = row
+        found += marks[row, _LAST_SEEN] == now and marks[row, _KIND] != LINE
+    return out[:found]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
