@@ -7,6 +7,7 @@ downdate of the triangle; a scan's own cost is linear in the landmarks but for t
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
 from slam.landmarks.association import UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.measures import nees_pose
@@ -75,6 +77,9 @@ class EkfSlam(LandmarkBackend):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
+        self.witness: Callable[[list[Innovation]], object] | None = (
+            None  # told of every correction before it is made
+        )
         self._max_turn = math.radians(c.max_turn_deg)
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
@@ -120,6 +125,7 @@ class EkfSlam(LandmarkBackend):
         )
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
+        self._tell(z, match)
         self._correct(z, match)
         if loop:
             self._close_loop(z, match)
@@ -142,6 +148,7 @@ class EkfSlam(LandmarkBackend):
             match = np.array([self._book.row(int(i)) for i in ids], np.int64)
             if self.config.known_gate < math.inf:
                 refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, part, self.config.known_gate, match)
+            self._tell(part, match)
             self._correct(part, match)
             self._book.count_sightings(match)
             for k in np.flatnonzero(match == UNMATCHED):
@@ -183,6 +190,7 @@ class EkfSlam(LandmarkBackend):
         nis, dof = self.nis, self.nis_dof
         closing = np.full(len(match), UNMATCHED)
         closing[rows] = more
+        self._tell(z, closing)
         self._correct(z, closing)
         self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
         match[closing >= 0] = closing[closing >= 0]
@@ -219,6 +227,12 @@ class EkfSlam(LandmarkBackend):
         """Correct by a match; return how well the scan fits the map from there."""
         self._correct(z, match)
         return self.grid.agreement(self.sensor_pose(), scan)
+
+    def _tell(self, z: Array, match: NDArray[np.int64]) -> None:
+        """Show the innovations to who has asked for them."""
+        if self.witness is not None:
+            offset = self.config.lidar_offset_m
+            self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""

@@ -1,6 +1,6 @@
 """Landmarks: which one was seen, which ones are kept, and the database they are written to.
 
 ``association`` decides by Mahalanobis distance, ``joint_compatibility`` for a scan as a whole; ``book`` keeps
-tentative and confirmed ones, ``loop_closing`` takes old ones for what they are only together, ``database`` is
-``landmarks.db``.
+tentative and confirmed ones, ``loop_closing`` takes old ones for what they are only together. ``innovations`` show
+what single observations say against the belief; ``database`` is ``landmarks.db``.
 """

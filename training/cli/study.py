@@ -13,6 +13,7 @@ __all__ = ["STUDIES", "study", "study_command"]
 
 STUDIES = {
     "accuracy": ("training.benchmark.evaluate", "errors of explored maps over seeds, rooms and backends"),
+    "belief": ("training.studies.belief", "where a belief stops being true: NEES, NIS, the largest innovations"),
     "calibration": ("training.studies.calibrate", "V of the simulated robot, beside what its estimators are told"),
     "digests": ("training.studies.digests", "same seed, same bits: digests of episodes, to compare commits by"),
     "dp-slam-cost": (
