@@ -30,7 +30,7 @@ from slam.types import Scan
 from training.episodes import explore
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.figures.tables import number, text_table
-from training.runs.options import FloorPlanFile, MaxSteps, Noise, Rooms, RoomSeed, Slam
+from training.runs.options import ConfigFile, FloorPlanFile, MaxSteps, Noise, Rooms, RoomSeed, Slam
 from training.runs.progress import Progress
 
 __all__ = ["BeliefWitness", "figures", "rises", "study"]
@@ -223,13 +223,14 @@ def study(
     slam: Slam = None,
     noise: Noise = None,
     seed: RoomSeed = 0,
+    config: ConfigFile = None,
     max_steps: MaxSteps = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/belief"),
 ) -> None:
     """Ask where a belief stops being true: NEES, errors by direction, NIS by kind, largest innovations."""
     episode = explore.prepare(
         out=out, agent=agent, rooms=rooms, slam=slam, noise=noise, seed=seed, floor_plan=floor_plan,
-        max_steps=max_steps,
+        config=config, max_steps=max_steps,
     )  # fmt: skip
     witness = BeliefWitness()
     witness.begin(episode.env)
