@@ -186,8 +186,8 @@ def _draw_innovations(moments: Sequence[Moment], env: ExploreEnv, step_s: float)
     for axes, moment in zip(panels, moments, strict=False):
         axes.set_visible(True)
         _draw_moment(axes, moment, walls, step_s)
-        if axes is not panels[0]:  # one legend will do
-            axes.get_legend().remove()
+        if axes is not panels[0] and (legend := axes.get_legend()):  # one will do
+            legend.remove()
     return png(figure)
 
 
