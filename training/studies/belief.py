@@ -31,6 +31,7 @@ from slam.types import Scan
 from training.episodes import explore
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.figures.tables import number, text_table
+from training.runs.errors import Interrupted
 from training.runs.options import ConfigFile, FloorPlanFile, MaxSteps, Noise, Rooms, RoomSeed, Slam
 from training.runs.progress import Progress
 
@@ -253,6 +254,8 @@ def study(
         atomic_write(out / "innovations.png", _draw_innovations(witness.shown(), episode.env, step_s))
     atomic_write(out / "belief.json", json.dumps(found, indent=1) + "\n")
     print(_told(found))
+    if episode.interrupted:
+        raise Interrupted(f"interrupted after {step_s * found['steps']:.1f} s; what was seen so far is in {out}")
 
 
 def _told(found: dict[str, Any]) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from agents.base import Goal
+from mecanum_env.env import ExploreEnv
 from training.cli import main
 from training.episodes import explore
 from training.studies.belief import FILES, BeliefWitness, figures, rises
@@ -49,3 +52,18 @@ def test_the_command_leaves_its_files(backend: str, tmp_path: Path, capsys: pyte
     shown = backend == "invariant-ekf"
     assert bool(found["nis_over_2"]) == bool(found["shown"]) == ("wall" in told) == shown
     assert {path.name for path in out.iterdir()} == {name for name in FILES if shown or name != "innovations.png"}
+
+
+def test_ctrl_c_keeps_what_was_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    take = BeliefWitness.take
+
+    def pressed_at_the_tenth(self: BeliefWitness, env: ExploreEnv, goal: Goal | None) -> None:
+        take(self, env, goal)
+        if len(self.nees) == 10:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(BeliefWitness, "take", pressed_at_the_tenth)
+    assert main(["study", "belief", "--rooms", "rectangular", "--out", str(tmp_path / "belief")]) == 130
+    found = json.loads((tmp_path / "belief" / "belief.json").read_text())
+    assert found["end"] == "interrupted"
+    assert found["steps"] == 9
