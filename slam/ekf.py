@@ -18,7 +18,7 @@ from slam.belief import Belief
 from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
-from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
+from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
 from slam.landmarks.innovations import Innovation, innovations
@@ -66,7 +66,7 @@ class EkfLinesConfig(EkfConfig):
     # another bends the map. Over apartments of the training seeds 100-149 at three times the noise, the average
     # pose NEES/3 was 1.15 with the nearest and 1.00 so; at nominal noise the error was the same.
     association: str = "individual"
-    loop_sigma_m: float = 0.1  # parallel walls stand apart by a few times that
+    loop_sigma_m: float = 0.02  # ledges at doors stand apart by a few times that
 
 
 class EkfSlam(LandmarkBackend):
@@ -202,7 +202,8 @@ class EkfSlam(LandmarkBackend):
         of that, and a filter that trusts it has every gate closed within two steps and is lost for good. So the
         pose may be off by as much as the wheels claim to have moved since the landmarks were last in sight.
         Gates as wide as that would take any corner near by for a landmark. So one pose must explain them all, and
-        the scan must fit the map better from there: what changed may be the view, through a door, say.
+        the scan must fit the map far better from there: what changed may be the view, through a door, say, where
+        the next corner of the jamb fits a little better by chance.
         """
         n = self._n
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
@@ -217,7 +218,7 @@ class EkfSlam(LandmarkBackend):
         found = np.count_nonzero(match >= 0)
         back = found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0)
         p_wide = self._p[:3, :3].copy()
-        if back and self._fit(z, match, scan) > fit:
+        if back and far_better(self._fit(z, match, scan), fit):
             p[:3, :3] = p_wide
             usual = match
         self._x[:n], self._p[:n, :n] = x, p

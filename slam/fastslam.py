@@ -19,7 +19,7 @@ from slam.backend import BackendConfig
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.geometry import rotation
-from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, observation_rows
+from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.book import DIRECTION, KIND, LandmarkPolicy, count_recent
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.particles.filter import correct_particles, narrow, predict_particles
@@ -212,7 +212,7 @@ class FastSlam(LandmarkBackend):
         if count < FEWEST_BACK or count <= np.count_nonzero(match[leader] >= 0):
             return
         usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
-        if self._fit(pose, cov + wide, landmarks, z, found, scan) > usual_fit:
+        if far_better(self._fit(pose, cov + wide, landmarks, z, found, scan), usual_fit):
             self._covs += wide
             match[:] = found
 

@@ -50,7 +50,7 @@ class FeatureConfig:
     sigma_floor_m: float = 0.0005
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: float = 0.6
-    wall_points: int = 10
+    wall_points: int = 5  # through a door the walls beyond are seen by a few beams, and nothing else tells as much
     wall_sigma_m: float = 0.0003  # 1σ that the model of a straight wall leaves out, across it …
     wall_sigma_rad: float = 0.0002  # … and in its direction
 
