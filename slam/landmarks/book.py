@@ -259,8 +259,8 @@ def _sightings(
                 continue
             nearest = n
             n += 1
-            tentative[nearest, _COUNT] = 0.0
             t = tentative[nearest]
+            t[_COUNT] = t[_AGE] = 0.0  # the row may be one that became a landmark
             t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
         # Compared with where it was first seen: what wanders with the robot never settles.
         t = tentative[nearest]
