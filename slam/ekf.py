@@ -20,7 +20,7 @@ from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import UNMATCHED, refuse_unlikely
-from slam.landmarks.book import DIRECTION, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
@@ -258,7 +258,7 @@ class EkfSlam(LandmarkBackend):
             self._enlarge()
         add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
-        extent = (0.0, 0.0)
+        extent = (float(z[EDGE]), 0.0)
         if z[KIND] == LINE:
             # Where the sensor stands along the wall, from the wall's foot; its own foot is there.
             sensor_x, sensor_y, _ = self.sensor_pose().tolist()

@@ -20,7 +20,7 @@ from slam.belief import Belief
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.geometry import rotation
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
-from slam.landmarks.book import DIRECTION, KIND, LandmarkPolicy, count_recent
+from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
@@ -238,7 +238,8 @@ class FastSlam(LandmarkBackend):
             self._book.drop(row)
 
     def _add(self, z: Array, best: int, known_id: int | None) -> None:
-        self._book.add(float(z[KIND]), float(z[DIRECTION]) + float(self._poses[best, 2]), known_id)
+        direction, extent = float(z[DIRECTION]) + float(self._poses[best, 2]), (float(z[EDGE]), 0.0)
+        self._book.add(float(z[KIND]), direction, known_id, extent=extent)
         self._maps.add(self._poses, z, self.config.lidar_offset_m)
 
     # ---- the belief ----------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ from slam.features.surfaces import (
     VAR_OFFSET,
     VAR_SLOPE,
     R,
+    add_hidden,
 )
 from slam.types import CONCAVE, CONVEX, LINE
 
@@ -179,21 +180,24 @@ def edge(
     direction = math.atan2(step * ay - ny, step * ax - nx)
     _to_polar(
         x, y, along * ax * ax + off * nx * nx, along * ax * ay + off * nx * ny, along * ay * ay + off * ny * ny,
-        CONVEX, direction, 1, corner,
+        CONVEX, direction, step, corner,
     )  # fmt: skip
     return 1
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walls_first(
-    lines: Array, corners: Array, length: float, points: float, sigma_r: float, sigma_alpha: float, out: Array
-) -> int:
+    lines: Array, corners: Array, limits: Array, length: float, points: float, lasting: float, sigma_r: float,
+    sigma_alpha: float, out: Array,
+) -> int:  # fmt: skip
     """Write the rows of :meth:`FeatureExtractor.with_walls`; return their number."""
+    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
     count = 0
     for k in range(lines.shape[0]):
         line, row = lines[k], out[count]
         if not _is_wall(line, length, points):
             continue
+        add_hidden(line, near, lasting - 1.0)
         middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
         # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
         row[0], row[1] = line[R], math.atan2(line[NY], line[NX])

@@ -51,6 +51,9 @@ class FeatureConfig:
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: float = 0.6
     wall_points: int = 5  # through a door the walls beyond are seen by a few beams, and nothing else tells as much
+    # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
+    # jamb. As noise of each it counts for so much more, and adds up to no less.
+    wall_lasting_scans: float = 16.0
     wall_sigma_m: float = 0.0003  # 1σ that the model of a straight wall leaves out, across it …
     wall_sigma_rad: float = 0.0002  # … and in its direction
 
@@ -61,6 +64,7 @@ class FeatureConfig:
         require(5 <= self.min_angle_deg <= 85, "FeatureConfig.min_angle_deg must be in [5, 85]")
         require(self.sigma_floor_m > 0, "FeatureConfig.sigma_floor_m must be > 0")
         require(self.wall_length_m > 0, "FeatureConfig.wall_length_m must be > 0")
+        require(self.wall_lasting_scans >= 1, "FeatureConfig.wall_lasting_scans must be at least 1")
         require(self.wall_sigma_m > 0 and self.wall_sigma_rad > 0, "FeatureConfig.wall_sigma_* must be > 0")
 
 
@@ -91,8 +95,9 @@ class FeatureExtractor:
     def extract(self, scan: Scan) -> NDArray[np.float64]:
         """Return the corners as rows of ``(m, 10)`` (a view, until the next call).
 
-        Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and 1 for the visible
-        end of a surface, 0 for a meeting of two; then the surfaces' numbers, -1 for none.
+        Columns: range, bearing, then the covariance's three distinct terms, kind, direction, and for the visible
+        end of a surface 1 or -1, as it is its last or first point by bearing, 0 for a meeting of two; then the
+        surfaces' numbers, -1 for none.
         """
         n = len(scan.ranges)
         key = (n, scan.angle_min, scan.angle_increment)
@@ -121,8 +126,8 @@ class FeatureExtractor:
         """
         c = self.config
         count = walls_first(
-            self._lines[: self._line_count], self._corners[: self._corner_count], c.wall_length_m, c.wall_points,
-            c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
+            self._lines[: self._line_count], self._corners[: self._corner_count], self._limits, c.wall_length_m,
+            c.wall_points, c.wall_lasting_scans, c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
         )  # fmt: skip
         return self._walls_and_corners[:count]
 

@@ -124,9 +124,16 @@ def refuse_unlikely(x: Array, p: Array, offset: float, z: Array, gate: float, ma
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def alike(z: Array, mark: Array, theta: float, max_turn: float) -> bool:
-    """Tell whether an observation has a landmark's kind and direction, as far as both are known."""
+    """Tell whether an observation has a landmark's kind and direction, as far as both are known.
+
+    Points are also told apart by what makes them: the left or the right end of a surface, or two that meet. Where
+    the corner of a pier is notched, the ends of its two faces and the place where these would meet lie decimetres
+    apart.
+    """
     if (z[5] == 0.0 and mark[0] != LINE) or (mark[0] == 0.0 and z[5] != LINE):
         return True
+    if z[5] != LINE and z[7] != mark[6]:
+        return False
     return bool(z[5] == mark[0] and abs(wrap_scalar(z[6] + theta - mark[1])) <= max_turn)
 
 
@@ -172,11 +179,11 @@ def nearest_neighbour(
     Parameters
     ----------
     z : Array
-        ``(m, ≥ 7)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame;
-        of a LINE distance and bearing of its foot, and in columns 8 and 9 from where to where it was seen [m].
+        ``(m, 10)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame, which
+        end; of a LINE distance and bearing of its foot, in columns 8 and 9 from where to where it was seen [m].
     marks : Array
-        ``(n, ≥ 2)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
-        from where to where it goes [m], and in column 5 when it was seen last.
+        ``(n, ≥ 8)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
+        from where to where it goes [m], and in column 5 when it was seen last; of a point in column 6 which end.
     gate : float
         Largest squared Mahalanobis distance (chi-square with two degrees of freedom).
     near : float

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.landmarks.association import UNMATCHED, nearest_neighbour
+from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.settings import require
 from slam.types import LINE, Scan
 
@@ -27,9 +27,10 @@ KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row
 # Columns of ``marks``, one row a landmark.
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN, _FROM, _TO = range(8)
 _RECENT = 3  # updates
+_SAME_TURN = 0.6  # [rad] between two sightings of one landmark
 _WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may become one landmark
 # Columns of the tentative ones.
-_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y = range(8)
+_X, _Y, _T_KIND, _T_DIRECTION, _COUNT, _AGE, _FROM_X, _FROM_Y, _END = range(9)
 _TENTATIVE = 64
 _NO_SCAN = Scan(np.zeros(0), 0.0, 1.0, 0.0)
 
@@ -38,7 +39,7 @@ _NO_SCAN = Scan(np.zeros(0), 0.0, 1.0, 0.0)
 class LandmarkPolicy:
     """When a corner becomes a landmark, and when it ceases to be one."""
 
-    confirm_after: int = 3  # sightings …
+    confirm_after: int = 2  # sightings …
     edge_confirm_after: int = 8  # … of a surface's visible end, which a round table can feign, more of them …
     edge_baseline_m: float = 0.2  # … and from two places this far apart
     forget_after: int = 20  # updates without a sighting, while tentative
@@ -65,19 +66,20 @@ class LandmarkBook:
         self._now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
         self._marks = np.zeros((32, 8))
-        self._tentative = np.zeros((_TENTATIVE, 8))
+        self._tentative = np.zeros((_TENTATIVE, 9))
         self._tentative_count = 0
         self._new = np.zeros(256, np.int64)
         self._limits = np.array([
             p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
-            p.clear_margin_m, p.drop_after, p.overlook_after, p.overlook_ratio,
+            p.clear_margin_m, p.drop_after, p.overlook_after, p.overlook_ratio, p.new_distance_m,
         ])  # fmt: skip
 
     @property
     def marks(self) -> Array:
         """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to ``(n, 8)``.
 
-        A wall goes from one to the other [m], along it from its foot. A view.
+        A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
+        surface it is, as the observation does. A view.
         """
         return self._marks[: self.count]
 
@@ -100,7 +102,7 @@ class LandmarkBook:
     def add(
         self, kind: float, direction: float, known_id: int | None, *, extent: tuple[float, float] = (0.0, 0.0)
     ) -> None:
-        """Append a landmark; without a known id it gets the next one. A wall has an extent along it [m]."""
+        """Append a landmark; without a known id it gets the next one. ``extent`` is from and to, see ``marks``."""
         new_id = self._next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
@@ -199,6 +201,16 @@ def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _goes_on(x: Array, offset: float, z: Array, marks: Array, near: float) -> bool:
+    """Tell whether a piece of wall is one of a landmark after all, which has been seen as far as this by now."""
+    for i in range(marks.shape[0]):
+        along = marks[i, _KIND] == LINE and abs(wrap_scalar(marks[i, _DIRECTION] - x[2] - z[1])) < _SAME_TURN
+        if along and beside(x, i, offset, z, marks[i], near):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
     """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
     recent = still = 0
@@ -218,7 +230,7 @@ def _sightings(
 ) -> tuple[int, int]:  # fmt: skip
     """Count sightings; return how many observations are new landmarks, and how many tentative ones there are."""
     gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
-    forget_after = limits[4]
+    forget_after, near = limits[4], limits[9]
     c, s = math.cos(x[2]), math.sin(x[2])
     found = 0
     for i in range(n):
@@ -229,7 +241,7 @@ def _sightings(
             marks[match[k], _LAST_SEEN] = now
             if z[k, KIND] == LINE:
                 _lengthen(x, offset, z[k], match[k], marks[match[k]])
-            continue
+    for k in range(z.shape[0]):
         if match[k] != UNMATCHED:
             continue
         bearing = x[2] + z[k, 1]
@@ -250,7 +262,11 @@ def _sightings(
             else:
                 d2 = dx * dx + dy * dy
             same = tentative[i, _T_KIND] == z[k, 5] and (
-                z[k, 5] == 0.0 or abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < 0.6
+                z[k, 5] == 0.0
+                or (
+                    tentative[i, _END] == z[k, EDGE]
+                    and abs(wrap_scalar(tentative[i, _T_DIRECTION] - turn)) < _SAME_TURN
+                )
             )
             if same and d2 < best:
                 nearest, best = i, d2
@@ -261,7 +277,7 @@ def _sightings(
             n += 1
             t = tentative[nearest]
             t[_COUNT] = t[_AGE] = 0.0  # the row may be one that became a landmark
-            t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y] = z[k, 5], px, py, x[0], x[1]
+            t[_T_KIND], t[_X], t[_Y], t[_FROM_X], t[_FROM_Y], t[_END] = z[k, 5], px, py, x[0], x[1], z[k, EDGE]
         # Compared with where it was first seen: what wanders with the robot never settles.
         t = tentative[nearest]
         # This very scan has made it a landmark already. Another piece of a wall is the same wall; another corner,
@@ -274,6 +290,8 @@ def _sightings(
         moved = (x[0] - t[_FROM_X]) ** 2 + (x[1] - t[_FROM_Y]) ** 2
         settled = t[_COUNT] >= edge_confirm_after and moved >= baseline * baseline
         if settled or (z[k, EDGE] == 0.0 and (at_once or t[_COUNT] >= confirm_after)):
+            if z[k, KIND] == LINE and _goes_on(x, offset, z[k], marks, near):
+                continue
             new[found] = k
             found += 1
             t[_AGE] = np.inf

@@ -44,7 +44,7 @@ def innovations(
     found = []
     for k in np.flatnonzero(match >= 0).tolist():
         row = int(match[k])
-        kind = "wall end" if z[k, 7] == 1.0 else _KINDS.get(int(z[k, 5]), "landmark")
+        kind = "wall end" if z[k, 7] != 0.0 else _KINDS.get(int(z[k, 5]), "landmark")
         expected = predicted(x, row, z[k, 5], offset, h)
         nis = gated_distance(x, p, row, offset, z[k], h)
         extent = (float(z[k, 8]), float(z[k, 9])) if z[k, 5] == LINE else (0.0, 0.0)

@@ -255,7 +255,7 @@ def associate(
             e = extents[row]
             apart_x, apart_y = max(e[0] - x1, x0 - e[1]), max(e[2] - y1, y0 - e[3])
             if apart_x <= window and apart_y <= window and (
-                z[k, 5] == 0.0 or marks[row, 0] == 0.0 or z[k, 5] == marks[row, 0]
+                z[k, 5] == 0.0 or marks[row, 0] == 0.0 or (z[k, 5] == marks[row, 0] and z[k, 7] == marks[row, 6])
             ):  # fmt: skip
                 candidates[count] = row
                 count += 1

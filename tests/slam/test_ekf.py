@@ -119,24 +119,27 @@ def test_stacked_update_is_the_textbook_one(seed: int, seen: int, landmarks: int
 def test_nearest_neighbour_takes_the_right_one_once_and_leaves_new_ones() -> None:
     x = np.array([0.0, 0.0, 0.0, 2.0, 1.0, 2.0, 1.6, 4.0, -1.0])
     p = np.triu(np.eye(9) * 1e-4)
-    marks = np.array([[1.0, 0.0], [1.0, 0.0], [-1.0, 0.5]])
+    marks = np.zeros((3, 8))
+    marks[:, :2] = [1.0, 0.0], [1.0, 0.0], [-1.0, 0.5]
+    marks[1, 6] = -1.0  # the right end of a surface
 
-    def row(px: float, py: float, kind: float, direction: float = 0.0) -> list[float]:
+    def row(px: float, py: float, kind: float, direction: float = 0.0, end: float = 0.0) -> list[float]:
         d = np.array([px - OFFSET, py])
-        return [float(np.hypot(*d)), math.atan2(d[1], d[0]), 1e-4, 0.0, 1e-5, kind, direction, 0.0]
+        return [float(np.hypot(*d)), math.atan2(d[1], d[0]), 1e-4, 0.0, 1e-5, kind, direction, end]
 
     z = np.array([
         row(2.005, 1.0, 1.0),  # landmark 0
-        row(2.0, 1.61, 1.0),  # landmark 1
+        row(2.0, 1.61, 1.0, end=-1.0),  # landmark 1
         row(2.01, 1.0, 1.0),  # landmark 0 too, but farther: gives way
         row(4.0, -1.0, 1.0),  # on landmark 2, but of another kind: new
         row(4.0, -1.0, -1.0, 0.5 + math.pi),  # … or facing the other way: new
         row(2.0, 1.15, 1.0),  # too far to be landmark 0, too near to be new
         row(5.0, 3.0, 1.0),
+        row(2.0, 1.0, 1.0, end=1.0),  # on landmark 0, but the end of a surface, not where two meet: new
     ])  # fmt: skip
     match, distance = np.zeros(len(z), np.int64), np.zeros(len(z))
     nearest_neighbour(x, p, OFFSET, z, marks, chi2_quantile(0.997, 2), 0.2, 0.6, False, match, distance)
-    assert match.tolist() == [0, 1, IGNORED, UNMATCHED, UNMATCHED, IGNORED, UNMATCHED]
+    assert match.tolist() == [0, 1, IGNORED, UNMATCHED, UNMATCHED, IGNORED, UNMATCHED, UNMATCHED]
     assert distance[0] < distance[2]
 
 

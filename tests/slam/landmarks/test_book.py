@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from slam import Scan
+from slam import LINE, Scan
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from tests.slam.simulated import ANGLE_MIN, INCREMENT
@@ -20,6 +20,31 @@ def test_a_meeting_of_two_surfaces_is_confirmed_after_three_sightings() -> None:
     book = LandmarkBook(LandmarkPolicy(confirm_after=3))
     for expected in ([], [], [0]):
         assert book.review(POSE, 0.0, corner(2, 1, edge=False)[None], np.array([UNMATCHED]))[0] == expected
+
+
+def wall(y: float, begin: float, end: float) -> np.ndarray:
+    """A piece of the wall at ``y``, as it is seen from the origin; along it is towards -x."""
+    return np.array([y, math.pi / 2, 1e-6, 0.0, 1e-6, LINE, math.pi / 2, 0.0, begin, end])
+
+
+def test_a_wall_is_confirmed_as_soon_as_any_whatever_was_confirmed_before_it() -> None:
+    """The list of tentative ones is used again, and what is new must not look like one that became a landmark."""
+    book = LandmarkBook(LandmarkPolicy(confirm_after=2))
+    new = np.array([UNMATCHED])
+    for y in (2.0, 3.0, 4.0):
+        assert book.review(POSE, 0.0, wall(y, -1.0, 1.0)[None], new)[0] == []
+        assert book.review(POSE, 0.0, wall(y, -1.0, 1.0)[None], new)[0] == [0]
+
+
+def test_a_far_piece_of_a_wall_is_no_second_one_once_the_gap_is_closed() -> None:
+    book = LandmarkBook(LandmarkPolicy(confirm_after=2))
+    book.add(LINE, math.pi / 2, None, extent=(0.5, 2.0))
+    x = np.array([0.0, 0.0, 0.0, math.pi / 2, 2.0])
+    far = wall(2.0, -3.0, -1.5)
+    assert book.review(x, 0.0, far[None], np.array([UNMATCHED]))[0] == []
+    rows = np.array([far, wall(2.0, -1.6, 0.6)])  # the piece between, seen at last, is the wall's
+    assert book.review(x, 0.0, rows, np.array([UNMATCHED, 0]))[0] == []
+    assert book.marks[0, 6:8].tolist() == [-1.6, 2.0]
 
 
 def test_what_the_first_scan_shows_is_a_landmark_at_once() -> None:
