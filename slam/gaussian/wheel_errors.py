@@ -83,6 +83,10 @@ class WheelErrors:
         """Leave out the two states from ``i`` on."""
         self.cross[:, i : n - 2] = self.cross[:, i + 2 : n].copy()
 
+    def forget_pose(self) -> None:
+        """Have the errors say nothing of the robot's pose, as when it is forgotten."""
+        self.cross[:, :3] = 0.0
+
     def enlarge(self, size: int) -> None:
         """Make room for a larger state."""
         cross = aligned_zeros(_STATES, size)

@@ -112,9 +112,9 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
 
 
 def _driven(odometry: Array) -> Array:
-    """Return what the base drives (k + 1, 3), times as the commands' (k, 3): it stands until the first comes through.
+    """Return what the base drives (k + 1, 3) by its commands (k, 3), both t [s], v [m/s], ω [rad/s].
 
-    Commands are t [s], v [m/s], ω [rad/s].
+    It stands until the first one comes through.
     """
     t, v, omega = odometry.T
     speed = np.sign(v) * np.maximum(_SPEED_SCALE * np.abs(v) - _HANGS_BACK_M * np.abs(omega), 0.0)
