@@ -42,6 +42,7 @@ class _Sighting(NamedTuple):
     row: Array  # (10,) the observation: see slam.landmark_backend.observation_rows
     pose: Array  # (3,) believed then
     held: bool  # whether the gate let it through
+    believed: int  # how often the gate had let the landmark through before
 
 
 class Elsewhere(NamedTuple):
@@ -68,7 +69,7 @@ class KnownIds:
             if match[k] == UNMATCHED:
                 continue  # new: not believed before it is seen again
             held = match[k] != IGNORED
-            self._lately.append(_Sighting(landmark, z[k].copy(), pose, held))
+            self._lately.append(_Sighting(landmark, z[k].copy(), pose, held, self._held.get(landmark, 0)))
             if held:
                 self._held[landmark] = self._held.get(landmark, 0) + 1
                 self._refused.pop(landmark, None)
@@ -78,11 +79,9 @@ class KnownIds:
 
     def misplaced(self) -> list[int]:
         """Return the landmarks whose place is wrong, and forget what was known of them."""
-        if len(self._doubted()) > len({s.landmark for s in self._lately if s.held}):
-            return []  # it may be the robot that is not where it should be
         found = []
         for landmark, refused in self._refused.items():
-            if len(refused) > self._held.get(landmark, 0):
+            if len(refused) > self._held.get(landmark, 0) and self._others_hold(landmark, len(refused)):
                 places = np.array([place for place, _ in refused])
                 off = np.hypot(*(places - np.median(places, axis=0)).T)
                 if np.all(off < [slack for _, slack in refused]):
@@ -100,7 +99,7 @@ class KnownIds:
         ``place_of`` returns a landmark's place ``(2,)`` in the map, or ``None``.
         """
         seen = [s for s in self._doubted_twice() if math.hypot(*(s.pose - pose)[:2]) < _LONGEST_WAY_M]
-        places = [place_of(s.landmark) if self._held.get(s.landmark, 0) >= _FEWEST else None for s in seen]
+        places = [place_of(s.landmark) for s in seen]
         pairs = [(s, p) for s, p in zip(seen, places, strict=True) if p is not None]
         if len(pairs) < _FEWEST:
             return None
@@ -121,10 +120,16 @@ class KnownIds:
         self._lately.clear()
         self._refused.clear()
 
-    def _doubted(self) -> list[_Sighting]:
-        """Return the last sighting of each landmark whose last sighting was refused."""
-        latest = {s.landmark: s for s in self._lately}
-        return [s for s in latest.values() if not s.held]
+    def _others_hold(self, landmark: int, refused: int) -> bool:
+        """Tell whether other landmarks were where they should be since this one was refused so many times."""
+        lately, begin = list(self._lately), 0
+        for k in range(len(lately) - 1, -1, -1):
+            refused -= lately[k].landmark == landmark
+            if refused == 0:
+                begin = k
+                break
+        others = [s.held for s in _of_old_ones(lately[begin:]) if s.landmark != landmark]
+        return 2 * sum(others) > len(others)
 
     def _doubted_twice(self) -> list[_Sighting]:
         """Return the last sighting of each landmark that was refused twice and not believed since nearly all were.
@@ -132,15 +137,17 @@ class KnownIds:
         Of misread labels few are in a row and few are the same, and others in between are where they should be.
         """
         lately = list(self._lately)
-        begin, held = len(lately), 0
-        for k in range(len(lately) - 1, -1, -1):
-            held += lately[k].held
-            if held <= _HELD_BY_CHANCE * (len(lately) - k):
-                begin = k
-        of: dict[int, list[_Sighting]] = {}
-        for s in lately[begin:]:
-            of.setdefault(s.landmark, []).append(s)
-        return [all_[-1] for all_ in of.values() if len(all_) > 1 and not any(s.held for s in all_)]
+        doubted: list[_Sighting] = []
+        for begin in range(len(lately)):
+            seen = _of_old_ones(lately[begin:])
+            if sum(s.held for s in seen) > _HELD_BY_CHANCE * len(seen):
+                continue
+            of: dict[int, list[_Sighting]] = {}
+            for s in seen:
+                of.setdefault(s.landmark, []).append(s)
+            doubted = [all_[-1] for all_ in of.values() if len(all_) > 1 and not any(s.held for s in all_)]
+            break
+        return doubted
 
     def _point(self, row: Array) -> Array:
         """Return where an observation was ``(2,)`` in the body frame."""
@@ -155,6 +162,14 @@ class KnownIds:
         out[2] += drift**2
         out[4] += (drift / max(float(out[0]), 1e-3)) ** 2 + (_DRIFT * float(motion[2])) ** 2
         return out
+
+
+def _of_old_ones(sightings: list[_Sighting]) -> list[_Sighting]:
+    """Return those of landmarks that were well known before: new ones are where a wrong pose has put them."""
+    at_first: dict[int, int] = {}
+    for s in sightings:
+        at_first.setdefault(s.landmark, s.believed)
+    return [s for s in sightings if at_first[s.landmark] >= _FEWEST]
 
 
 def _slack(row: Array) -> float:
