@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam.geometry import compose, wrap
-from slam.logs import ObservationNoise, RecordedLog, open_log
+from slam.logs import ObservationNoise, RecordedLog, open_log, utias
 from slam.logs.recorded import group_by_time, split_holds
 from slam.logs.tables import read_table
 from slam.logs.victoria_park import car_twist, plausible
@@ -281,6 +281,58 @@ def test_a_truth_that_begins_too_late_is_refused(tmp_path):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[10:]))
     with pytest.raises(ValueError, match="does not cover the first odometry"):
         open_log(tmp_path)
+
+
+# ---- what the rig makes of it -----------------------------------------------------------------------------------
+
+
+def test_depths_of_the_utias_camera_become_ranges():
+    rng = np.random.default_rng(0)
+    ranges, bearings = rng.uniform(1.0, 7.0, 20), rng.uniform(-0.6, 0.6, 20)
+    depth = (0.0385 + 1.0152 * ranges) * np.cos(bearings)
+    rows = utias._measured(np.column_stack([np.full(20, 5.0), np.full(20, 63.0), depth, bearings]))
+    np.testing.assert_allclose(rows, np.column_stack([np.full(20, 4.97), np.full(20, 63.0), ranges, bearings]))
+
+
+def test_the_utias_base_follows_its_commands_late_and_not_quite():
+    commands = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, 0.4], [2.0, -0.1, -0.4], [3.0, 0.02, 0.4], [4.0, 0.0, 0.4]])
+    driven = utias._driven(commands)
+    np.testing.assert_allclose(driven[0], 0.0)  # until the first command comes through
+    np.testing.assert_allclose(driven[1:, 0], commands[:, 0] + 0.19)
+    np.testing.assert_allclose(driven[1:, 1], [0.1045, 0.0685, -0.0685, 0.0, 0.0])
+    np.testing.assert_allclose(driven[1:, 2], 0.95 * commands[:, 2])
+
+
+def test_a_utias_log_is_calibrated_unless_it_is_another_rigs_or_wanted_raw(tmp_path):
+    write_utias(tmp_path)
+    assert open_log(tmp_path).observation_noise == utias.RAW_NOISE  # bearings all round: no camera's
+    measured = tmp_path / "Robot1_Measurement.dat"
+    rows = np.loadtxt(measured)
+    np.savetxt(measured, rows[np.abs(rows[:, 3]) < 1.0], fmt="%.9f")
+    log, raw = open_log(tmp_path), open_log(tmp_path, raw=True)
+    assert log.observation_noise == utias.NOISE and raw.observation_noise == utias.RAW_NOISE
+    assert log.duration_s == pytest.approx(raw.duration_s + 0.19) and "as recorded" in raw.note
+    assert np.all(log.range_bearing[:, 1] == raw.range_bearing[:, 1])
+    assert np.all(log.range_bearing[:, 0] != raw.range_bearing[:, 0])
+
+
+def test_a_repeated_sighting_tells_less():
+    noise = ObservationNoise(range_m=0.1, bearing_deg=1.0, repeat_s=2.0)
+    times, ids = np.array([0.0, 0.0, 1.0, 1.0, 11.0]), np.array([7, 8, 7, 9, 7])
+    tells = 1.0 / noise.repeated(times, ids)
+    np.testing.assert_allclose(tells, [1.0, 1.0, 1 - math.exp(-0.5), 1.0, 1 - math.exp(-5.0)])
+    np.testing.assert_allclose(1.0 / noise.repeated(times, None)[1:4], [1.0, *2 * [1 - math.exp(-0.5)]])
+    assert np.all(ObservationNoise(range_m=0.1, bearing_deg=1.0).repeated(times, ids) == 1.0)
+
+
+def test_sightings_in_a_row_tell_what_a_lasting_error_lets_them():
+    """The mean of an error with correlation exp(-t/τ) over a long time T has variance 2 τ s² / T."""
+    tau, step, count = 3.0, 0.1, 20_000
+    noise = ObservationNoise(range_m=1.0, bearing_deg=1.0, repeat_s=2.0 * tau)
+    tells = np.sum(1.0 / noise.repeated(step * np.arange(count), None))
+    lag = np.arange(1, count)
+    variance = (1.0 + 2.0 * np.sum((1.0 - lag / count) * np.exp(-lag * step / tau))) / count
+    assert 1.0 / tells == pytest.approx(variance, rel=0.02)
 
 
 # ---- real data ------------------------------------------------------------------------------------------------
