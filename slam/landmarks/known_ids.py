@@ -81,7 +81,8 @@ class KnownIds:
         """Return the landmarks whose place is wrong, and forget what was known of them."""
         found = []
         for landmark, refused in self._refused.items():
-            if len(refused) > self._held.get(landmark, 0) and self._others_hold(landmark, len(refused)):
+            held = self._held.get(landmark, 0)
+            if len(refused) > held and (held == 0 or self._others_hold(landmark, len(refused))):
                 places = np.array([place for place, _ in refused])
                 off = np.hypot(*(places - np.median(places, axis=0)).T)
                 if np.all(off < [slack for _, slack in refused]):
