@@ -22,8 +22,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfConfig, EkfSlam, state_rows
-from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, symmetric_block
+from slam.ekf import EkfConfig, EkfSlam
+from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, state_rows, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import solve
 from slam.gaussian.tiles import add_combination, downdate, product, subtract
@@ -133,6 +133,10 @@ class CompressedEkfSlam(EkfSlam):
         if not self._free:
             self._free.append(len(self._near) + len(self._far))  # every place before it is taken
         self._near = np.append(self._near, self._free.pop())
+
+    def _forget_pose(self, pose: Array) -> None:
+        super()._forget_pose(pose)
+        self._phi[:3] = 0.0  # the robot's rows of P_ab are none of what they were
 
     def _drop(self, row: int) -> None:
         n, i = self._n, 3 + 2 * row

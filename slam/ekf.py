@@ -15,21 +15,31 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
+from slam.gaussian.joint_gaussian import (
+    add_landmark,
+    forget_pose,
+    leave_out,
+    line_ends,
+    near_landmarks,
+    read_block,
+    state_rows,
+    symmetric_block,
+)
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
-from slam.landmarks.association import UNMATCHED, refuse_unlikely
+from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
+from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import predict_robot
 from slam.settings import require, unknown_name
 from slam.types import LINE, Observations, Odometry, Scan
 
-__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam", "state_rows"]
+__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
 
 Array = NDArray[np.float64]
 
@@ -143,17 +153,47 @@ class EkfSlam(LandmarkBackend):
             part = z[begin : begin + MAX_OBSERVATIONS]
             if observations.ids is None:
                 self._take(part, None)
-                continue
-            ids = np.asarray(observations.ids)[begin : begin + MAX_OBSERVATIONS]
-            match = np.array([self._book.row(int(i)) for i in ids], np.int64)
-            if self.config.known_gate < math.inf:
-                refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, part, self.config.known_gate, match)
-            self._tell(part, match)
-            self._correct(part, match)
-            self._book.count_sightings(match)
-            for k in np.flatnonzero(match == UNMATCHED):
-                if self._book.row(int(ids[k])) < 0:  # not added by this very call
-                    self._add(part[k], int(ids[k]))
+            else:
+                self._take_known(part, [int(i) for i in observations.ids[begin : begin + MAX_OBSERVATIONS]])
+
+    def _take_known(self, z: Array, ids: list[int]) -> None:
+        """Correct by observations of these landmarks, but those that cannot be theirs, and add new ones."""
+        doubting = self.config.known_gate < math.inf
+        if doubting:
+            self._drop_misplaced()
+        match = self._rows(ids)
+        if doubting:
+            refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, z, self.config.known_gate, match)
+        self._tell(z, match)
+        self._correct(z, match)
+        self._book.count_sightings(match)
+        for k in np.flatnonzero(match == UNMATCHED):
+            if self._book.row(ids[k]) < 0:  # not added by this very call
+                self._add(z[k], ids[k])
+        if doubting:
+            self._known.note(ids, z, match, self.pose)
+            if np.any(match == IGNORED):
+                self._look_elsewhere()
+
+    def _look_elsewhere(self) -> None:
+        """Start over at the pose that landmarks lately refused agree on, with the map as it is, if they do."""
+        found = self._known.elsewhere(self.pose, self._place_of)
+        if found is None:
+            return
+        match, n = self._rows(found.ids), self._n
+        x, p = self._x.copy(), self._p.copy()
+        forget_pose(x, p, n, found.pose)
+        dof, nis = stacked_update(
+            x, p, n, found.rows, match, self.config.lidar_offset_m, self._h, self._w, self._s
+        )
+        if nis < chi2_quantile(0.999, dof - 3):  # three of them went into the pose
+            self._forget_pose(found.pose)
+            self._correct(found.rows, match)
+            self._known.forget()
+
+    def _forget_pose(self, pose: Array) -> None:
+        """Have the robot anywhere, linearised at a pose ``(3,)``, and the map as it is."""
+        forget_pose(self._x, self._p, self._n, pose)
 
     def _associate(self, z: Array) -> NDArray[np.int64]:
         config, book = self.config, self._book
@@ -352,20 +392,6 @@ class EkfSlam(LandmarkBackend):
             joint_cov=joint,
             landmark_kinds=marks[rows, 0].astype(np.int8),
             lines=points[lines],
-            line_ends=_ends_of(points[lines], marks[lines, 6:8]),
+            line_ends=line_ends(points[lines], marks[lines, 6:8]),
             whole_cov=whole,
         )
-
-
-def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
-    """Return the state's indices of landmarks, after the robot's three if wanted."""
-    rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
-    return np.concatenate([np.arange(3), rows]) if robot else rows
-
-
-def _ends_of(lines: Array, extent: Array) -> Array:
-    """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
-    alpha, r = lines.T
-    n = np.column_stack([np.cos(alpha), np.sin(alpha)])
-    along = np.column_stack([-n[:, 1], n[:, 0]])
-    return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

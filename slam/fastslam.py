@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
+from slam.gaussian.joint_gaussian import ANYWHERE_M, OBSERVED_LIMIT
 from slam.geometry import rotation
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
+from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
+from slam.landmarks.known_ids import rigid_fit
 from slam.particles.filter import correct_particles, narrow, predict_particles
+from slam.particles.gate import refuse_unlikely
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
 from slam.particles.resampling import (
     ResamplingPolicy,
@@ -49,6 +52,7 @@ class FastSlamConfig(BackendConfig):
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     max_turn_deg: float = 35.0  # difference in a corner's direction
+    known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
     # An observation that no landmark of a particle explains weighs as one at this squared distance from a
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
     unexplained: float = 11.83
@@ -57,7 +61,7 @@ class FastSlamConfig(BackendConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.particles >= 1, "FastSlamConfig.particles must be at least 1")
-        require(self.gate > 0, "FastSlamConfig.gate must be > 0")
+        require(self.gate > 0 and self.known_gate > 0, "FastSlamConfig.gate and known_gate must be > 0")
         require(self.unexplained >= 0, "FastSlamConfig.unexplained must be ≥ 0")
 
 
@@ -121,23 +125,59 @@ class FastSlam(LandmarkBackend):
             self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
 
     def observe(self, observations: Observations) -> None:
-        """Correct by landmark observations without a scan; known ids are believed, and new ones added."""
+        """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``)."""
         z = observation_rows(observations)
         if observations.ids is None:
             match, _ = self._associate(z)
             best = self._correct(z, match)
             self._manage(z, match[best], best, None)
         else:
-            ids = [int(i) for i in observations.ids]
-            rows = np.array([self._book.row(i) for i in ids], np.int64)
-            match = self._match_buffer(len(z))
-            match[:] = rows
-            best = self._correct(z, match)
-            for k in np.flatnonzero(rows < 0):
-                if self._book.row(ids[k]) < 0:  # not added by this very call
-                    self._add(z[k], best, ids[k])
+            self._take_known(z, [int(i) for i in observations.ids])
         self._resample(len(z))
         self._believe()
+
+    def _take_known(self, z: Array, ids: list[int]) -> None:
+        """Correct by observations of these landmarks, but those that cannot be theirs, and add new ones."""
+        gate = self.config.known_gate
+        if gate < math.inf:
+            self._drop_misplaced()
+        rows = self._rows(ids)
+        if gate < math.inf:
+            refuse_unlikely(
+                self._poses, self._covs, self._weights, self._maps, self.config.lidar_offset_m, z, gate, rows
+            )
+        match = self._match_buffer(len(z))
+        match[:] = rows
+        best = self._correct(z, match)
+        for k in np.flatnonzero(rows == UNMATCHED):
+            if self._book.row(ids[k]) < 0:  # not added by this very call
+                self._add(z[k], best, ids[k])
+        if gate < math.inf:
+            self._believe()
+            self._known.note(ids, z, rows, self.pose)
+            if np.any(rows == IGNORED):
+                self._look_elsewhere()
+
+    def _look_elsewhere(self) -> None:
+        """Start every particle over at the pose that landmarks lately refused agree on, in its own map."""
+        found = self._known.elsewhere(self.pose, self._place_of)
+        if found is None:
+            return
+        rows, offset = self._rows(found.ids), self.config.lidar_offset_m
+        ahead = np.column_stack([
+            offset + found.rows[:, 0] * np.cos(found.rows[:, 1]), found.rows[:, 0] * np.sin(found.rows[:, 1])
+        ])  # fmt: skip
+        for i in range(len(self._poses)):
+            self._poses[i] = rigid_fit(ahead, self._maps.of(i)[rows, :2])
+        self._covs[:] = np.diag([ANYWHERE_M**2, ANYWHERE_M**2, math.pi**2])
+        match = self._match_buffer(len(rows))
+        match[:] = rows
+        self._correct(found.rows, match)
+        self._known.forget()
+
+    def _drop(self, row: int) -> None:
+        self._maps.drop(row)
+        self._book.drop(row)
 
     def _match_buffer(self, observations: int) -> Indices:
         if self._match.shape[1] < observations:
@@ -234,8 +274,7 @@ class FastSlam(LandmarkBackend):
         for k in new:
             self._add(z[k], best, None)
         for row in gone:
-            self._maps.drop(row)
-            self._book.drop(row)
+            self._drop(row)
 
     def _add(self, z: Array, best: int, known_id: int | None) -> None:
         direction, extent = float(z[DIRECTION]) + float(self._poses[best, 2]), (float(z[EDGE]), 0.0)

@@ -98,6 +98,11 @@ class InvariantEkfSlam(EkfSlam):
             self._wheels.drop(self._n, 3 + 2 * row)
         super()._drop(row)
 
+    def _forget_pose(self, pose: Array) -> None:
+        super()._forget_pose(pose)
+        if self._wheels is not None:
+            self._wheels.forget_pose()
+
     def _enlarge(self) -> None:
         super()._enlarge()
         self._delta = np.zeros(len(self._x))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import abc
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
+from slam.landmarks.known_ids import KnownIds
 from slam.motion import OdometryNoise
 from slam.types import LINE, Observations, Odometry
 
@@ -26,6 +28,7 @@ class LandmarkBackend(Backend):
 
     def _begin(self, policy: LandmarkPolicy) -> None:
         self._book = LandmarkBook(policy)
+        self._known = KnownIds(self.config.lidar_offset_m)
         self._twist = (0.0, 0.0, 0.0)
         self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
 
@@ -43,6 +46,26 @@ class LandmarkBackend(Backend):
     def _out_of_sight(self, recent: int, still: int) -> bool:
         """Tell whether many of the landmarks that the last scans showed are missing all at once."""
         return recent >= 3 and still < 0.6 * recent
+
+    # ---- landmarks with labels -----------------------------------------------------------------------------
+
+    def _rows(self, ids: Sequence[int]) -> NDArray[np.int64]:
+        """Return the book's row of each landmark ``(m,)``, or -1."""
+        return np.array([self._book.row(i) for i in ids], np.int64)
+
+    def _place_of(self, landmark: int) -> Array | None:
+        row = self._book.row(landmark)
+        return None if row < 0 else self._points[row]
+
+    def _drop_misplaced(self) -> None:
+        """Take out landmarks that a misread label put where they are not: they are new at their next sighting."""
+        for landmark in self._known.misplaced():
+            if (row := self._book.row(landmark)) >= 0:
+                self._drop(row)
+
+    @abc.abstractmethod
+    def _drop(self, row: int) -> None:
+        """Take a landmark out of the map and the book."""
 
     @property
     @abc.abstractmethod

@@ -23,11 +23,13 @@ class LastingErrors:
 
     radius_sigma: float = 0.0  # relative
     lever_sigma: float = 0.0  # relative
+    difference_sigma: float = 0.0  # relative, of the right wheels' radii and, by as much less, of the left ones'
     white_speed_share: float | None = None  # OdometryNoise's shares without what lasts; None: all of them
     white_turn_share_rad_m: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("radius_sigma", "lever_sigma", "white_speed_share", "white_turn_share_rad_m"):
+        shares = ("white_speed_share", "white_turn_share_rad_m")
+        for name in ("radius_sigma", "lever_sigma", "difference_sigma", *shares):
             value = getattr(self, name)
             require(value is None or (math.isfinite(value) and value >= 0), f"LastingErrors.{name} must be ≥ 0")
 

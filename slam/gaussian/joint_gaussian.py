@@ -18,12 +18,16 @@ from slam.landmarks.joint_compatibility import insert_nearest
 from slam.types import LINE
 
 __all__ = [
+    "ANYWHERE_M",
     "OBSERVED_LIMIT",
     "add_landmark",
+    "forget_pose",
     "landmark_by_pose",
     "leave_out",
+    "line_ends",
     "near_landmarks",
     "read_block",
+    "state_rows",
     "symmetric_block",
 ]
 
@@ -31,6 +35,9 @@ Array = NDArray[np.float64]
 
 OBSERVED_LIMIT = 1e4
 """Bound of what :func:`near_landmarks` writes, m and m²: Gymnasium asks for finite spaces."""
+
+ANYWHERE_M = 10.0
+"""Standard deviation of a place that is as good as unknown."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -96,6 +103,17 @@ def leave_out(x: Array, p: Array, n: int, i: int) -> None:
         x[a] = x[a + 2]
 
 
+def forget_pose(x: Array, p: Array, n: int, pose: Array) -> None:
+    """Put the robot at a pose ``(3,)`` that is as good as unknown: of P's robot rows only a wide diagonal is left.
+
+    So the next update finds it by the landmarks alone, and ``pose`` is only where that is linearised.
+    """
+    x[:3] = pose
+    p[:3, :n] = 0.0
+    p[0, 0] = p[1, 1] = ANYWHERE_M**2
+    p[2, 2] = math.pi**2
+
+
 def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:
     """Return Gr ``(2, 3)``, the Jacobian by the pose of the landmark that :func:`add_landmark` appends."""
     x, y, theta = pose[:3].tolist()
@@ -150,3 +168,17 @@ def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -
         for q in range(5):
             out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
         out[j, 5] = 1.0
+
+
+def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
+    """Return the state's indices of landmarks, after the robot's three if wanted."""
+    rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
+    return np.concatenate([np.arange(3), rows]) if robot else rows
+
+
+def line_ends(lines: Array, extent: Array) -> Array:
+    """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
+    alpha, r = lines.T
+    n = np.column_stack([np.cos(alpha), np.sin(alpha)])
+    along = np.column_stack([-n[:, 1], n[:, 0]])
+    return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

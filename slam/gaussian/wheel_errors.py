@@ -46,6 +46,7 @@ class WheelErrors:
         self._lever_m = lever_m
         self.mean = np.zeros(_STATES)
         self.cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
+        self.cov[:4, :4] += declared.difference_sigma**2 * np.outer(_TURN, _TURN)
         self.cross = aligned_zeros(_STATES, size)  # C: of each error with the robot and the landmarks
         self._w = aligned_zeros(2 * observations, 2 * LANES)  # W_e; solve takes two vectors of a row at a time
         self._b = np.zeros((3, _STATES))
@@ -82,6 +83,10 @@ class WheelErrors:
     def drop(self, n: int, i: int) -> None:
         """Leave out the two states from ``i`` on."""
         self.cross[:, i : n - 2] = self.cross[:, i + 2 : n].copy()
+
+    def forget_pose(self) -> None:
+        """Have the errors say nothing of the robot's pose, as when it is forgotten."""
+        self.cross[:, :3] = 0.0
 
     def enlarge(self, size: int) -> None:
         """Make room for a larger state."""

@@ -2,5 +2,6 @@
 
 ``association`` decides by Mahalanobis distance, ``joint_compatibility`` for a scan as a whole; ``book`` keeps
 tentative and confirmed ones, ``loop_closing`` takes old ones for what they are only together. ``innovations`` show
-what single observations say against the belief; ``database`` is ``landmarks.db``.
+what single observations say against the belief; ``known_ids`` is about labels that were misread; ``database`` is
+``landmarks.db``.
 """

@@ -34,7 +34,7 @@ _READERS = dict.fromkeys(_CARMEN_WORDS, carmen.read) | dict.fromkeys(("Odometry"
 _LINES_TO_KNOW_BY = 10_000
 
 
-def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
+def open_log(path: str | Path, *, robot: int | None = None, raw: bool = False) -> AnyLog:
     """Read a log; its format is known by the names of its files, that of one with scans by its lines.
 
     Parameters
@@ -44,6 +44,8 @@ def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
         CARMEN or DP-SLAM log, plain or gzip, whatever its name.
     robot : int, optional
         Which robot of a UTIAS folder; not needed where it has only one.
+    raw : bool
+        Of a UTIAS log: ranges, stamps and commands as recorded, not as calibrated (:mod:`slam.logs.utias`).
 
     Raises
     ------
@@ -55,7 +57,7 @@ def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
         raise ValueError(f"log {path} does not exist; check the path")
     if path.is_dir():
         if any((path / f"steering.txt{end}").exists() for end in ("", ".gz")):
-            _refuse_robot(robot, path)
+            _refuse(robot, raw, path)
             return victoria_park.read(path)
         matches = [m for p in sorted(path.iterdir()) if (m := _UTIAS_FILE.fullmatch(p.name))]
         found = sorted({int(m[1]) for m in matches})
@@ -66,16 +68,16 @@ def open_log(path: str | Path, *, robot: int | None = None) -> AnyLog:
         if robot not in found:
             given = "no robot was chosen" if robot is None else f"there is no robot {robot}"
             raise ValueError(f"folder {path}: {given}; give --robot {' or '.join(map(str, found))}")
-        return utias.read(path, robot)
+        return utias.read(path, robot, raw=raw)
     match = _UTIAS_FILE.fullmatch(path.name)
     if match is None:
-        _refuse_robot(robot, path)
+        _refuse(robot, raw, path)
         if (read := _reader_of(path)) is None:
             raise ValueError(f"file {path} is no log that is known: {_KNOWN}")
         return read(path)
     if robot is not None and robot != int(match[1]):
         raise ValueError(f"log {path} is robot {match[1]}'s, not robot {robot}'s; leave --robot out")
-    return utias.read(path.parent, int(match[1]))
+    return utias.read(path.parent, int(match[1]), raw=raw)
 
 
 def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
@@ -146,6 +148,8 @@ def _reader_of(path: Path) -> Callable[[Path], ScanLog] | None:
     return None
 
 
-def _refuse_robot(robot: int | None, path: Path) -> None:
+def _refuse(robot: int | None, raw: bool, path: Path) -> None:
     if robot is not None:
         raise ValueError(f"log {path} has one vehicle only; leave --robot out")
+    if raw:
+        raise ValueError(f"log {path} is handed on as recorded in any case; leave raw out")

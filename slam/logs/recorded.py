@@ -18,27 +18,63 @@ __all__ = ["Event", "ObservationNoise", "RecordedLog", "group_by_time", "split_h
 
 Array = NDArray[np.float64]
 
+_LEAST_TOLD = 1e-3  # by a sighting, of what one on its own tells: two at the same time are no division by zero
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationNoise:
-    """Standard deviations of a landmark observation, independent of each other."""
+    """Standard deviations of a landmark observation: of its range, a + b ρ + c ρ², and of its bearing."""
 
     range_m: float
     range_share: float = 0.0  # of the range, added to ``range_m``
+    range_square_per_m: float = 0.0  # of the range's square, as where a range is told from an apparent size
     bearing_deg: float
+    # How long the error of a landmark's sightings stays the same. A sighting right after another one of the same
+    # landmark says little that is new: see ``repeated``.
+    repeat_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("range_m", "bearing_deg"):
             value = getattr(self, name)
             require(value > 0 and math.isfinite(value), f"ObservationNoise.{name} must be > 0 and finite")
-        require(0 <= self.range_share < math.inf, "ObservationNoise.range_share must be ≥ 0 and finite")
+        for name in ("range_share", "range_square_per_m", "repeat_s"):
+            require(0 <= getattr(self, name) < math.inf, f"ObservationNoise.{name} must be ≥ 0 and finite")
 
     def cov(self, range_bearing: Array) -> Array:
-        """Return the covariances ``(m, 2, 2)`` of observations ``(m, 2)`` [m², m·rad, rad²]."""
+        """Return the covariances ``(m, 2, 2)`` of observations ``(m, 2)`` [m², m·rad, rad²], each on its own."""
         out = np.zeros((len(range_bearing), 2, 2))
-        out[:, 0, 0] = (self.range_m + self.range_share * range_bearing[:, 0]) ** 2
+        ranges = range_bearing[:, 0]
+        out[:, 0, 0] = (self.range_m + self.range_share * ranges + self.range_square_per_m * ranges**2) ** 2
         out[:, 1, 1] = math.radians(self.bearing_deg) ** 2
         return out
+
+    def repeated(self, times: Array, ids: NDArray[np.int64] | None) -> Array:
+        """Return by what the covariance of each sighting grows ``(o,)`` for what those before it have told.
+
+        An error that lasts is not averaged out. Of a process with variance s² and correlation exp(−t/τ) a second
+        of sightings tells 1/(2 τ s²) at most, however many there are (the spectral density at zero). So a sighting
+        after a gap Δ counts 1 − exp(−Δ / ``repeat_s``) of one on its own, ``repeat_s`` being 2 τ times the share
+        of s² that lasts: all of it after a long gap, Δ / ``repeat_s`` in a dense row of them.
+
+        Parameters
+        ----------
+        times : Array
+            ``(o,)`` [s], not falling.
+        ids : NDArray[np.int64], optional
+            ``(o,)``; without them a gap is one in which nothing at all was seen.
+        """
+        if self.repeat_s == 0.0:
+            return np.ones(len(times))
+        gap = np.full(len(times), math.inf)
+        last: dict[int, float] = {}
+        now, before = -math.inf, -math.inf
+        for k, at in enumerate(times.tolist()):
+            if at > now:
+                now, before = at, now
+            of = 0 if ids is None else int(ids[k])
+            gap[k] = now - (before if ids is None else last.get(of, -math.inf))
+            last[of] = now
+        return 1.0 / np.maximum(-np.expm1(-gap / self.repeat_s), _LEAST_TOLD)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,8 +130,10 @@ class RecordedLog(Log):
         known : bool
             Hand the ids on, where the log has them.
         """
-        cov = (noise or self.observation_noise).cov(self.range_bearing)
         ids = self.ids if known else None
+        noise = noise or self.observation_noise
+        at_set = np.repeat(self.observation_times, np.diff(self.observation_ends, prepend=0))
+        cov = noise.cov(self.range_bearing) * noise.repeated(at_set, ids)[:, None, None]
         seen, sets = 0, len(self.observation_times)
         begin, now = 0, 0.0
         twists = [tuple(row) for row in self.twists.tolist()]

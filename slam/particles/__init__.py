@@ -1,5 +1,5 @@
 """Particles: what FastSLAM and DP-SLAM stand on.
 
-``filter``, ``resampling`` and ``maps`` carry FastSLAM's particles; ``ancestry``, ``shared_grid``, ``grids``,
-``match`` and ``paths`` those of DP-SLAM.
+``filter``, ``gate``, ``resampling`` and ``maps`` carry FastSLAM's particles; ``ancestry``, ``shared_grid``,
+``grids``, ``match`` and ``paths`` those of DP-SLAM.
 """

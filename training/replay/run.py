@@ -49,6 +49,7 @@ SAMPLE_S = 0.1
 
 _RUN_KINDS: dict[str, tuple[type, ...]] = {
     "association": (str,), "seed": (int,), "limit_s": (int, float), "reference": (str,),
+    "raw": (bool,),
 }  # fmt: skip
 
 
@@ -122,7 +123,7 @@ def prepare(
         values, past = read_config(config, _RUN_KINDS) if config is not None else ({}, {})
         given = {"association": association, "seed": seed, "limit_s": limit_s, "reference": reference}
         run = {"seed": 0} | past | {name: value for name, value in given.items() if value is not None}
-        log = open_log(path, robot=robot)
+        log = open_log(path, robot=robot, raw=run.get("raw", False))
         if "reference" in run:
             log = with_reference(log, run["reference"])
             run["reference"] = str(Path(run["reference"]).absolute())

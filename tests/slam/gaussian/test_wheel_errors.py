@@ -267,6 +267,28 @@ def test_landmarks_come_and_go_with_their_correlations() -> None:
     np.testing.assert_array_equal(filter_._wheels.cross[:, : n - 2], np.delete(before, [13, 14], axis=1))
 
 
+def test_wheels_of_two_sides_that_differ_bend_a_straight_way_and_do_nothing_else() -> None:
+    """Going straight, ω = v δ / l: no other component is in doubt, and the bend is found."""
+    lever, delta, sigma = 0.13, 0.02, 0.03
+    wheels = WheelErrors(LastingErrors(difference_sigma=sigma), lever, 1, 3)
+    wheels.corrected(np.array([0.4, 0.0, 0.0]))
+    np.testing.assert_allclose(
+        wheels._b @ wheels.cov @ wheels._b.T, np.diag([0.0, 0.0, (0.4 * sigma / lever) ** 2]), atol=1e-15
+    )
+    noise = OdometryNoise(lever_m=lever, lasting=LastingErrors(difference_sigma=sigma))
+    robot, rng = backend(noise), np.random.default_rng(1)
+    robot.reset(np.zeros(3))
+    pose, points, claimed = np.zeros(3), rng.uniform(-4.0, 4.0, (10, 2)), np.array([0.4, 0.0, 0.0])
+    for _ in range(100):
+        pose = move(pose, claimed + np.array([0.0, 0.0, 0.4 * delta / lever]), 0.1)
+        robot.predict(Odometry(claimed, 0.1))
+        robot.observe(Observations(seen(pose, points), np.tile(R, (10, 1, 1)), np.arange(10)))
+    assert robot.wheel_errors is not None
+    mean, cov = robot.wheel_errors
+    found = mean[:4] @ np.array([-1.0, 1.0, -1.0, 1.0]) / 4.0
+    assert found == pytest.approx(delta, abs=0.005) and math.sqrt(cov[1, 1]) < 0.2 * sigma
+
+
 def test_errors_that_cannot_be_are_no_states() -> None:
     """Of no size they change nothing, and no more do they where the states are switched off."""
     share = {"white_speed_share": NOISE.speed_share, "white_turn_share_rad_m": NOISE.turn_share_rad_m}

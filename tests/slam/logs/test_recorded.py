@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slam.geometry import compose, wrap
-from slam.logs import ObservationNoise, RecordedLog, open_log
+from slam.logs import ObservationNoise, RecordedLog, open_log, utias
 from slam.logs.recorded import group_by_time, split_holds
 from slam.logs.tables import read_table
 from slam.logs.victoria_park import car_twist, plausible
@@ -283,12 +283,67 @@ def test_a_truth_that_begins_too_late_is_refused(tmp_path):
         open_log(tmp_path)
 
 
+# ---- what the rig makes of it -----------------------------------------------------------------------------------
+
+
+def test_depths_of_the_utias_camera_become_ranges():
+    rng = np.random.default_rng(0)
+    ranges, bearings = rng.uniform(1.0, 7.0, 20), rng.uniform(-0.6, 0.6, 20)
+    depth = (0.0385 + 1.0152 * ranges) * np.cos(bearings)
+    rows = utias._measured(np.column_stack([np.full(20, 5.0), np.full(20, 63.0), depth, bearings]))
+    np.testing.assert_allclose(rows, np.column_stack([np.full(20, 4.97), np.full(20, 63.0), ranges, bearings]))
+
+
+def test_the_utias_base_follows_its_commands_late_and_not_quite():
+    commands = np.array([[0.0, 0.1, 0.0], [1.0, 0.1, 0.4], [2.0, -0.1, -0.4], [3.0, 0.02, 0.4], [4.0, 0.0, 0.4]])
+    driven = utias._driven(commands)
+    np.testing.assert_allclose(driven[0], 0.0)  # until the first command comes through
+    np.testing.assert_allclose(driven[1:, 0], commands[:, 0] + 0.19)
+    np.testing.assert_allclose(driven[1:, 1], [0.1045, 0.0685, -0.0685, 0.0, 0.0])
+    np.testing.assert_allclose(driven[1:, 2], 0.95 * commands[:, 2])
+
+
+def test_a_utias_log_is_calibrated_unless_it_is_another_rigs_or_wanted_raw(tmp_path):
+    write_utias(tmp_path)
+    assert open_log(tmp_path).observation_noise == utias.RAW_NOISE  # bearings all round: no camera's
+    measured = tmp_path / "Robot1_Measurement.dat"
+    rows = np.loadtxt(measured)
+    np.savetxt(measured, rows[np.abs(rows[:, 3]) < 1.0], fmt="%.9f")
+    log, raw = open_log(tmp_path), open_log(tmp_path, raw=True)
+    assert log.observation_noise == utias.NOISE and raw.observation_noise == utias.RAW_NOISE
+    assert log.duration_s == pytest.approx(raw.duration_s + 0.19) and "as recorded" in raw.note
+    assert np.all(log.range_bearing[:, 1] == raw.range_bearing[:, 1])
+    assert np.all(log.range_bearing[:, 0] != raw.range_bearing[:, 0])
+
+
+def test_a_repeated_sighting_tells_less():
+    noise = ObservationNoise(range_m=0.1, bearing_deg=1.0, repeat_s=2.0)
+    times, ids = np.array([0.0, 0.0, 1.0, 1.0, 11.0]), np.array([7, 8, 7, 9, 7])
+    tells = 1.0 / noise.repeated(times, ids)
+    np.testing.assert_allclose(tells, [1.0, 1.0, 1 - math.exp(-0.5), 1.0, 1 - math.exp(-5.0)])
+    np.testing.assert_allclose(1.0 / noise.repeated(times, None)[1:4], [1.0, *2 * [1 - math.exp(-0.5)]])
+    assert np.all(ObservationNoise(range_m=0.1, bearing_deg=1.0).repeated(times, ids) == 1.0)
+
+
+def test_sightings_in_a_row_tell_what_a_lasting_error_lets_them():
+    """The mean of an error with correlation exp(-t/τ) over a long time T has variance 2 τ s² / T."""
+    tau, step, count = 3.0, 0.1, 20_000
+    noise = ObservationNoise(range_m=1.0, bearing_deg=1.0, repeat_s=2.0 * tau)
+    tells = np.sum(1.0 / noise.repeated(step * np.arange(count), None))
+    lag = np.arange(1, count)
+    variance = (1.0 + 2.0 * np.sum((1.0 - lag / count) * np.exp(-lag * step / tau))) / count
+    assert 1.0 / tells == pytest.approx(variance, rel=0.02)
+
+
 # ---- real data ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("robot", "odometry_m"), [(1, 2.64), (3, 4.25)])
-def test_real_utias(robot, odometry_m):
-    log = open_log(data_folder("utias6"), robot=robot)
+@pytest.mark.parametrize(
+    ("robot", "raw", "odometry_m", "range_m"),
+    [(1, True, 2.64, 0.1), (3, True, 4.25, 0.1), (1, False, 1.86, 0.02), (3, False, 3.40, 0.02)],
+)
+def test_real_utias(robot, raw, odometry_m, range_m):
+    log = open_log(data_folder("utias6"), robot=robot, raw=raw)
     assert len(log.landmarks) == 15 and log.duration_s == pytest.approx(887.5, abs=1.0)
     compared = [i for i, t in enumerate(log.reference_times) if i % 10 == 0]
     reckoned = log.dead_reckoning()[np.searchsorted(log.odometry_times, log.reference_times[compared])]
@@ -303,7 +358,7 @@ def test_real_utias(robot, odometry_m):
             errors.append(log.range_bearing[begin:end] - expected)
         begin = end
     spread = np.median(np.abs(np.vstack(errors)), axis=0)
-    assert spread[0] < 0.1 and spread[1] < 0.01
+    assert spread[0] < range_m and spread[1] < 0.01
 
 
 def test_real_victoria_park():
