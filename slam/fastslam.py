@@ -176,7 +176,7 @@ class FastSlam(LandmarkBackend):
         best = int(np.argmax(self._weights))
         self._inherited.correct(
             self._poses[best], maps.of(best)[:, :2], known, z, match[best], config.lidar_offset_m,
-            1.0 / config.particles,
+            1.0 / effective_particles(self._weights),
         )  # fmt: skip
         return best
 

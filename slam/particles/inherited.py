@@ -67,7 +67,7 @@ class InheritedError:
         offset : float
             Of the sensor, ahead of the body's centre [m].
         drawn : float
-            Share of the drawn pose's covariance that stays as an error: 1 of one particle, 1/n of the mean of n.
+            Share of the drawn pose's covariance that stays as an error: 1/N_eff of the particles' mean.
         """
         _correct(self._p, self._size, self.motion, pose, points, covs, z, match, offset, drawn)
 
