@@ -66,8 +66,8 @@ class FastSlam(LandmarkBackend):
     """What both versions share.
 
     ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. Once all
-    particles descend from one (``ancestors``), their spread says nothing of the error that all inherit from it: the
-    covariances of the belief are no less than that error's (:mod:`slam.particles.inherited`).
+    particles descend from one (``ancestors``), their spread says nothing of the error that all inherit from it:
+    the covariances of the belief are no less than that error's (:mod:`slam.particles.inherited`).
     """
 
     config: FastSlamConfig
