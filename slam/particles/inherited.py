@@ -2,10 +2,10 @@
 
 Resampling leaves one ancestor of all but the last few updates, so the particles' spread says nothing of the error
 that was made before (Bailey, Nieto and Nebot 2006, "Consistency of the FastSLAM algorithm"). That error is not
-unknown, though. A particle is a linear filter with gains that are not the best ones: its pose is corrected as if
-every landmark it sees were known but for what was measured of it, each landmark as if the pose were. The covariance
-of a filter with *any* gain is known (Joseph's form, P ← (I - KH) P (I - KH)ᵀ + K R Kᵀ), and here K has rows for the
-pose and for the landmarks seen only: the time of an update is in proportion to the number of landmarks
+unknown, though. A particle is a linear filter whose gains are not the best ones: its pose is corrected as if its
+landmarks knew of no error but that of their own measurements, each landmark as if the pose were known. Of a filter
+with *any* gain the covariance is known (Joseph's form, P ← (I - KH) P (I - KH)ᵀ + K R Kᵀ), and here K has rows for
+the pose and the landmarks seen only: the time of an update is in proportion to the number of landmarks
 (``docs/reference/fastslam.md``).
 """
 
@@ -160,7 +160,7 @@ def _correct(
     p: Array, size: int, motion: Array, pose: Array, points: Array, covs: Array, z: Array, match: Indices,
     offset: float, drawn: float,
 ) -> None:  # fmt: skip
-    """Let the errors of the pose and of the landmarks seen go on as A e + B v + D d: v of what was seen, d drawn."""
+    """Let errors of the pose and of the landmarks seen go on as A e + B v + D d: v of what was seen, d drawn."""
     m = z.shape[0]
     slot, rows, used = np.full(points.shape[0], -1, np.int64), np.empty(3 + 2 * m, np.int64), 3
     rows[0], rows[1], rows[2] = 0, 1, 2

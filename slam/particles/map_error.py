@@ -1,11 +1,11 @@
 """What a matched pose inherits from the map it is matched to: the errors of the poses that drew it.
 
-A scan that fits a map says where the robot is in the map. In the world it is known no better than the surfaces that
-it was matched to, and they are as far off as the poses from which they were drawn. So the map is cut into square
-tiles, and each has an error of its own, that of a rigid piece: a pose's, at the tile's centre. A match is a mean of
-the motion's prior and of the tiles in sight, each weighed by the information its beams gave; drawing the scan makes
-each tile the mean of what it was and of the new pose. Both are linear in the errors, so the joint covariance follows
-from the weights that were used, best or not, in Joseph's form (``docs/reference/dp_slam.md``).
+A scan that fits a map says where the robot is in the map. In the world that is known no better than the surfaces
+it was matched to, which are as far off as the poses from which they were drawn. So the map is cut into square
+tiles, and each has an error of its own, that of a rigid piece: a pose's, at the tile's centre. A match is a mean
+of the motion's prior and of the tiles in sight, each weighed by the information its beams gave; drawing the scan
+makes each tile the mean of what it was and of the new pose. Both are linear in the errors, so the joint covariance
+follows from the weights that were used, best or not, in Joseph's form (``docs/reference/dp_slam.md``).
 """
 
 from __future__ import annotations

@@ -78,8 +78,8 @@ class ParticleMatcher:
 
         Returns
         -------
-        The information of the pose by each group's beams ``(most, 3, 3)``, and the mean square of the distances [m²]
-        from the surfaces, of the beams that count.
+        The information of the pose by each group's beams ``(most, 3, 3)``, and the mean square of the distances
+        [m²] from the surfaces, of the beams that count.
         """
         config, cell = self.config, self.config.cell_m
         count, row, col, x0, y0 = self._draw(grids, particle, points, pose)
@@ -93,7 +93,7 @@ class ParticleMatcher:
     def _draw(
         self, grids: ParticleGrids, particle: int, points: Array, pose: Array
     ) -> tuple[int, int, int, float, float]:
-        """Draw what a particle's map has near the beams' ends; return what :meth:`_window` does, and its corner [m]."""
+        """Draw what a particle's map has near the beams' ends; return as :meth:`_window`, and its corner [m]."""
         count, row, col = self._window(grids, points, pose)
         cells, evidence = self._cells[:count], self._evidence[:count]
         grids.read(particle, cells, evidence)
