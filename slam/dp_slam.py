@@ -55,7 +55,7 @@ class DpSlamConfig(BackendConfig):
     # than it does: particles that all go one way cannot close a loop (docs/reference/dp_slam.md).
     drift_m: float = 0.02
     drift_rad: float = 0.01
-    tile_m: float = 3.0  # side of the pieces of the map that have an error each, in the covariance
+    tile_m: float = 2.0  # side of the pieces of the map that have an error each, in the covariance
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
     # of no surface: what is new says less against a particle than what contradicts its map.
     unknown: float = 0.3
