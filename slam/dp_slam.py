@@ -205,13 +205,13 @@ class DpSlam(Backend):
         c, s = math.cos(pose[2]), math.sin(pose[2])
         ends = pose[:2] + points @ np.array([[c, s], [-s, c]])
         groups, tiles = error.tiles(ends)
-        if self._key:
-            infos, distance2 = self._matcher.informations(self.grids, self._lead, points, pose, groups, len(tiles))
-            motion = self._motion_cov(float(pose[2]))
-            prior = np.linalg.inv(motion + self._drift)
-            noise = distance2 / config.matching.sigma_m**2
-            draw = np.linalg.inv(prior + infos.sum(axis=0)) / self.n_eff
-            error.match(self._drawn_from, pose, motion, prior, tiles, infos, noise, draw)
+        infos, distance2 = self._matcher.informations(self.grids, self._lead, points, pose, groups, len(tiles))
+        motion = self._motion_cov(float(pose[2]))
+        prior = np.linalg.inv(motion + self._drift)
+        noise = distance2 / config.matching.sigma_m**2
+        drawn = 1.0 / self.n_eff if self._key else 0.0  # the first poses are where the motion led
+        draw = drawn * np.linalg.inv(prior + infos.sum(axis=0))
+        error.match(self._drawn_from, pose, motion, prior, tiles, infos, noise, draw)
         error.draw(pose, tiles, np.bincount(groups, minlength=len(tiles)).astype(np.float64))
         self._drawn_from = pose.copy()
 

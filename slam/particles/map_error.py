@@ -87,7 +87,10 @@ class MapError:
         gain = np.linalg.inv(prior + total)
         by_motion, by_map = gain @ prior, gain @ infos
         # e ← A e + noise of the motion, of the scan and of the draw: A's blocks side by side.
-        blocks = [by_motion @ transport(before[:2], pose[:2])]
+        # Where nothing was drawn yet, beams meet surfaces across the tile's border: the last poses drew those.
+        new = self._drawn[tiles] == 0
+        blocks = [(by_motion + by_map[new].sum(axis=0)) @ transport(before[:2], pose[:2])]
+        tiles, by_map = tiles[~new], by_map[~new]
         blocks += [k @ transport(self._centres[t], pose[:2]) for k, t in zip(by_map, tiles, strict=True)]
         rows = np.concatenate([np.arange(3), *(3 + 3 * t + np.arange(3) for t in tiles)])
         a, p = np.hstack(blocks), self.cov

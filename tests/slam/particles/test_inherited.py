@@ -182,7 +182,9 @@ def mean_nees(name: str, world: LandmarkWorld, runs: range, steps: int, **settin
     nees = []
     for seed in runs:
         backend = slam.make(name, config={**world.backend_settings(), **settings})
-        nees.append(np.mean([backend.pose_nees(s.true_pose) / 3 for s in drive_in_world(world, backend, seed, steps)]))
+        nees.append(
+            np.mean([backend.pose_nees(s.true_pose) / 3 for s in drive_in_world(world, backend, seed, steps)])
+        )
     return np.array(nees)
 
 
