@@ -162,14 +162,8 @@ def _correct(
 ) -> None:  # fmt: skip
     """Let errors of the pose and of the landmarks seen go on as A e + B v + D d: v of what was seen, d drawn."""
     m = z.shape[0]
-    slot, rows, used = np.full(points.shape[0], -1, np.int64), np.empty(3 + 2 * m, np.int64), 3
-    rows[0], rows[1], rows[2] = 0, 1, 2
-    for k in range(m):
-        i = match[k]
-        if i >= 0 and slot[i] < 0:
-            slot[i] = used
-            rows[used], rows[used + 1] = 3 + 2 * i, 4 + 2 * i
-            used += 2
+    slot, rows = _slots(match, points.shape[0])
+    used = rows.shape[0]
     # One matrix for A, B and D, side by side.
     map_of = np.zeros((used, used + 2 * m + 3))
     for j in range(used):
@@ -206,7 +200,20 @@ def _correct(
         _apply(map_of, slot[i], gain, h[k], by_point, slot[i], used + 2 * k)
         own -= gain @ back.T
     motion[:, :] = 0.0
-    _map(p, size, rows[:used], map_of, r, match, drawn * sigma)
+    _map(p, size, rows, map_of, r, match, drawn * sigma)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _slots(match: Indices, landmarks: int) -> tuple[Indices, Indices]:
+    """Return where each landmark comes in the rows that change, -1 where it does not, and those rows of P."""
+    slot, rows, used = np.full(landmarks, -1, np.int64), np.empty(3 + 2 * match.shape[0], np.int64), 3
+    rows[0], rows[1], rows[2] = 0, 1, 2
+    for i in match:
+        if i >= 0 and slot[i] < 0:
+            slot[i] = used
+            rows[used], rows[used + 1] = 3 + 2 * i, 4 + 2 * i
+            used += 2
+    return slot, rows[:used]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
