@@ -21,6 +21,8 @@ from slam.geometry import compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
 from slam.particles.grids import ParticleGrids, ScanCells
+from slam.particles.inherited import beyond, common_descent
+from slam.particles.map_error import MapError, transport
 from slam.particles.match import ParticleMatcher
 from slam.particles.paths import Paths
 from slam.particles.resampling import (
@@ -53,6 +55,7 @@ class DpSlamConfig(BackendConfig):
     # than it does: particles that all go one way cannot close a loop (docs/reference/dp_slam.md).
     drift_m: float = 0.02
     drift_rad: float = 0.01
+    tile_m: float = 2.0  # side of the pieces of the map that have an error each, in the covariance
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
     # of no surface: what is new says less against a particle than what contradicts its map.
     unknown: float = 0.3
@@ -66,6 +69,7 @@ class DpSlamConfig(BackendConfig):
         super().__post_init__()
         require(self.particles >= 1, "DpSlamConfig.particles must be at least 1")
         require(self.update_m >= 0 and self.update_rad >= 0, "DpSlamConfig.update_* must be ≥ 0")
+        require(self.tile_m > 0, "DpSlamConfig.tile_m must be > 0")
         require(self.drift_m > 0 and self.drift_rad > 0, "DpSlamConfig.drift_* must be > 0")
         require(0 < self.free <= 1 and 0 < self.unknown <= 1, "DpSlamConfig.free and unknown must be in (0, 1]")
 
@@ -74,7 +78,8 @@ class DpSlam(Backend):
     """Particles with maps of their own in one grid.
 
     ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. There are no
-    landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses.
+    landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses. The pose's covariance is no less
+    than that of the error which all particles inherit with their ancestors' map (:mod:`slam.particles.map_error`).
     """
 
     observes_landmarks = False
@@ -93,11 +98,14 @@ class DpSlam(Backend):
         self._weights = np.full(n, 1.0 / n)
         grids = CopiedGrids if config.copies else SharedGrid
         self.grids: ParticleGrids = grids(n, config.matching.cell_m)
+        self._map_error = MapError(pose_cov, config.tile_m)
+        self._origin = np.arange(n)  # the particle of the start that each one descends from
         self._matcher, self._cells = ParticleMatcher(config.matching), ScanCells()
         self._paths, self._shown = Paths(n), np.zeros((0, 3))  # poses that the grid was drawn from
         self._key: list[tuple[Scan, NDArray[np.int16]]] = []  # one scan an update
         self._odometry = ScanOdometry(config.scan_odometry, config.matching, config.odometry)
-        self._lead = 0
+        self._lead, self._drawn_from = 0, pose.copy()  # the lead's pose at the last update
+        self._drift = np.diag(np.square([config.drift_m, config.drift_m, config.drift_rad]))
         self._updates = 0  # since the last resampling
         self.n_eff = float(n)
         self.resampled = False
@@ -155,8 +163,9 @@ class DpSlam(Backend):
             self._draw_poses(guesses, points)
         else:
             self._poses = guesses
-        self._odometry.settle()
         ancestors = self._choose_survivors()
+        self._follow_the_error(points)
+        self._odometry.settle()
         for i in np.unique(ancestors):  # the others' maps are forgotten at once
             self._cells.trace(self.grids.lattice, self._poses[i], config.lidar_offset_m, points)
             self.grids.write(int(i), self._cells)
@@ -166,13 +175,10 @@ class DpSlam(Backend):
 
     def _draw_poses(self, guesses: Array, points: Array) -> None:
         """Sample from the Gaussian around each particle's best fit; its weight is the evidence, at the peak."""
-        config, odometry = self.config, self._odometry
-        drift = np.diag(np.square([config.drift_m, config.drift_m, config.drift_rad]))
+        config = self.config
         normals = self._rng.standard_normal(self._poses.shape)
         for i, guess in enumerate(guesses):
-            # From the local frame, in which the covariance is kept, to the particle's.
-            r = _about_z(float(guess[2] - odometry.pose[2]))
-            info = np.linalg.inv(r @ odometry.cov @ r.T + drift)
+            info = np.linalg.inv(self._motion_cov(float(guess[2])) + self._drift)
             best, curvature, log_likelihood = self._matcher.fit(
                 self.grids, i, points, guess, info, unknown=config.unknown, free=config.free
             )
@@ -181,6 +187,33 @@ class DpSlam(Backend):
             best[2] = float(wrap(best[2]))
             self._poses[i] = best
         normalise(self._log_weights, self._weights)
+
+    def _motion_cov(self, heading: float) -> Array:
+        """Return the covariance ``(3, 3)`` of the motion since the last update, for a particle that heads so."""
+        # From the local frame, in which the covariance is kept, to the particle's.
+        r = _about_z(heading - float(self._odometry.pose[2]))
+        cov: Array = r @ self._odometry.cov @ r.T
+        return cov
+
+    def _follow_the_error(self, points: Array) -> None:
+        """Follow the error that all inherit: how the lead was matched, and from where its scan will be drawn.
+
+        The match was weighed by ``sigma_m``; how exact it is here, the distances of the beams' ends from the map
+        tell. Of a drawn pose's covariance 1/N_eff stays as an error.
+        """
+        config, error, pose = self.config, self._map_error, self._poses[self._lead]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        ends = pose[:2] + points @ np.array([[c, s], [-s, c]])
+        groups, tiles = error.tiles(ends)
+        infos, distance2 = self._matcher.informations(self.grids, self._lead, points, pose, groups, len(tiles))
+        motion = self._motion_cov(float(pose[2]))
+        prior = np.linalg.inv(motion + self._drift)
+        noise = distance2 / config.matching.sigma_m**2
+        drawn = 1.0 / self.n_eff if self._key else 0.0  # the first poses are where the motion led
+        draw = drawn * np.linalg.inv(prior + infos.sum(axis=0))
+        error.match(self._drawn_from, pose, motion, prior, tiles, infos, noise, draw)
+        error.draw(pose, tiles, np.bincount(groups, minlength=len(tiles)).astype(np.float64))
+        self._drawn_from = pose.copy()
 
     def _choose_survivors(self) -> NDArray[np.int64]:
         """Return whom each particle descends from after this update; ``resampled`` tells whether that is news."""
@@ -200,7 +233,7 @@ class DpSlam(Backend):
         self._lead = int(np.flatnonzero(ancestors == self._lead)[0])
         self.grids.resample(ancestors)
         self._paths.resample(ancestors)
-        self._poses = self._poses[ancestors]
+        self._poses, self._origin = self._poses[ancestors], self._origin[ancestors]
         self._weights[:] = 1.0 / n
         self._log_weights[:] = -math.log(n)
         self._updates = 0
@@ -224,7 +257,7 @@ class DpSlam(Backend):
     def _moments(self) -> tuple[Array, Array]:
         """Return mean and covariance of the particles, carried along by the motion since their last update."""
         if self._believed is None:
-            config, odometry, motion = self.config, self._odometry, self._motion()
+            config, motion = self.config, self._motion()
             c, s = np.cos(self._poses[:, 2]), np.sin(self._poses[:, 2])
             now = self._poses + np.column_stack(
                 [c * motion[0] - s * motion[1], s * motion[0] + c * motion[1], np.full(len(c), motion[2])]
@@ -232,8 +265,10 @@ class DpSlam(Backend):
             mean, cov = np.zeros(3), np.zeros((3, 3))
             floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
             pose_moments(now, np.zeros((len(now), 3, 3)), self._weights, floor, mean, cov)
-            r = _about_z(float(mean[2] - odometry.pose[2]))
-            self._believed = mean, cov + r @ odometry.cov @ r.T
+            moved = transport(self._drawn_from[:2], mean[:2])
+            inherited = moved @ self._map_error.pose_cov @ moved.T
+            beyond(inherited[None], cov[None], common_descent(self._origin, self._weights))
+            self._believed = mean, cov + self._motion_cov(float(mean[2]))
         return self._believed
 
     @property

@@ -26,6 +26,7 @@ from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibi
 from slam.landmarks.known_ids import rigid_fit
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.gate import refuse_unlikely
+from slam.particles.inherited import InheritedError, beyond, common_descent
 from slam.particles.maps import ParticleMaps, associate, refresh_extents
 from slam.particles.resampling import (
     ResamplingPolicy,
@@ -68,9 +69,9 @@ class FastSlamConfig(BackendConfig):
 class FastSlam(LandmarkBackend):
     """What both versions share.
 
-    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. The
-    covariances are those of the particles there are: once all descend from one (``ancestors``), they say nothing
-    of the error that all inherit from it, and NEES grows with the length of the way.
+    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. Once all
+    particles descend from one (``ancestors``), their spread says nothing of the error that all inherit from it:
+    the covariances of the belief are no less than that error's (:mod:`slam.particles.inherited`).
     """
 
     config: FastSlamConfig
@@ -87,6 +88,7 @@ class FastSlam(LandmarkBackend):
         self._log_weights = np.full(n, -math.log(n))
         self._weights = np.full(n, 1.0 / n)
         self._origin = np.arange(n)  # the particle of the start that each one descends from
+        self._inherited = InheritedError(pose_cov)
         self._maps = ParticleMaps(n)
         self._begin(self.config.landmarks)
         self._match = np.zeros((n, MAX_OBSERVATIONS), np.int64)
@@ -101,7 +103,9 @@ class FastSlam(LandmarkBackend):
     def predict(self, odometry: Odometry) -> None:
         """Move every particle on by what the wheels measured (theory.md A, predict)."""
         vx, vy, omega, var_v, var_w = self._measured(odometry, self.config.odometry)
-        self._move(np.array([vx, vy, omega]), odometry.dt, var_v, var_w)
+        twist = np.array([vx, vy, omega])
+        self._inherited.predict(self._mean, twist, odometry.dt, var_v, var_w)
+        self._move(twist, odometry.dt, var_v, var_w)
         self._believe()
 
     @abc.abstractmethod
@@ -169,7 +173,9 @@ class FastSlam(LandmarkBackend):
         ])  # fmt: skip
         for i in range(len(self._poses)):
             self._poses[i] = rigid_fit(ahead, self._maps.of(i)[rows, :2])
-        self._covs[:] = np.diag([ANYWHERE_M**2, ANYWHERE_M**2, math.pi**2])
+        anywhere = np.diag([ANYWHERE_M**2, ANYWHERE_M**2, math.pi**2])
+        self._covs[:] = anywhere
+        self._inherited.widen(anywhere)
         match = self._match_buffer(len(rows))
         match[:] = rows
         self._correct(found.rows, match)
@@ -177,6 +183,7 @@ class FastSlam(LandmarkBackend):
 
     def _drop(self, row: int) -> None:
         self._maps.drop(row)
+        self._inherited.drop(row)
         self._book.drop(row)
 
     def _match_buffer(self, observations: int) -> Indices:
@@ -200,6 +207,7 @@ class FastSlam(LandmarkBackend):
         if not len(z):
             return int(np.argmax(self._log_weights))
         maps.reserve(match.size)
+        known = maps.of(int(np.argmax(self._log_weights)))[:, 2:]
         drawn = not self._covs.any()
         normals = np.zeros_like(self._poses) if drawn else self._rng.standard_normal(self._poses.shape)
         correct_particles(
@@ -208,7 +216,12 @@ class FastSlam(LandmarkBackend):
         )  # fmt: skip
         refresh_extents(maps.table, maps.records, match, maps.extents)
         normalise(self._log_weights, self._weights)
-        return int(np.argmax(self._weights))
+        best = int(np.argmax(self._weights))
+        self._inherited.correct(
+            self._poses[best], maps.of(best)[:, :2], known, z, match[best], config.lidar_offset_m,
+            1.0 / effective_particles(self._weights),
+        )  # fmt: skip
+        return best
 
     def _resample(self, observations: int) -> None:
         self.resampled = False
@@ -254,6 +267,7 @@ class FastSlam(LandmarkBackend):
         usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
         if far_better(self._fit(pose, cov + wide, landmarks, z, found, scan), usual_fit):
             self._covs += wide
+            self._inherited.widen(wide)
             match[:] = found
 
     def _fit(self, pose: Array, cov: Array, landmarks: Array, z: Array, match: Indices, scan: Scan) -> float:
@@ -280,15 +294,17 @@ class FastSlam(LandmarkBackend):
         direction, extent = float(z[DIRECTION]) + float(self._poses[best, 2]), (float(z[EDGE]), 0.0)
         self._book.add(float(z[KIND]), direction, known_id, extent=extent)
         self._maps.add(self._poses, z, self.config.lidar_offset_m)
+        self._inherited.add(self._poses[best], z, self.config.lidar_offset_m)
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
     def _believe(self) -> None:
         """Sum the particles up; of the landmarks, only when somebody asks."""
         config = self.config
-        self._mean, self._cov = np.zeros(3), np.zeros((3, 3))
+        self._mean, self._spread = np.zeros(3), np.zeros((3, 3))
         floor = np.array([config.start_sigma_m, config.start_sigma_m, config.start_sigma_rad])
-        pose_moments(self._poses, self._covs, self._weights, floor, self._mean, self._cov)
+        pose_moments(self._poses, self._covs, self._weights, floor, self._mean, self._spread)
+        self._cov: Array | None = None
         self._mixture: tuple[Array, Array] | None = None
 
     def _landmark_moments(self) -> tuple[Array, Array]:
@@ -296,6 +312,7 @@ class FastSlam(LandmarkBackend):
         # and does not jump (nor make the map be redrawn) each time another particle becomes the heaviest.
         if self._mixture is None:
             self._mixture = self._maps.mixture(self._weights)
+            beyond(self._inherited.of_landmarks(), self._mixture[1], common_descent(self._origin, self._weights))
         return self._mixture
 
     @property
@@ -315,6 +332,9 @@ class FastSlam(LandmarkBackend):
     @property
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
+        if self._cov is None:
+            self._cov = self._spread.copy()
+            beyond(self._inherited.cov[None, :3, :3], self._cov[None], common_descent(self._origin, self._weights))
         return self._cov.copy()
 
     def near_landmarks(self, out: NDArray[np.float32]) -> None:

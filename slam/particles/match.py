@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.grids.match_kernels import climb, prior_loss
+from slam.grids.match_kernels import climb, prior_loss, slope
 from slam.grids.scan_matching import MatchConfig, Values, stamps_of
 from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
 
@@ -54,20 +54,52 @@ class ParticleMatcher:
         -------
         The pose, the information there ``(3, 3)``, and the log-likelihood of scan and motion [nat].
         """
-        lattice, config = grids.lattice, self.config
-        count, row, col = self._window(grids, points, pose)
-        cells, evidence = self._cells[:count], self._evidence[:count]
-        grids.read(particle, cells, evidence)
-        draw_surfaces(self._values, self._plane, row, col, cells, evidence, stamps_of(config))
-        cell = lattice.cell_m
-        x0, y0 = (lattice.col + col + 0.5) * cell, (lattice.row + row + 0.5) * cell
+        config, cell = self.config, self.config.cell_m
+        count, row, col, x0, y0 = self._draw(grids, particle, points, pose)
         best, curvature = pose.copy(), np.zeros((3, 3))
         climb(self._values, x0, y0, cell, points, best, pose, info, config.gain, config.iterations, curvature)
         log_likelihood = weigh(
             self._values, self._plane, x0, y0, cell, points, best, pose, info, config.beam_weight, unknown, free
         )
-        wipe(self._values, self._plane, row, col, cells)
+        wipe(self._values, self._plane, row, col, self._cells[:count])
         return best, curvature, log_likelihood
+
+    def informations(
+        self, grids: ParticleGrids, particle: int, points: Array, pose: Array, groups: NDArray[np.int64], most: int
+    ) -> tuple[Array, float]:
+        """Tell the parts of the map apart that a fit's information is from.
+
+        Parameters
+        ----------
+        points, pose : Array
+            As of :meth:`fit`, and where it ended.
+        groups, most
+            The group ``(n,)`` of each of the ``points``, and how many there are.
+
+        Returns
+        -------
+        The information of the pose by each group's beams ``(most, 3, 3)``, and the mean square of the distances
+        [m²] from the surfaces, of the beams that count.
+        """
+        config, cell = self.config, self.config.cell_m
+        count, row, col, x0, y0 = self._draw(grids, particle, points, pose)
+        out, gradient = np.zeros((most, 3, 3)), np.zeros(3)
+        for group in range(most):
+            slope(self._values, x0, y0, cell, points[groups == group], pose, gradient, out[group])
+        distance2 = misfit(self._values, x0, y0, cell, points, pose, config.smooth_m)
+        wipe(self._values, self._plane, row, col, self._cells[:count])
+        return config.gain * out, distance2
+
+    def _draw(
+        self, grids: ParticleGrids, particle: int, points: Array, pose: Array
+    ) -> tuple[int, int, int, float, float]:
+        """Draw what a particle's map has near the beams' ends; return as :meth:`_window`, and its corner [m]."""
+        count, row, col = self._window(grids, points, pose)
+        cells, evidence = self._cells[:count], self._evidence[:count]
+        grids.read(particle, cells, evidence)
+        draw_surfaces(self._values, self._plane, row, col, cells, evidence, stamps_of(self.config))
+        lattice, cell = grids.lattice, grids.lattice.cell_m
+        return count, row, col, (lattice.col + col + 0.5) * cell, (lattice.row + row + 0.5) * cell
 
     def _window(self, grids: ParticleGrids, points: Array, pose: Array) -> tuple[int, int, int]:
         """List the wanted cells; return how many, and the array cell that the window begins at."""
@@ -167,3 +199,20 @@ def wipe(values: Values, plane: Bytes, row: int, col: int, cells: Ints) -> None:
     for k in range(cells.shape[0]):
         values[cells[k, 0] - row, cells[k, 1] - col] = 0.0
         plane[cells[k, 0] - row, cells[k, 1] - col] = _UNWANTED
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def misfit(values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array, smooth: float) -> float:
+    """Return the mean d² of the field's exp(-d²/2s²) under the beams' ends, each weighed by the field itself.
+
+    So a beam counts as much as it does in the fit, and one that met something unknown does not.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    total = weight = 0.0
+    for k in range(points.shape[0]):
+        j = math.floor((pose[0] + c * points[k, 0] - s * points[k, 1] - x0) / cell + 0.5)
+        i = math.floor((pose[1] + s * points[k, 0] + c * points[k, 1] - y0) / cell + 0.5)
+        if 0 <= i < values.shape[0] and 0 <= j < values.shape[1] and values[i, j] > 0.1:
+            total -= 2.0 * smooth * smooth * values[i, j] * math.log(values[i, j])
+            weight += values[i, j]
+    return total / weight if weight > 0.0 else 0.0

@@ -200,6 +200,24 @@ def test_pose_and_map_in_a_room() -> None:
     np.testing.assert_allclose(backend.path[-1][:2], backend.pose[:2], atol=0.25)
 
 
+def test_the_covariance_is_true_within_a_factor_of_three() -> None:
+    """Where all particles descend from one, so that it is the inherited error's."""
+    nees = []
+    for seed in range(4):
+        backend = small()
+        start = pose = np.array([2.0, 2.0, 0.3])
+        rng = np.random.default_rng(seed)
+        backend.reset(seed=seed)
+        backend._origin[:] = 0
+        backend.update(room_scan(compose(pose, np.array([OFFSET, 0.0, 0.0])), rng))
+        for k in range(80):
+            pose, odometry = drive(pose, circle_twist(k), (0.02, 0.03), rng)
+            backend.predict(odometry)
+            backend.update(room_scan(compose(pose, np.array([OFFSET, 0.0, 0.0])), rng))
+            nees.append(backend.pose_nees(compose(inverse(start), pose)) / 3)
+    assert 0.2 < np.mean(nees) < 3
+
+
 def test_shared_and_copied_maps_give_the_same_filter() -> None:
     """Poses, weights and maps bit for bit, with much resampling."""
     often = {"resampling": {"when": "every_k", "every": 2}, "particles": 6}

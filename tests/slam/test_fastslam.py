@@ -205,6 +205,7 @@ def test_shared_maps_are_what_deep_copies_would_be(seed: int) -> None:
         _, _, _, z, _ = random_sight(int(rng.integers(10_000)))
         if what == "add":
             maps.add(backend._poses, z, OFFSET)
+            backend._inherited.add(backend._poses[0], z, OFFSET)
             for i in range(n):
                 single = ParticleMaps(1)
                 single.add(backend._poses[i : i + 1], z, OFFSET)
@@ -227,6 +228,7 @@ def test_shared_maps_are_what_deep_copies_would_be(seed: int) -> None:
         elif what == "drop" and maps.count:
             row = int(rng.integers(maps.count))
             maps.drop(row)
+            backend._inherited.drop(row)
             for landmarks in alone:
                 del landmarks[row]
         check_references(maps)
@@ -465,6 +467,7 @@ def test_dropped_landmarks_leave_the_rest_and_their_ids(kind: type[FastSlam]) ->
     np.testing.assert_allclose(out[:, 2], before.landmark_cov[order, 0, 0], rtol=0.1, atol=1e-6)
     assert out[:, 5].tolist() == [1.0] * 32
     backend._maps.drop(2)
+    backend._inherited.drop(2)
     backend._book.drop(2)
     backend._believe()
     keep = [i for i in range(40) if i != 2]
