@@ -1,0 +1,242 @@
+"""Pose-graph SLAM, backend ``graph-slam``."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.backend import Backend
+from slam.belief import Belief
+from slam.features.surfaces import MAX_LINES
+from slam.geometry import compose, inverse, wrap
+from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
+from slam.graph.patches import Patch, new_patches
+from slam.graph.pose_graph import PoseGraph
+from slam.graph.settings import GraphSlamConfig
+from slam.graph.surfaces import BeamEnds, beam_ends
+from slam.graph.window import Window
+from slam.motion import predict_robot
+from slam.types import Observations, Odometry, Scan
+
+__all__ = ["GraphSlam"]
+
+Array = NDArray[np.float64]
+
+_SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
+_EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an inverse
+
+
+class GraphSlam(Backend):
+    """Key scans, and the patches each was the first to see, in a sparse graph."""
+
+    observes_landmarks = False
+    config: GraphSlamConfig
+
+    def __init__(self, config: GraphSlamConfig | None = None) -> None:
+        super().__init__(config or GraphSlamConfig())
+        self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        del seed
+        self.graph = PoseGraph(pose, pose_cov)
+        self.window = Window(pose, pose_cov)
+        self._patches: dict[int, Patch] = {}  # node → patch
+        self._key_nodes: list[int] = []  # nodes of key scans, in order of time
+        self._map: SurfaceMap | None = None
+        self._motion, self._upper = np.zeros(3), np.zeros((3, 3))  # since the key scan, in its frame
+        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
+        self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since the key scan
+        self._twist = (0.0, 0.0, 0.0)
+        self._last = pose.copy()  # where the last scan was aligned
+        self._mean, self._cov = pose.copy(), pose_cov.copy()
+        self._drawn: list[tuple[Scan, NDArray[np.int16]]] = []
+        self._drawn_from: list[tuple[int, Array]] = []  # node, and the pose as seen from it
+        self._shown = np.zeros((0, 3))
+        self.last_links: Links | None = None
+
+    # ---- the steps -----------------------------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured."""
+        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
+        dt, noise = odometry.dt, self.config.odometry
+        slip = noise.slip(self._twist, twist, dt) if dt > 0 else 0.0
+        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
+        predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
+        predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
+        self._twist = twist
+        way, turn = self._claimed
+        self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
+        self._ahead()
+
+    def _ahead(self) -> None:
+        pose, rows = self.window.ahead(self._motion, _full(self._upper))
+        self._mean, self._cov = pose, rows[:, :3]
+
+    def update(self, scan: Scan) -> None:
+        """Align the scan with the patches in reach; where the robot has moved on, make it a key scan."""
+        config = self.config
+        self.extractor.extract(scan)
+        ends = beam_ends(
+            scan, self.extractor, offset_m=config.lidar_offset_m, reach_m=config.reach_m,
+            sigma_m=config.features.range_sigma_m, rough_m=config.rough_m,
+        )  # fmt: skip
+        if self._map is None:
+            self._key_nodes.append(0)
+            self._add_patches(ends, None)
+        else:
+            self._follow(ends)
+        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
+        self._draw_it(scan)
+
+    def _follow(self, ends: BeamEnds) -> None:
+        assert self._map is not None
+        config, window = self.config, self.window
+        guess = compose(self._last, self._step)
+        turned = _about_z(float(self._last[2]))
+        prior = turned @ _full(self._step_upper) @ turned.T + np.diag([1e-5, 1e-5, 1e-6])
+        found = align(self._map, ends, guess, prior_info=np.linalg.inv(prior), gate_m=config.gate_m)
+        found_links = links(self._map, ends, found, window.frames, self._common)
+        self.last_links = found_links
+        motion_cov = _full(self._upper) + _EXACT * np.eye(3)
+        pose, rows = window.ahead(self._motion, motion_cov)
+        mean, cov = window.corrected(found.pose, found_links, pose, rows)
+        change = mean - pose
+        change[2] = float(wrap(change[2]))
+        spread = rows[:, :3] - cov + _EXACT * np.eye(3)
+        self.spin = float(change @ np.linalg.solve(spread, change))
+        if self.spin > _SPUN:
+            way, turn = self._claimed
+            lost = np.square([way, way, max(turn, way / config.odometry.lever_m)])
+            self._upper = self._upper + np.diag(lost)
+            motion_cov = _full(self._upper) + _EXACT * np.eye(3)
+            pose, rows = window.ahead(self._motion, motion_cov)
+            mean, cov = window.corrected(found.pose, found_links, pose, rows)
+        self._mean, self._cov = mean, cov
+        self._last = found.pose
+        self.found = found
+        if self._moved_on():
+            self._make_key(ends, found, found_links, motion_cov)
+
+    def _moved_on(self) -> bool:
+        x, y, theta = self._motion.tolist()
+        return math.hypot(x, y) >= self.config.key_m or abs(theta) >= self.config.key_rad
+
+    def _make_key(self, ends: BeamEnds, found: Alignment, seen: Links, motion_cov: Array) -> None:
+        window, graph = self.window, self.graph
+        before = self._key_nodes[-1]
+        window.step(self._motion, motion_cov)
+        window.correct(found.pose, seen)
+        node = graph.add_node(window.pose)
+        self._key_nodes.append(node)
+        graph.add_link(before, node, self._motion, np.linalg.inv(motion_cov))
+        for k, p in enumerate(seen.patches.tolist()):
+            graph.add_link(
+                int(window.nodes[p]), node, seen.relative[k], seen.info[k], seen.gradient[k]
+            )
+        self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
+        graph.poses[window.nodes] = window.frames
+        self._last = window.pose.copy()
+        self._leave_behind()
+        self._add_patches(ends, found)
+        self._mean, self._cov = window.pose.copy(), window.cov[:3, :3].copy()
+
+    def _add_patches(self, ends: BeamEnds, found: Alignment | None) -> None:
+        config = self.config
+        unexplained = ends.spacing <= config.spacing_m
+        if found is not None:
+            unexplained &= found.beside < 0
+        common = config.features.wall_sigma_m**2, config.common_m**2
+        for patch in new_patches(ends, unexplained, common_var=common):
+            node = self.graph.add_node(self.window.pose)
+            self._patches[node] = patch
+            self.graph.add_link(self._key_nodes[-1], node, np.zeros(3), patch.info)
+            self.window.add(node, patch.info)
+        self._chart()
+
+    def _leave_behind(self) -> None:
+        """Let patches far away leave the window."""
+        window = self.window
+        if len(window.nodes) <= self.config.patches:
+            return
+        far = np.array([
+            np.hypot(*(_placed(frame, self._patches[node].centre[None])[0] - window.pose[:2]))
+            for frame, node in zip(window.frames, window.nodes.tolist(), strict=True)
+        ])  # fmt: skip
+        kept = far <= self.config.window_m
+        window.keep(kept)
+
+    def _chart(self) -> None:
+        """Put the window's patches where they are believed now, for the next scans to be held against."""
+        window, patches = self.window, [self._patches[node] for node in self.window.nodes.tolist()]
+        sizes = np.array([len(p.points) for p in patches], np.int64)
+        number = np.repeat(np.arange(len(patches)), sizes)
+        points = np.concatenate([np.zeros((0, 2)), *(p.points for p in patches)])
+        normals = np.concatenate([np.zeros((0, 2)), *(p.normals for p in patches)])
+        reach = np.concatenate([np.zeros(0), *(p.reach for p in patches)])
+        frames = window.frames[number]
+        c, s = np.cos(frames[:, 2]), np.sin(frames[:, 2])
+        turn = lambda v: np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])  # noqa: E731
+        self._map = SurfaceMap(frames[:, :2] + turn(points), turn(normals), reach, number)
+        config = self.config
+        straight = np.array([p.straight for p in patches], bool)
+        self._common = np.where(straight, config.features.wall_sigma_m**2, config.common_m**2)
+
+    # ---- the map that is shown -----------------------------------------------------------------------------
+
+    def _draw_it(self, scan: Scan) -> None:
+        body, surface = self._mean, self.extractor.surface
+        sensor = self.sensor_pose(body)
+        self.grid.integrate(
+            sensor, scan, surface, body=(float(body[0]), float(body[1]), self.config.body_radius_m)
+        )
+        x, y, theta = sensor.tolist()
+        if self.key_scans.wants(x, y, theta):
+            self.key_scans.keep(sensor, scan, surface, np.zeros(0, np.int64), np.zeros((0, 2)))
+
+    def observe(self, observations: Observations) -> None:
+        """Refuse: surfaces have no use for landmark observations."""
+        raise ValueError(
+            "graph-slam maps surfaces, not landmarks: it takes scans (`update`), not landmark observations; "
+            "use ekf or fastslam2 for those"
+        )
+
+    # ---- the belief ----------------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Array:
+        """Pose mean ``(3,)``."""
+        return self._mean.copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``."""
+        return self._cov.copy()
+
+    @property
+    def belief(self) -> Belief:
+        """Pose and grid; landmarks are empty, and there is no joint covariance."""
+        return Belief(
+            pose=self.pose,
+            pose_cov=self.pose_cov,
+            landmarks=np.zeros((0, 2)),
+            landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64),
+            grid=self.grid,
+        )
+
+
+def _full(upper: Array) -> Array:
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).T, np.float64)
+
+
+def _about_z(turn: float) -> Array:
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _placed(pose: Array, points: Array) -> Array:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    return np.asarray(points @ np.array([[c, s], [-s, c]]) + pose[:2], np.float64)

@@ -1,0 +1,96 @@
+"""What a key scan adds to the map: the surfaces that no patch in reach explains, each a patch of its own.
+
+A patch is a rigid piece of surface in the frame of the key scan that saw it first. Where that scan's noise puts
+it is an error of the patch alone: the beams that make a patch link the scan to nothing else, so that no beam's
+noise counts twice, and every later scan held against the patch shares the one error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.features.surfaces import MAX_LINES
+from slam.graph.surfaces import BeamEnds
+
+__all__ = ["Patch", "new_patches"]
+
+Array = NDArray[np.float64]
+
+_SAMPLES_M = 0.1  # between the points that stand for a straight surface
+_FEWEST = 4  # beams that make a patch
+_PRIOR_SIGMA = 0.02  # [m, rad] of a patch where the scan says nothing, as along a wall: nothing is held against it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patch:
+    """Surface points in the frame of a key scan, and the information of where they are."""
+
+    points: Array  # (m, 2) [m]
+    normals: Array  # (m, 2) towards free space
+    reach: Array  # (m,) [m] along the surface, to either side
+    info: Array  # (3, 3) of the patch's pose relative to the key scan's
+    straight: bool
+
+    @property
+    def centre(self) -> Array:
+        """Mean of the points ``(2,)`` [m]."""
+        return np.asarray(self.points.mean(axis=0), np.float64)
+
+
+def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: tuple[float, float]) -> list[Patch]:
+    """Return the patches that a scan's unexplained beams make.
+
+    Parameters
+    ----------
+    unexplained : NDArray[np.bool_]
+        ``(n,)`` beams that nothing known is near, exact enough to stand for a surface.
+    common_var : tuple
+        [m²] that the beams on one straight, and on one rough, surface have in common.
+    """
+    made: list[Patch] = []
+    rest: list[tuple[Array, Array, Array, Array]] = []
+    for label in np.unique(ends.surface[unexplained]):
+        rows = np.flatnonzero(unexplained & (ends.surface == label))
+        if len(rows) < _FEWEST:
+            continue
+        straight = bool(label < MAX_LINES)
+        info = _information(ends, rows, common_var[0 if straight else 1])
+        points, normals, reach = _straight(ends, rows) if straight else _contour(ends, rows)
+        if straight and len(rows) >= 2 * _FEWEST:
+            made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, True))
+        else:
+            rest.append((points, normals, reach, info))
+    if rest:
+        points, normals, reach = (np.concatenate([piece[k] for piece in rest]) for k in range(3))
+        info = np.sum([piece[3] for piece in rest], axis=0)
+        made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, False))
+    return made
+
+
+def _information(ends: BeamEnds, rows: NDArray[np.int64], common: float) -> Array:
+    n, p, weight = ends.normals[rows], ends.on[rows], 1.0 / ends.var[rows]
+    j = np.column_stack([n, n[:, 1] * p[:, 0] - n[:, 0] * p[:, 1]])
+    return np.asarray((j * weight[:, None]).T @ j / (1.0 + common * weight.sum()), np.float64)
+
+
+def _straight(ends: BeamEnds, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    """Return points along a line, as far as beams ended on it without a gap."""
+    normal = ends.normals[rows[0]]
+    along = np.array([-normal[1], normal[0]])
+    first = ends.on[rows[0]]
+    t = np.sort((ends.on[rows] - first) @ along)
+    gap = np.maximum(0.3, 3.0 * float(ends.spacing[rows].max()))
+    pieces = np.split(t, np.flatnonzero(np.diff(t) > gap) + 1)
+    at = np.concatenate([
+        np.linspace(piece[0], piece[-1], max(2, int(np.ceil((piece[-1] - piece[0]) / _SAMPLES_M)) + 1))
+        for piece in pieces if len(piece) > 1
+    ] or [t[:1]])  # fmt: skip
+    points = first + at[:, None] * along
+    return points, np.tile(normal, (len(at), 1)), np.full(len(at), 0.5 * _SAMPLES_M)
+
+
+def _contour(ends: BeamEnds, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+    return ends.on[rows], ends.normals[rows], 0.6 * ends.spacing[rows]

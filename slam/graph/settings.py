@@ -1,0 +1,32 @@
+"""Settings of ``graph-slam``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from slam.backend import BackendConfig
+from slam.settings import require
+
+__all__ = ["GraphSlamConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraphSlamConfig(BackendConfig):
+    """Pose-graph SLAM: key scans, what a beam is believed, when a loop closes."""
+
+    key_m: float = 0.4  # a scan becomes a key scan when the robot has moved …
+    key_rad: float = 0.5  # … or turned so far since the last
+    reach_m: float = 20.0  # beams that end farther are not used
+    # Beams farther apart on a surface than this do not make a patch of it: a better view will come.
+    spacing_m: float = 0.12
+    rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
+    common_m: float = 0.003  # … and which all beams of a scan on one patch of it have in common
+    gate_m: float = 0.1  # farthest from its surface that a beam may end, before the alignment
+    patches: int = 60  # in the window at most
+    window_m: float = 9.0  # patches farther from the robot leave it
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.key_m > 0 and self.key_rad > 0, "GraphSlamConfig.key_* must be > 0")
+        require(self.spacing_m > 0 and self.reach_m > 0, "GraphSlamConfig.spacing_m and reach_m must be > 0")
+        require(self.rough_m >= 0 and self.common_m >= 0, "GraphSlamConfig.rough_m and common_m must be ≥ 0")
