@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 from slam.backend import Backend
 from slam.belief import Belief
 from slam.features.surfaces import MAX_LINES
-from slam.geometry import compose, inverse, wrap
+from slam.geometry import compose, relative, wrap
 from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
 from slam.graph.patches import Patch, new_patches
 from slam.graph.pose_graph import PoseGraph
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.graph.window import Window
+from slam.grids.scan_matching import LikelihoodField, search
 from slam.motion import predict_robot
 from slam.types import Observations, Odometry, Scan
 
@@ -51,9 +52,8 @@ class GraphSlam(Backend):
         self._twist = (0.0, 0.0, 0.0)
         self._last = pose.copy()  # where the last scan was aligned
         self._mean, self._cov = pose.copy(), pose_cov.copy()
-        self._drawn: list[tuple[Scan, NDArray[np.int16]]] = []
-        self._drawn_from: list[tuple[int, Array]] = []  # node, and the pose as seen from it
-        self._shown = np.zeros((0, 3))
+        self._at: list[int] = []  # the key scan before each update …
+        self._from: list[Array] = []  # … and the pose as seen from it
         self.last_links: Links | None = None
 
     # ---- the steps -----------------------------------------------------------------------------------------
@@ -89,6 +89,8 @@ class GraphSlam(Backend):
         else:
             self._follow(ends)
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
+        self._at.append(self._key_nodes[-1])
+        self._from.append(relative(self.window.pose[None], self._mean[None])[0])
         self._draw_it(scan)
 
     def _follow(self, ends: BeamEnds) -> None:
@@ -97,7 +99,11 @@ class GraphSlam(Backend):
         guess = compose(self._last, self._step)
         turned = _about_z(float(self._last[2]))
         prior = turned @ _full(self._step_upper) @ turned.T + np.diag([1e-5, 1e-5, 1e-6])
-        found = align(self._map, ends, guess, prior_info=np.linalg.inv(prior), gate_m=config.gate_m)
+        prior_info = np.asarray(np.linalg.inv(prior), np.float64)
+        start = guess
+        if max(prior[0, 0], prior[1, 1]) > config.search_sigma_m**2 or prior[2, 2] > config.search_sigma_rad**2:
+            start = self._searched(ends, guess, prior_info)
+        found = align(self._map, ends, start, prior=guess, prior_info=prior_info, gate_m=config.gate_m)
         found_links = links(self._map, ends, found, window.frames, self._common)
         self.last_links = found_links
         motion_cov = _full(self._upper) + _EXACT * np.eye(3)
@@ -119,6 +125,15 @@ class GraphSlam(Backend):
         self.found = found
         if self._moved_on():
             self._make_key(ends, found, found_links, motion_cov)
+
+    def _searched(self, ends: BeamEnds, guess: Array, prior_info: Array) -> Array:
+        """Return the best pose ``(3,)`` of the window of ``MatchConfig`` around a guess."""
+        assert self._map is not None
+        matching = self.config.matching
+        near = np.hypot(*(self._map.points - guess[:2]).T) < self.config.window_m + 2.0
+        field = LikelihoodField(matching, self._map.points[near])
+        every = max(1, len(ends) // matching.beams)
+        return search(field, ends.points[::every], guess, matching, prior_info=prior_info)
 
     def _moved_on(self) -> bool:
         x, y, theta = self._motion.tolist()
@@ -214,6 +229,16 @@ class GraphSlam(Backend):
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
         return self._cov.copy()
+
+    @property
+    def scan_poses(self) -> Array:
+        """The poses at every update ``(updates, 3)`` as they are known by now."""
+        keys = self.graph.poses[self._at]
+        seen = np.array(self._from).reshape(-1, 3)
+        c, s = np.cos(keys[:, 2]), np.sin(keys[:, 2])
+        x = keys[:, 0] + c * seen[:, 0] - s * seen[:, 1]
+        y = keys[:, 1] + s * seen[:, 0] + c * seen[:, 1]
+        return np.column_stack([x, y, wrap(keys[:, 2] + seen[:, 2])])
 
     @property
     def belief(self) -> Belief:

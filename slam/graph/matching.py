@@ -72,18 +72,19 @@ class Links:
 
 
 def align(
-    surfaces: SurfaceMap, ends: BeamEnds, guess: Array, *, prior_info: Array, gate_m: float, iterations: int = 10
-) -> Alignment:
-    """Return where a scan fits best near ``guess`` ``(3,)``, which has an information ``(3, 3)`` of its own.
+    surfaces: SurfaceMap, ends: BeamEnds, start: Array, *, prior: Array, prior_info: Array, gate_m: float,
+    iterations: int = 10,
+) -> Alignment:  # fmt: skip
+    """Return where a scan fits best near ``start`` ``(3,)``, given a prior pose ``(3,)`` with its information.
 
     ``gate_m`` is how far from its surface a beam's end may be at first; it shrinks.
     """
-    pose = np.array(guess, np.float64)
+    pose = np.array(start, np.float64)
     beside = np.full(len(ends), -1, np.int64)
     counts = np.zeros(2)
     _align(
         surfaces.points, surfaces.normals, surfaces.reach, surfaces.x0, surfaces.y0, surfaces.rows, surfaces.cols,
-        surfaces.starts, surfaces.items, ends.points, ends.normals, ends.var, pose, np.asarray(prior_info),
+        surfaces.starts, surfaces.items, ends.points, ends.normals, ends.var, pose, prior, np.asarray(prior_info),
         gate_m, iterations, beside, counts,
     )  # fmt: skip
     n = max(len(ends), 1)
@@ -141,10 +142,9 @@ def _robust(e: float, var: float) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _align(
     points: Array, normals: Array, reach: Array, x0: float, y0: float, rows: int, cols: int, starts: Ints,
-    items: Ints, ends: Array, end_normals: Array, var: Array, pose: Array, prior_info: Array, gate_m: float,
-    iterations: int, beside: Ints, counts: Array,
+    items: Ints, ends: Array, end_normals: Array, var: Array, pose: Array, guess: Array,
+    prior_info: Array, gate_m: float, iterations: int, beside: Ints, counts: Array,
 ) -> None:  # fmt: skip
-    guess = pose.copy()
     h, g, step = np.empty((3, 3)), np.empty(3), np.empty(3)
     gate = gate_m
     for iteration in range(iterations + 1):

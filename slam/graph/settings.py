@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from slam.backend import BackendConfig
+from slam.grids.scan_matching import MatchConfig
 from slam.settings import require
 
 __all__ = ["GraphSlamConfig"]
@@ -22,6 +23,10 @@ class GraphSlamConfig(BackendConfig):
     rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
     common_m: float = 0.003  # … and which all beams of a scan on one patch of it have in common
     gate_m: float = 0.1  # farthest from its surface that a beam may end, before the alignment
+    # Wheels that know a step to less than this are helped by a search over the window of ``MatchConfig``.
+    search_sigma_m: float = 0.03
+    search_sigma_rad: float = 0.015
+    matching: MatchConfig = field(default_factory=MatchConfig)
     patches: int = 60  # in the window at most
     window_m: float = 9.0  # patches farther from the robot leave it
 
