@@ -12,7 +12,7 @@ from slam.belief import Belief
 from slam.features.surfaces import MAX_LINES
 from slam.geometry import compose, relative, wrap
 from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
-from slam.graph.patches import Patch, new_patches
+from slam.graph.patches import Patch, extended, new_patches
 from slam.graph.pose_graph import PoseGraph
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
@@ -26,6 +26,7 @@ __all__ = ["GraphSlam"]
 Array = NDArray[np.float64]
 
 _SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
+_LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an inverse
 
 
@@ -86,6 +87,7 @@ class GraphSlam(Backend):
         if self._map is None:
             self._key_nodes.append(0)
             self._add_patches(ends, None)
+            self._chart()
         else:
             self._follow(ends)
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
@@ -154,8 +156,9 @@ class GraphSlam(Backend):
         self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
         graph.poses[window.nodes] = window.frames
         self._last = window.pose.copy()
-        self._leave_behind()
         self._add_patches(ends, found)
+        self._leave_behind()
+        self._chart()
         self._mean, self._cov = window.pose.copy(), window.cov[:3, :3].copy()
 
     def _add_patches(self, ends: BeamEnds, found: Alignment | None) -> None:
@@ -163,13 +166,34 @@ class GraphSlam(Backend):
         unexplained = ends.spacing <= config.spacing_m
         if found is not None:
             unexplained &= found.beside < 0
+            self._extend_patches(ends, found, unexplained)
         common = config.features.wall_sigma_m**2, config.common_m**2
         for patch in new_patches(ends, unexplained, common_var=common):
             node = self.graph.add_node(self.window.pose)
             self._patches[node] = patch
             self.graph.add_link(self._key_nodes[-1], node, np.zeros(3), patch.info)
             self.window.add(node, patch.info)
-        self._chart()
+
+    def _extend_patches(self, ends: BeamEnds, found: Alignment, unexplained: NDArray[np.bool_]) -> None:
+        """Let straight patches reach as far as their surface is seen to go on, and count those beams explained."""
+        assert self._map is not None
+        window = self.window
+        number = np.where(found.beside >= 0, self._map.patch[found.beside], -1)
+        for label in np.unique(ends.surface[unexplained & (ends.surface < MAX_LINES)]):
+            on = ends.surface == label
+            held = number[on & (number >= 0)]
+            if len(held) < _LEAST_HELD:
+                continue
+            p = int(np.bincount(held).argmax())
+            node = int(window.nodes[p])
+            if not self._patches[node].straight or np.count_nonzero(held == p) < _LEAST_HELD:
+                continue
+            rows = np.flatnonzero(on & unexplained)
+            seen = relative(window.frames[p][None], window.pose[None])[0]
+            longer = extended(self._patches[node], ends, rows, seen)
+            if longer is not None:
+                self._patches[node] = longer
+                unexplained[rows] = False
 
     def _leave_behind(self) -> None:
         """Let patches far away leave the window."""

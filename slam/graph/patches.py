@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from slam.features.surfaces import MAX_LINES
 from slam.graph.surfaces import BeamEnds
 
-__all__ = ["Patch", "new_patches"]
+__all__ = ["Patch", "extended", "new_patches"]
 
 Array = NDArray[np.float64]
 
 _SAMPLES_M = 0.1  # between the points that stand for a straight surface
 _FEWEST = 4  # beams that make a patch
+_BENT_M = 0.003  # by which a wall may be off its line where it goes on
+_LONGEST_M = 20.0  # stretch of wall that is taken for straight
 _PRIOR_SIGMA = 0.02  # [m, rad] of a patch where the scan says nothing, as along a wall: nothing is held against it
 
 
@@ -68,6 +70,35 @@ def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: t
         info = np.sum([piece[3] for piece in rest], axis=0)
         made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, False))
     return made
+
+
+def extended(patch: Patch, ends: BeamEnds, rows: NDArray[np.int64], relative: Array) -> Patch | None:
+    """Return a straight patch that reaches as far as more beams of the same surface ended, or None.
+
+    None where they do not lie on its line. ``rows`` are the beams, ``relative`` ``(3,)`` is the scan's pose as seen
+    from the patch. A longer patch has no more freedom than a short one: later scans tell its direction.
+    """
+    c, s = np.cos(relative[2]), np.sin(relative[2])
+    seen = ends.points[rows] @ np.array([[c, s], [-s, c]]) + relative[:2]
+    normal, first = patch.normals[0], patch.points[0]
+    off = (seen - first) @ normal
+    noise = float(ends.var[rows].mean())
+    if abs(float(off.mean())) > 3.0 * np.sqrt(noise / len(rows)) + _BENT_M:
+        return None
+    along = np.array([-normal[1], normal[0]])
+    t, had = (seen - first) @ along, (patch.points - first) @ along
+    low, high = float(min(t.min(), had.min())), float(max(t.max(), had.max()))
+    if high - low > _LONGEST_M:
+        return None
+    new = np.concatenate([
+        np.arange(float(had.min()) - _SAMPLES_M, low - 0.5 * _SAMPLES_M, -_SAMPLES_M),
+        np.arange(float(had.max()) + _SAMPLES_M, high + 0.5 * _SAMPLES_M, _SAMPLES_M),
+    ])  # fmt: skip
+    if not len(new):
+        return None
+    points = np.concatenate([patch.points, first + new[:, None] * along])
+    count = len(points)
+    return Patch(points, np.tile(normal, (count, 1)), np.full(count, 0.5 * _SAMPLES_M), patch.info, True)
 
 
 def _information(ends: BeamEnds, rows: NDArray[np.int64], common: float) -> Array:
