@@ -8,6 +8,7 @@ noise counts twice, and every later scan held against the patch shares the one e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +21,13 @@ __all__ = ["Patch", "extended", "new_patches"]
 Array = NDArray[np.float64]
 
 _SAMPLES_M = 0.1  # between the points that stand for a straight surface
-_FEWEST = 4  # beams that make a patch
+_FEWEST = 3  # beams that make a patch
 _BENT_M = 0.003  # by which a wall may be off its line where it goes on
 _LONGEST_M = 20.0  # stretch of wall that is taken for straight
 _PRIOR_SIGMA = 0.02  # [m, rad] of a patch where the scan says nothing, as along a wall: nothing is held against it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Patch:
     """Surface points in the frame of a key scan, and the information of where they are."""
 
@@ -36,10 +37,11 @@ class Patch:
     info: Array  # (3, 3) of the patch's pose relative to the key scan's
     straight: bool
 
-    @property
-    def centre(self) -> Array:
-        """Mean of the points ``(2,)`` [m]."""
-        return np.asarray(self.points.mean(axis=0), np.float64)
+    @cached_property
+    def extent(self) -> Array:
+        """A disc around the points ``(3,)``: centre x, y and radius [m]."""
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        return np.append(0.5 * (low + high), 0.5 * float(np.hypot(*(high - low))))
 
 
 def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: tuple[float, float]) -> list[Patch]:
@@ -61,7 +63,7 @@ def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: t
         straight = bool(label < MAX_LINES)
         info = _information(ends, rows, common_var[0 if straight else 1])
         points, normals, reach = _straight(ends, rows) if straight else _contour(ends, rows)
-        if straight and len(rows) >= 2 * _FEWEST:
+        if straight and len(rows) >= 6:
             made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, True))
         else:
             rest.append((points, normals, reach, info))

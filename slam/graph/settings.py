@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from slam.backend import BackendConfig
+from slam.graph.loop_closing import ClosingConfig
 from slam.grids.scan_matching import MatchConfig
 from slam.settings import require
 
@@ -19,7 +20,7 @@ class GraphSlamConfig(BackendConfig):
     key_rad: float = 0.5  # … or turned so far since the last
     reach_m: float = 20.0  # beams that end farther are not used
     # Beams farther apart on a surface than this do not make a patch of it: a better view will come.
-    spacing_m: float = 0.12
+    spacing_m: float = 0.3
     rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
     common_m: float = 0.003  # … and which all beams of a scan on one patch of it have in common
     gate_m: float = 0.1  # farthest from its surface that a beam may end, before the alignment
@@ -27,8 +28,9 @@ class GraphSlamConfig(BackendConfig):
     search_sigma_m: float = 0.03
     search_sigma_rad: float = 0.015
     matching: MatchConfig = field(default_factory=MatchConfig)
-    patches: int = 60  # in the window at most
-    window_m: float = 9.0  # patches farther from the robot leave it
+    closing: ClosingConfig = field(default_factory=ClosingConfig)
+    # Patches farther from the robot than a beam of it reaches, and so much more, leave the window.
+    beyond_m: float = 2.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -122,3 +122,7 @@ class Window:
         part = np.concatenate([np.ones(3, bool), np.repeat(rows, 3)])
         self.cov = self.cov[np.ix_(part, part)]
         self.frames, self.nodes = self.frames[rows], self.nodes[rows]
+
+    def replace(self, pose: Array, frames: Array, nodes: Ints, cov: Array) -> None:
+        """Take over the graph's solution: the key scan's pose, the patches' frames and their joint covariance."""
+        self.pose, self.frames, self.nodes, self.cov = pose.copy(), frames.copy(), nodes.copy(), cov
