@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from slam.features.surfaces import MAX_LINES
 from slam.geometry import relative
 from slam.graph.loop_closing import Candidate, agreeing, find_candidate
-from slam.graph.matching import Alignment, Links, SurfaceMap
+from slam.graph.matching import Alignment, Links, SurfaceMap, align
 from slam.graph.patches import Patch, extended, new_patches
 from slam.graph.pose_graph import PoseGraph, relative_jacobians
 from slam.graph.settings import GraphSlamConfig
@@ -24,6 +24,7 @@ Ints = NDArray[np.int64]
 
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _PROBES = 6  # old patches by which it is asked whether those in reach are surely known
+_NEAR_M = 0.1  # 1σ of the pose up to which old patches in sight are known by being near what is seen
 _PATIENCE = 3.0  # how much rarer it asks again where they are not
 
 
@@ -162,6 +163,10 @@ class Atlas:
         away = away[order[distance[order] <= reach_m]]
         if not len(away):
             return
+        if float(window.cov[0, 0] + window.cov[1, 1]) < _NEAR_M**2:
+            away = self._in_sight(away, ends)
+            if len(away) < _PROBES:
+                return
         self._look_at = self._way + closing.every_m
         self._solve()
         probes = away[:_PROBES]
@@ -178,6 +183,14 @@ class Atlas:
             self._look_at = self._way + _PATIENCE * closing.every_m
         window.replace(graph.poses[self.key], graph.poses[nodes], nodes, cov)
         window.keep(np.concatenate([np.ones(len(nodes) - len(away), bool), sure]))
+
+    def _in_sight(self, nodes: Ints, ends: BeamEnds) -> Ints:
+        """Return those of the patches that some beam ends near to."""
+        surfaces, _ = self._charted(nodes, self.graph.poses[nodes])
+        pose = self.window.pose
+        found = align(surfaces, ends, pose, prior=pose, prior_info=np.eye(3), gate_m=2.0 * _NEAR_M, iterations=0)
+        seen = np.unique(surfaces.patch[found.beside[found.beside >= 0]])
+        return np.asarray(nodes[seen], np.int64)
 
     def _solve(self) -> None:
         self.graph.solve()

@@ -25,6 +25,7 @@ Ints = NDArray[np.int64]
 
 _GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _FLATTEST = 0.15  # cosine of incidence below which a rough contour's normal means nothing
+_BENT = 1.3  # variance across, in units of what noise makes, beyond which five points go around a corner
 _PIECE_BEAMS, _PIECE_M, _PIECE_COS = 10, 0.6, 0.825  # largest piece of contour that is one surface
 _SHARED = 3.0  # neighbouring normals of a rough contour come from the same points: each beam counts as a third
 
@@ -104,7 +105,7 @@ def _describe(
         else:
             spread = _contour_normal(ranges, x, y, surface, i, increment, range_min, reach, normal)
             c = normal[2]
-            if spread < 0.0 or c < _FLATTEST:
+            if spread < 0.0 or c < _FLATTEST or spread > _BENT * (sigma * sigma * c * c + rough * rough):
                 continue
             nx, ny = normal[0], normal[1]
             turned = nx * first_nx + ny * first_ny < _PIECE_COS
