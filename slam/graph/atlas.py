@@ -11,7 +11,7 @@ from slam.features.surfaces import MAX_LINES
 from slam.geometry import relative
 from slam.graph.loop_closing import Candidate, agreeing, find_candidate
 from slam.graph.matching import Alignment, Links, SurfaceMap, align
-from slam.graph.patches import Patch, extended, new_patches
+from slam.graph.patches import ModelError, Patch, extended, new_patches
 from slam.graph.pose_graph import PoseGraph, relative_jacobians
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds
@@ -55,6 +55,9 @@ class Atlas:
         self._way = 0.0  # [m] driven, from key scan to key scan
         self._look_at = 0.0  # way from which on it looks back again
         self._candidates: list[Candidate] = []
+        features = config.features
+        ledge = max(features.split_sigmas * features.range_sigma_m, features.split_floor_m)
+        self._model = ModelError(features.wall_sigma_m, config.common_m, ledge)
         self.chart()
 
     # ---- key scans -----------------------------------------------------------------------------------------
@@ -86,9 +89,7 @@ class Atlas:
         self.chart()
 
     def _add_patches(self, ends: BeamEnds, unexplained: NDArray[np.bool_]) -> None:
-        config = self.config
-        common = config.features.wall_sigma_m**2, config.common_m**2
-        for patch in new_patches(ends, unexplained, common_var=common):
+        for patch in new_patches(ends, unexplained, self._model):
             node = self.graph.add_node(self.window.pose)
             self._patches[node] = patch
             self.graph.add_link(self.key, node, np.zeros(3), patch.info)
@@ -109,7 +110,7 @@ class Atlas:
                 continue
             rows = np.flatnonzero(on & unexplained)
             seen = relative(window.frames[p][None], window.pose[None])[0]
-            longer = extended(self._patches[node], ends, rows, seen)
+            longer = extended(self._patches[node], ends, rows, seen, self._model)
             if longer is not None:
                 self._patches[node] = longer
                 unexplained[rows] = False
@@ -131,10 +132,7 @@ class Atlas:
         c, s = np.cos(theta), np.sin(theta)
         placed = np.column_stack([x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]])
         turned = np.column_stack([c * normals[:, 0] - s * normals[:, 1], s * normals[:, 0] + c * normals[:, 1]])
-        config = self.config
-        straight = np.array([p.straight for p in patches], bool)
-        common = np.where(straight, config.features.wall_sigma_m**2, config.common_m**2)
-        return SurfaceMap(placed, turned, reach, number), common
+        return SurfaceMap(placed, turned, reach, number), np.array([p.common_var for p in patches])
 
     def _extents(self, nodes: Ints) -> tuple[Array, Array]:
         """Return centres ``(k, 2)`` and radii ``(k,)`` of patches [m], in their frames."""

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from slam.features.surfaces import MAX_LINES
 from slam.graph.surfaces import BeamEnds
 
-__all__ = ["Patch", "extended", "new_patches"]
+__all__ = ["ModelError", "Patch", "extended", "new_patches"]
 
 Array = NDArray[np.float64]
 
 _SAMPLES_M = 0.1  # between the points that stand for a straight surface
 _FEWEST = 3  # beams that make a patch
+_HIDDEN = 0.25  # 1σ of a line's shift by a ledge, in units of its height² over the length: surfaces.fit's own
 _BENT_M = 0.003  # by which a wall may be off its line where it goes on
 _LONGEST_M = 20.0  # stretch of wall that is taken for straight
 _PRIOR_SIGMA = 0.02  # [m, rad] of a patch where the scan says nothing, as along a wall: nothing is held against it
@@ -35,6 +36,7 @@ class Patch:
     normals: Array  # (m, 2) towards free space
     reach: Array  # (m,) [m] along the surface, to either side
     info: Array  # (3, 3) of the patch's pose relative to the key scan's
+    common_var: float  # [m²] of what all beams of one scan on it have in common: what the model leaves out
     straight: bool
 
     @cached_property
@@ -44,16 +46,22 @@ class Patch:
         return np.append(0.5 * (low + high), 0.5 * float(np.hypot(*(high - low))))
 
 
-def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: tuple[float, float]) -> list[Patch]:
-    """Return the patches that a scan's unexplained beams make.
+@dataclass(frozen=True, slots=True)
+class ModelError:
+    """What the model of a surface leaves out, 1σ [m] across it: the same for all beams of a scan."""
 
-    Parameters
-    ----------
-    unexplained : NDArray[np.bool_]
-        ``(n,)`` beams that nothing known is near, exact enough to stand for a surface.
-    common_var : tuple
-        [m²] that the beams on one straight, and on one rough, surface have in common.
-    """
+    straight_m: float  # of a wall that is not quite straight
+    rough_m: float  # of a contour
+    ledge_m: float  # the highest ledge that the extractor does not tell from its wall
+
+    def straight_var(self, length_m: float) -> float:
+        """Return the variance [m²] of a straight surface: a ledge shifts it the more, the shorter it is."""
+        hidden = _HIDDEN * self.ledge_m**2 / max(length_m, self.ledge_m)
+        return self.straight_m**2 + hidden * hidden
+
+
+def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], model: ModelError) -> list[Patch]:
+    """Return the patches that a scan's unexplained beams ``(n,)`` make: those that nothing known is near."""
     made: list[Patch] = []
     rest: list[tuple[Array, Array, Array, Array]] = []
     for label in np.unique(ends.surface[unexplained]):
@@ -61,20 +69,23 @@ def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], *, common_var: t
         if len(rows) < _FEWEST:
             continue
         straight = bool(label < MAX_LINES)
-        info = _information(ends, rows, common_var[0 if straight else 1])
         points, normals, reach = _straight(ends, rows) if straight else _contour(ends, rows)
+        common = model.straight_var(float(np.hypot(*(points[-1] - points[0])))) if straight else model.rough_m**2
+        info = _information(ends, rows, common)
         if straight and len(rows) >= 6:
-            made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, True))
+            made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, common, True))
         else:
             rest.append((points, normals, reach, info))
     if rest:
         points, normals, reach = (np.concatenate([piece[k] for piece in rest]) for k in range(3))
         info = np.sum([piece[3] for piece in rest], axis=0)
-        made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, False))
+        made.append(Patch(points, normals, reach, info + np.eye(3) / _PRIOR_SIGMA**2, model.rough_m**2, False))
     return made
 
 
-def extended(patch: Patch, ends: BeamEnds, rows: NDArray[np.int64], relative: Array) -> Patch | None:
+def extended(
+    patch: Patch, ends: BeamEnds, rows: NDArray[np.int64], relative: Array, model: ModelError
+) -> Patch | None:
     """Return a straight patch that reaches as far as more beams of the same surface ended, or None.
 
     None where they do not lie on its line. ``rows`` are the beams, ``relative`` ``(3,)`` is the scan's pose as seen
@@ -100,7 +111,8 @@ def extended(patch: Patch, ends: BeamEnds, rows: NDArray[np.int64], relative: Ar
         return None
     points = np.concatenate([patch.points, first + new[:, None] * along])
     count = len(points)
-    return Patch(points, np.tile(normal, (count, 1)), np.full(count, 0.5 * _SAMPLES_M), patch.info, True)
+    reach = np.full(count, 0.5 * _SAMPLES_M)
+    return Patch(points, np.tile(normal, (count, 1)), reach, patch.info, model.straight_var(high - low), True)
 
 
 def _information(ends: BeamEnds, rows: NDArray[np.int64], common: float) -> Array:

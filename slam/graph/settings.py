@@ -22,7 +22,7 @@ class GraphSlamConfig(BackendConfig):
     # Beams farther apart on a surface than this do not make a patch of it: a better view will come.
     spacing_m: float = 0.3
     rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
-    common_m: float = 0.003  # … and which all beams of a scan on one patch of it have in common
+    common_m: float = 0.005  # … and which all beams of a scan on one patch of it have in common
     gate_m: float = 0.1  # farthest from its surface that a beam may end, before the alignment
     # Wheels that know a step to less than this are helped by a search over the window of ``MatchConfig``.
     search_sigma_m: float = 0.03
