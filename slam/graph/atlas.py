@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _PROBES = 6  # old patches by which it is asked whether those in reach are surely known
 _NEAR_M = 0.1  # 1σ of the pose up to which old patches in sight are known by being near what is seen
-_PATIENCE = 3.0  # how much rarer it asks again where they are not
+_PATIENCE = 6.0  # how much rarer it looks, at most, where it looks in vain
 
 
 class Atlas:
@@ -54,10 +54,11 @@ class Atlas:
         self._patches: dict[int, Patch] = {}  # node → patch
         self._way = 0.0  # [m] driven, from key scan to key scan
         self._look_at = 0.0  # way from which on it looks back again
+        self._rest = config.closing.every_m  # way from one look to the next: longer where they are in vain
         self._candidates: list[Candidate] = []
         features = config.features
         ledge = max(features.split_sigmas * features.range_sigma_m, features.split_floor_m)
-        self._model = ModelError(features.wall_sigma_m, config.common_m, ledge)
+        self._model = ModelError(config.straight_m, config.common_m, ledge)
         self.chart()
 
     # ---- key scans -----------------------------------------------------------------------------------------
@@ -165,20 +166,19 @@ class Atlas:
             away = self._in_sight(away, ends)
             if len(away) < _PROBES:
                 return
-        self._look_at = self._way + closing.every_m
+        self._look_at = self._way + self._rest
+        self._rest = min(2.0 * self._rest, _PATIENCE * closing.every_m)
         self._solve()
         probes = away[:_PROBES]
         sigmas, near = self._seen(probes, graph.covariance([self.key, *probes]))
         if np.count_nonzero(sigmas <= closing.sigma_m) < 0.5 * len(probes):
-            self._look_at = self._way + closing.every_m
             if not self._close_loop(ends, away, near):
                 return
+        self._rest = closing.every_m
         nodes = np.concatenate([window.nodes, away])
         cov = graph.covariance([self.key, *nodes])
         first = np.r_[0:3, 3 + 3 * len(window.nodes) : len(cov)]
         sure = self._seen(away, cov[np.ix_(first, first)])[0] <= closing.sigma_m
-        if np.count_nonzero(sure) < len(sure):
-            self._look_at = self._way + _PATIENCE * closing.every_m
         window.replace(graph.poses[self.key], graph.poses[nodes], nodes, cov)
         window.keep(np.concatenate([np.ones(len(nodes) - len(away), bool), sure]))
 
@@ -229,6 +229,8 @@ class Atlas:
         if candidate is None:
             return False
         self._candidates.append(candidate)
+        self._rest = config.closing.every_m
+        self._look_at = self._way + self._rest
         group = agreeing(self._candidates, config.closing)
         if not group:
             return False
