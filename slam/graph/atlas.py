@@ -76,7 +76,7 @@ class Atlas:
         window.step(motion, motion_cov)
         window.correct(found.pose, seen)
         node = graph.add_node(window.pose)
-        graph.add_link(self.key, node, motion, np.linalg.inv(motion_cov))
+        graph.add_link(self.key, node, motion, np.asarray(np.linalg.inv(motion_cov), np.float64))
         for k, p in enumerate(seen.patches.tolist()):
             graph.add_link(int(window.nodes[p]), node, seen.relative[k], seen.info[k], seen.gradient[k])
         self.key = node
@@ -131,8 +131,9 @@ class Atlas:
         reach = np.concatenate([np.zeros(0), *(p.reach for p in patches)])
         x, y, theta = frames[number].reshape(-1, 3).T
         c, s = np.cos(theta), np.sin(theta)
-        placed = np.column_stack([x + c * points[:, 0] - s * points[:, 1], y + s * points[:, 0] + c * points[:, 1]])
-        turned = np.column_stack([c * normals[:, 0] - s * normals[:, 1], s * normals[:, 0] + c * normals[:, 1]])
+        (px, py), (nx, ny) = points.T, normals.T
+        placed = np.column_stack([x + c * px - s * py, y + s * px + c * py])
+        turned = np.column_stack([c * nx - s * ny, s * nx + c * ny])
         return SurfaceMap(placed, turned, reach, number), np.array([p.common_var for p in patches])
 
     def _extents(self, nodes: Ints) -> tuple[Array, Array]:
@@ -155,8 +156,8 @@ class Atlas:
         closing, graph, window = self.config.closing, self.graph, self.window
         if self._way < self._look_at:
             return
-        known = np.fromiter(self._patches, np.int64, len(self._patches))
-        away = np.setdiff1d(known, window.nodes)
+        patches = np.fromiter(self._patches, np.int64, len(self._patches))
+        away = np.setdiff1d(patches, window.nodes)
         distance = self._distances(away)
         order = np.argsort(distance, kind="stable")
         away = away[order[distance[order] <= reach_m]]
@@ -171,9 +172,9 @@ class Atlas:
         self._solve()
         probes = away[:_PROBES]
         sigmas, near = self._seen(probes, graph.covariance([self.key, *probes]))
-        if np.count_nonzero(sigmas <= closing.sigma_m) < 0.5 * len(probes):
-            if not self._close_loop(ends, away, near):
-                return
+        known = np.count_nonzero(sigmas <= closing.sigma_m) >= 0.5 * len(probes)
+        if not known and not self._close_loop(ends, away, near):
+            return
         self._rest = closing.every_m
         nodes = np.concatenate([window.nodes, away])
         cov = graph.covariance([self.key, *nodes])
@@ -197,7 +198,7 @@ class Atlas:
         self.window.frames = self.graph.poses[self.window.nodes]
 
     def _seen(self, nodes: Ints, cov: Array) -> tuple[Array, Array]:
-        """Return how well the middle of patches is known as seen from the robot ``(k,)``: 1σ [m] where it is worst.
+        """Return how well the middle of patches is known as seen from the robot ``(k,)``: the largest 1σ [m].
 
         ``cov`` is of the last key scan and the patches, jointly. Also returned is the covariance ``(3, 3)`` of the
         key scan's pose as seen from the first of them, in the directions of the map.

@@ -196,7 +196,7 @@ class GraphSlam(Backend):
 
     @property
     def scan_poses(self) -> Array:
-        """The poses at every update ``(updates, 3)`` as they are known by now: the whole graph is solved for it."""
+        """The poses at every update ``(updates, 3)`` as they are known by now; the graph is solved for it."""
         self.atlas.graph.solve()
         return self._poses_of(range(len(self._at)))
 

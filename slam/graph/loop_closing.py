@@ -52,7 +52,8 @@ class ClosingConfig:
 
     def __post_init__(self) -> None:
         require(self.together >= 1, "ClosingConfig.together must be at least 1")
-        require(0 < self.share <= 1 and 0 < self.in_sight <= 1, "ClosingConfig.share and in_sight must be in (0, 1]")
+        for name in ("share", "in_sight", "rival"):
+            require(0 < getattr(self, name) <= 1, f"ClosingConfig.{name} must be in (0, 1]")
         require(self.sigma_m > 0 and self.every_m > 0, "ClosingConfig.sigma_m and every_m must be > 0")
 
 
@@ -96,8 +97,9 @@ def find_candidate(
 
 
 def _search(
-    surfaces: SurfaceMap, ends: BeamEnds, pose: Array, pose_cov: Array, config: ClosingConfig, matching: MatchConfig
-) -> tuple[Alignment, float]:
+    surfaces: SurfaceMap, ends: BeamEnds, pose: Array, pose_cov: Array, config: ClosingConfig,
+    matching: MatchConfig,
+) -> tuple[Alignment, float]:  # fmt: skip
     """Return the best alignment within 3σ, and what the best place apart from it scores beside it."""
     sigma = np.sqrt(np.diag(pose_cov))
     reach = min(3.0 * float(sigma[:2].max()) + 0.1, config.farthest_m)

@@ -88,7 +88,7 @@ def extended(
 ) -> Patch | None:
     """Return a straight patch that reaches as far as more beams of the same surface ended, or None.
 
-    None where they do not lie on its line. ``rows`` are the beams, ``relative`` ``(3,)`` is the scan's pose as seen
+    None where they do not lie on its line. ``rows`` are the beams, ``relative`` ``(3,)`` the scan's pose as seen
     from the patch. A longer patch has no more freedom than a short one: later scans tell its direction.
     """
     c, s = np.cos(relative[2]), np.sin(relative[2])

@@ -161,7 +161,7 @@ class PoseGraph:
         at = (3 * np.asarray(nodes, np.int64)[:, None] + np.arange(3)).ravel()
         unit = np.zeros((3 * self.size, len(at)))
         unit[at, np.arange(len(at))] = 1.0
-        cov = self._factor.solve(unit)[at]
+        cov = np.asarray(self._factor.solve(unit)[at], np.float64)
         return 0.5 * (cov + cov.T)
 
 

@@ -21,7 +21,7 @@ class GraphSlamConfig(BackendConfig):
     reach_m: float = 20.0  # beams that end farther are not used
     # Beams farther apart on a surface than this do not make a patch of it: a better view will come.
     spacing_m: float = 0.3
-    # 1σ of what the model leaves out, common to all beams of a scan on one surface: of a wall that is not straight …
+    # 1σ of what the model leaves out, common to all beams of a scan on one surface: of a wall …
     straight_m: float = 0.0003
     common_m: float = 0.005  # … and of a contour
     rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
@@ -38,4 +38,5 @@ class GraphSlamConfig(BackendConfig):
         super().__post_init__()
         require(self.key_m > 0 and self.key_rad > 0, "GraphSlamConfig.key_* must be > 0")
         require(self.spacing_m > 0 and self.reach_m > 0, "GraphSlamConfig.spacing_m and reach_m must be > 0")
-        require(min(self.rough_m, self.common_m, self.straight_m) >= 0, "GraphSlamConfig.rough_m, common_m and straight_m must be ≥ 0")
+        for name in ("rough_m", "common_m", "straight_m"):
+            require(getattr(self, name) >= 0, f"GraphSlamConfig.{name} must be ≥ 0")

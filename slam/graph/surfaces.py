@@ -61,7 +61,8 @@ def beam_ends(
     numbers, labels = np.empty((n, 8)), np.empty(n, np.int64)
     count = _describe(
         np.asarray(scan.ranges, np.float64), scan.angle_min, scan.angle_increment, scan.range_min,
-        min(scan.range_max, reach_m), extractor.surface, extractor.lines, offset_m, sigma_m, rough_m, numbers, labels,
+        min(scan.range_max, reach_m), extractor.surface, extractor.lines, offset_m, sigma_m, rough_m, numbers,
+        labels,
     )  # fmt: skip
     rows = numbers[:count]
     return BeamEnds(
@@ -128,7 +129,7 @@ def _contour_normal(
     ranges: Array, x: Array, y: Array, surface: NDArray[np.int16], i: int, increment: float, range_min: float,
     reach: float, normal: Array,
 ) -> float:  # fmt: skip
-    """Write the normal (towards the sensor) and cosine of incidence at a beam; return the variance across, or -1."""
+    """Write a beam's normal (towards the sensor) and cosine of incidence; return the variance across, or -1."""
     n = ranges.shape[0]
     low = high = i
     for side in (-1, 1):
