@@ -25,7 +25,7 @@ Ints = NDArray[np.int64]
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _PROBES = 6  # old patches by which it is asked whether those in reach are surely known
 _NEAR_M = 0.1  # 1σ of the pose up to which old patches in sight are known by being near what is seen
-_PATIENCE = 6.0  # how much rarer it looks, at most, where it looks in vain
+_PATIENCE = 3.0  # how much rarer it looks, at most, where it looks in vain
 
 
 class Atlas:
