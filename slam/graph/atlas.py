@@ -99,6 +99,8 @@ class Atlas:
     def _extend_patches(self, ends: BeamEnds, found: Alignment, unexplained: NDArray[np.bool_]) -> None:
         """Let straight patches reach as far as their surface is seen to go on, and count those beams explained."""
         window = self.window
+        if not np.any(found.beside >= 0):
+            return
         number = np.where(found.beside >= 0, self.surfaces.patch[found.beside], -1)
         for label in np.unique(ends.surface[unexplained & (ends.surface < MAX_LINES)]):
             on = ends.surface == label

@@ -145,6 +145,21 @@ def test_along_a_corridor_a_scan_tells_nothing() -> None:
     assert math.sqrt(backend.pose_cov[1, 1]) < 0.005
 
 
+def test_nothing_in_sight_is_no_error() -> None:
+    """Out of a room into the open and back: by the wheels alone in between, and the covariance grows."""
+    rng, walls, none = np.random.default_rng(0), np.array(box(-2, -2, 2, 2)), np.zeros((0, 4))
+    for first, then in ((walls, none), (none, walls), (none, none)):
+        backend = GraphSlam(GraphSlamConfig(odometry=WHEELS))
+        backend.reset(np.zeros(3))
+        backend.update(scan_of(first, np.zeros(3), rng))
+        for k in range(1, 60):
+            backend.predict(Odometry(np.array([0.5, 0.0, 0.0]), 0.4))
+            there = np.array([0.2 * k, 0.0, 0.0])
+            backend.update(scan_of(then if k % 2 else none, there - [there[0] // 1.5 * 1.5, 0.0, 0.0], rng))
+        assert np.all(np.isfinite(backend.pose)) and np.all(np.linalg.eigvalsh(backend.pose_cov) > 0)
+        assert backend.scan_poses.shape == (60, 3)
+
+
 def old_patches(segments: Array, body: Array) -> tuple[SurfaceMap, Array, Array, Array]:
     """Patches of one scan, as a surface map in the world, with frames, common variances and nodes."""
     patches = new_patches(*ends_of(segments, body, 0), ModelError(0.001, 0.005, 0.04))
