@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 _SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
 _KNOWN, _SOONER = 0.7, 0.4  # share of a scan that is known, below which the next key scan comes so much sooner
+_STILL = 10.0  # how much more the model's error counts, at most, where the robot has hardly moved
 _EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an inverse
 _ALIGNED = np.diag([1e-5, 1e-5, 1e-6])  # covariance of where the scan before was aligned, as far as a guess goes
 
@@ -103,7 +104,7 @@ class GraphSlam(Backend):
         """Correct the belief by a scan."""
         found = self._aligned(ends, reach_m)
         window = self.atlas.window
-        seen = links(self.atlas.surfaces, ends, found, window.frames, self.atlas.common_var)
+        seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
         self._correct(found, seen)
         if self._moved_on(found.share):
             motion_cov = _full(self._upper) + _EXACT * np.eye(3)
@@ -141,6 +142,15 @@ class GraphSlam(Backend):
                 break
             way, turn = self._claimed
             self._upper += np.diag(np.square([way, way, max(turn, way / self.config.odometry.lever_m)]))
+
+    def _lasting(self) -> float:
+        """Return by how much the model's error counts more because it is still that of the key scan before.
+
+        It changes with the place that a surface is seen from: looking twice from one place tells nothing more of it.
+        """
+        x, y, theta = self._motion.tolist()
+        apart = math.hypot(x, y) / self.config.key_m + abs(theta) / self.config.key_rad
+        return min(max(1.0 / max(apart, 1e-3), 1.0), _STILL)
 
     def _moved_on(self, share: float) -> bool:
         """Tell whether it is time for a key scan: sooner where much is new, as in a door."""

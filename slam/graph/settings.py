@@ -23,7 +23,7 @@ class GraphSlamConfig(BackendConfig):
     spacing_m: float = 0.3
     # 1σ of what the model leaves out, common to all beams of a scan on one surface: of a wall …
     straight_m: float = 0.0003
-    common_m: float = 0.005  # … and of a contour
+    common_m: float = 0.01  # … and of a contour
     rough_m: float = 0.005  # 1σ by which a contour that is not straight departs from its tangents
     gate_m: float = 0.1  # farthest from its surface that a beam may end, before the alignment
     # Wheels that know a step to less than this are helped by a search over the window of ``MatchConfig``.
