@@ -54,6 +54,7 @@ class GraphSlam(Backend):
         self._motion, self._upper = np.zeros(3), np.zeros((3, 3))  # since the key scan, in its frame
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
         self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since the key scan
+        self._blind = (0.0, 0.0)  # [m, rad] up to the key scan that nothing but the wheels told all about
         self._twist = (0.0, 0.0, 0.0)
         self._last = pose.copy()  # where the last scan was aligned
         self._mean, self._cov = pose.copy(), pose_cov.copy()
@@ -76,7 +77,7 @@ class GraphSlam(Backend):
         self._twist = twist
         way, turn = self._claimed
         self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
-        self._mean, rows = self.atlas.window.ahead(self._motion, _full(self._upper))
+        self._mean, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
         self._cov = rows[:, :3]
 
     def update(self, scan: Scan) -> None:
@@ -107,8 +108,11 @@ class GraphSlam(Backend):
         seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
         self._correct(found, seen)
         if self._moved_on(found.share):
-            motion_cov = _full(self._upper) + _EXACT * np.eye(3)
+            motion_cov = self._motion_cov()
+            way, turn = self._claimed
+            blind = self._is_blind(motion_cov, found, seen)
             self.atlas.add_key(self._motion, motion_cov, ends, found, seen, reach_m)
+            self._blind = (self._blind[0] + way, self._blind[1] + turn) if blind else (0.0, 0.0)
             self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
             self._last = window.pose.copy()
             self._mean, self._cov = window.pose.copy(), window.cov[:3, :3].copy()
@@ -134,7 +138,7 @@ class GraphSlam(Backend):
         """Set the belief to that of the window and this scan; wheels that contradict it are not believed."""
         window = self.atlas.window
         for _ in range(2):
-            pose, rows = window.ahead(self._motion, _full(self._upper) + _EXACT * np.eye(3))
+            pose, rows = window.ahead(self._motion, self._motion_cov())
             self._mean, self._cov = window.corrected(found.pose, seen, pose, rows)
             change = self._mean - pose
             change[2] = float(wrap(change[2]))
@@ -143,10 +147,39 @@ class GraphSlam(Backend):
             way, turn = self._claimed
             self._upper += np.diag(np.square([way, way, max(turn, way / self.config.odometry.lever_m)]))
 
+    def _motion_cov(self) -> Array:
+        """Return the covariance ``(3, 3)`` of the motion since the key scan, in its frame.
+
+        Where nothing but the wheels has told the motion for a way L, their lasting errors add up along all of it:
+        after d more, (L + d)² - L² = 2 L d + d² times their variance. The noise that is taken for white has d².
+        """
+        cov = _full(self._upper) + _EXACT * np.eye(3)
+        lasting, lever = self.config.odometry.lasting, self.config.odometry.lever_m
+        if lasting is not None:
+            (before, turned), (way, turn) = self._blind, self._claimed
+            share = (0.5 * lasting.radius_sigma) ** 2  # four wheels average
+            rolled = 2.0 * math.hypot(before, lever * turned) * math.hypot(way, lever * turn)
+            linear, angular = (
+                share * rolled,
+                share * rolled / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn,
+            )
+            cov += np.diag([linear, linear, angular])
+        return cov
+
+    def _is_blind(self, motion_cov: Array, found: Alignment, seen: Links) -> bool:
+        """Tell whether there is a direction in which the scan tells less of the motion than the wheels do."""
+        frames = self.atlas.window.frames[seen.patches]
+        info = np.zeros((3, 3))
+        for frame, h in zip(frames, seen.info, strict=True):
+            turn = about_z(float(found.pose[2] - frame[2]))
+            info += turn.T @ h @ turn
+        left = np.linalg.eigvals(np.eye(3) + motion_cov @ info).real
+        return bool(left.min() < 2.0)
+
     def _lasting(self) -> float:
         """Return by how much the model's error counts more because it is still that of the key scan before.
 
-        It changes with the place that a surface is seen from: looking twice from one place tells nothing more of it.
+        It changes with the place that a surface is seen from: looking twice from one place tells no more of it.
         """
         x, y, theta = self._motion.tolist()
         apart = math.hypot(x, y) / self.config.key_m + abs(theta) / self.config.key_rad
