@@ -11,6 +11,8 @@ from slam.dead_reckoning import OdometrySlam, TruthSlam
 from slam.dp_slam import DpSlam, DpSlamConfig
 from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
 from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
+from slam.graph.graph_slam import GraphSlam
+from slam.graph.settings import GraphSlamConfig
 from slam.invariant import InvariantEkfConfig, InvariantEkfSlam
 from slam.settings import from_mapping, unknown_name
 
@@ -26,6 +28,7 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
     "fastslam1": (FastSlam1, FastSlamConfig),
     "fastslam2": (FastSlam2, FastSlamConfig),
     "dp-slam": (DpSlam, DpSlamConfig),
+    "graph-slam": (GraphSlam, GraphSlamConfig),
 }
 
 

@@ -116,6 +116,14 @@ class FeatureExtractor:
         )  # fmt: skip
         return self._corners[: self._corner_count]
 
+    @property
+    def lines(self) -> NDArray[np.float64]:
+        """Straight surfaces of the last scan, in the order of ``surface``'s numbers (a view, until the next call).
+
+        Rows of ``(l, 13)``, in the sensor frame: :mod:`slam.features.surfaces` names the columns.
+        """
+        return self._lines[: self._line_count]
+
     def with_walls(self) -> NDArray[np.float64]:
         """Return walls and corners of the last scan, as rows like :meth:`extract`'s (a view, until the next call).
 

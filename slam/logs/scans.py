@@ -31,6 +31,7 @@ _SETTINGS = {
     },
     "features": {"range_sigma_m": 0.02, "split_floor_m": 0.05, "sigma_floor_m": 0.02, "wall_sigma_m": 0.01,
                  "wall_sigma_rad": 0.005},
+    "rough_m": 0.02, "common_m": 0.02, "straight_m": 0.02,
     "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.4},
 }  # fmt: skip
 

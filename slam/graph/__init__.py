@@ -1,0 +1,7 @@
+"""Pose-graph SLAM: key scans, the patches of surface that each was the first to see, and what links them.
+
+``surfaces`` tells what a scan's beams ended on, ``patches`` what a key scan adds to the map, ``matching`` holds a
+scan against the patches in reach, ``window`` is the joint Gaussian of what is in reach, ``pose_graph`` everything
+there is with its sparse solution, ``loop_closing`` which old places are believed to be seen again, ``atlas`` all
+of that together, ``settings`` the configuration and ``graph_slam`` the backend.
+"""

@@ -1,0 +1,269 @@
+"""Pose-graph SLAM, backend ``graph-slam``: what a scan changes, what is drawn, what is believed.
+
+Every scan is aligned with the patches in reach and corrects the belief, as though it were the last there is; where
+the robot has moved on, it becomes a key scan and stays in the graph. See ``docs/reference/graph_slam.md``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.backend import Backend
+from slam.belief import Belief
+from slam.geometry import compose, relative, wrap
+from slam.graph.atlas import Atlas, about_z
+from slam.graph.matching import Alignment, Links, align, links
+from slam.graph.settings import GraphSlamConfig
+from slam.graph.surfaces import BeamEnds, beam_ends
+from slam.grids.scan_matching import LikelihoodField, search
+from slam.motion import predict_robot
+from slam.types import Observations, Odometry, Scan
+
+__all__ = ["GraphSlam"]
+
+Array = NDArray[np.float64]
+
+_SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
+_KNOWN, _SOONER = 0.7, 0.4  # share of a scan that is known, below which the next key scan comes so much sooner
+_STILL = 10.0  # how much more the model's error counts, at most, where the robot has hardly moved
+_EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an inverse
+_ALIGNED = np.diag([1e-5, 1e-5, 1e-6])  # covariance of where the scan before was aligned, as far as a guess goes
+
+
+class GraphSlam(Backend):
+    """Key scans, and the patches each was the first to see, in a sparse graph.
+
+    There are no landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses.
+    """
+
+    observes_landmarks = False
+    config: GraphSlamConfig
+
+    def __init__(self, config: GraphSlamConfig | None = None) -> None:
+        super().__init__(config or GraphSlamConfig())
+        self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        del seed
+        self.atlas = Atlas(self.config, pose, pose_cov)
+        self._begun = False
+        self._motion, self._upper = np.zeros(3), np.zeros((3, 3))  # since the key scan, in its frame
+        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
+        self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since the key scan
+        self._blind = (0.0, 0.0)  # [m, rad] up to the key scan that nothing but the wheels told all about
+        self._twist = (0.0, 0.0, 0.0)
+        self._last = pose.copy()  # where the last scan was aligned
+        self._mean, self._cov = pose.copy(), pose_cov.copy()
+        self._at: list[int] = []  # the key scan before each update …
+        self._from: list[Array] = []  # … and the pose as seen from it
+        self._drawn: list[tuple[Scan, NDArray[np.int16]]] = []  # the scans the grid can be redrawn from …
+        self._drawn_at: list[int] = []  # … which updates they are of
+        self._shown: list[Array] = []  # … and the sensor poses they are drawn from
+
+    # ---- the steps -----------------------------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move on by what the wheels measured."""
+        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
+        dt, noise = odometry.dt, self.config.odometry
+        slip = noise.slip(self._twist, twist, dt) if dt > 0 else 0.0
+        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
+        predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
+        predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
+        self._twist = twist
+        way, turn = self._claimed
+        self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
+        self._mean, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
+        self._cov = rows[:, :3]
+
+    def update(self, scan: Scan) -> None:
+        """Align the scan with the patches in reach; where the robot has moved on, make it a key scan."""
+        config, atlas = self.config, self.atlas
+        self.extractor.extract(scan)
+        ends = beam_ends(
+            scan, self.extractor, offset_m=config.lidar_offset_m, reach_m=config.reach_m,
+            sigma_m=config.features.range_sigma_m, rough_m=config.rough_m,
+        )  # fmt: skip
+        solutions = atlas.solutions
+        if self._begun:
+            self._follow(ends, min(scan.range_max, config.reach_m))
+        else:
+            atlas.begin(ends)
+            self._begun = True
+        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
+        self._at.append(atlas.key)
+        self._from.append(relative(atlas.window.pose[None], self._mean[None])[0])
+        if atlas.solutions > solutions:
+            self._redraw_if_moved()
+        self._draw_it(scan)
+
+    def _follow(self, ends: BeamEnds, reach_m: float) -> None:
+        """Correct the belief by a scan."""
+        found = self._aligned(ends, reach_m)
+        window = self.atlas.window
+        seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
+        self._correct(found, seen)
+        if self._moved_on(found.share):
+            motion_cov = self._motion_cov()
+            way, turn = self._claimed
+            blind = self._is_blind(motion_cov, found, seen)
+            self.atlas.add_key(self._motion, motion_cov, ends, found, seen, reach_m)
+            self._blind = (self._blind[0] + way, self._blind[1] + turn) if blind else (0.0, 0.0)
+            self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
+            self._last = window.pose.copy()
+            self._mean, self._cov = window.pose.copy(), window.cov[:3, :3].copy()
+        else:
+            self._last = found.pose
+
+    def _aligned(self, ends: BeamEnds, reach_m: float) -> Alignment:
+        """Return where the scan fits the patches in reach, near to where the wheels say."""
+        config, surfaces = self.config, self.atlas.surfaces
+        guess = compose(self._last, self._step)
+        turn = about_z(float(self._last[2]))
+        cov = turn @ _full(self._step_upper) @ turn.T + _ALIGNED
+        info = np.asarray(np.linalg.inv(cov), np.float64)
+        start = guess
+        if max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2:
+            near = np.hypot(*(surfaces.points - guess[:2]).T) < reach_m
+            field = LikelihoodField(config.matching, surfaces.points[near])
+            points = ends.points[:: max(1, len(ends) // config.matching.beams)]
+            start = search(field, points, guess, config.matching, prior_info=info)
+        return align(surfaces, ends, start, prior=guess, prior_info=info, gate_m=config.gate_m)
+
+    def _correct(self, found: Alignment, seen: Links) -> None:
+        """Set the belief to that of the window and this scan; wheels that contradict it are not believed."""
+        window = self.atlas.window
+        for _ in range(2):
+            pose, rows = window.ahead(self._motion, self._motion_cov())
+            self._mean, self._cov = window.corrected(found.pose, seen, pose, rows)
+            change = self._mean - pose
+            change[2] = float(wrap(change[2]))
+            if float(change @ np.linalg.solve(rows[:, :3] - self._cov + _EXACT * np.eye(3), change)) <= _SPUN:
+                break
+            way, turn = self._claimed
+            self._upper += np.diag(np.square([way, way, max(turn, way / self.config.odometry.lever_m)]))
+
+    def _motion_cov(self) -> Array:
+        """Return the covariance ``(3, 3)`` of the motion since the key scan, in its frame.
+
+        Where nothing but the wheels has told the motion for a way L, their lasting errors add up along all of it:
+        after d more, (L + d)² - L² = 2 L d + d² times their variance. The noise that is taken for white has d².
+        """
+        cov = _full(self._upper) + _EXACT * np.eye(3)
+        lasting, lever = self.config.odometry.lasting, self.config.odometry.lever_m
+        if lasting is not None:
+            (before, turned), (way, turn) = self._blind, self._claimed
+            share = (0.5 * lasting.radius_sigma) ** 2  # four wheels average
+            rolled = 2.0 * math.hypot(before, lever * turned) * math.hypot(way, lever * turn)
+            linear, angular = (
+                share * rolled,
+                share * rolled / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn,
+            )
+            cov += np.diag([linear, linear, angular])
+        return cov
+
+    def _is_blind(self, motion_cov: Array, found: Alignment, seen: Links) -> bool:
+        """Tell whether there is a direction in which the scan tells less of the motion than the wheels do."""
+        frames = self.atlas.window.frames[seen.patches]
+        info = np.zeros((3, 3))
+        for frame, h in zip(frames, seen.info, strict=True):
+            turn = about_z(float(found.pose[2] - frame[2]))
+            info += turn.T @ h @ turn
+        left = np.linalg.eigvals(np.eye(3) + motion_cov @ info).real
+        return bool(left.min() < 2.0)
+
+    def _lasting(self) -> float:
+        """Return by how much the model's error counts more because it is still that of the key scan before.
+
+        It changes with the place that a surface is seen from: looking twice from one place tells no more of it.
+        """
+        x, y, theta = self._motion.tolist()
+        apart = math.hypot(x, y) / self.config.key_m + abs(theta) / self.config.key_rad
+        return min(max(1.0 / max(apart, 1e-3), 1.0), _STILL)
+
+    def _moved_on(self, share: float) -> bool:
+        """Tell whether it is time for a key scan: sooner where much is new, as in a door."""
+        x, y, theta = self._motion.tolist()
+        part = 1.0 if share >= _KNOWN else _SOONER
+        return math.hypot(x, y) >= part * self.config.key_m or abs(theta) >= part * self.config.key_rad
+
+    def observe(self, observations: Observations) -> None:
+        """Refuse: surfaces have no use for landmark observations."""
+        raise ValueError(
+            "graph-slam maps surfaces, not landmarks: it takes scans (`update`), not landmark observations; "
+            "use ekf or fastslam2 for those"
+        )
+
+    # ---- the map that is shown -----------------------------------------------------------------------------
+
+    def _draw_it(self, scan: Scan) -> None:
+        body, surface = self._mean, self.extractor.surface
+        sensor = self.sensor_pose(body)
+        self.grid.integrate(
+            sensor, scan, surface, body=(float(body[0]), float(body[1]), self.config.body_radius_m)
+        )
+        if self.key_scans.wants(*sensor.tolist()):
+            self.key_scans.keep(sensor, scan, surface, np.zeros(0, np.int64), np.zeros((0, 2)))
+            self._drawn.append((scan, surface.copy()))
+            self._drawn_at.append(len(self._at) - 1)
+            self._shown.append(sensor)
+
+    def _redraw_if_moved(self) -> None:
+        """Redraw the grid where a scan would be drawn from more than half a cell from where it was."""
+        if not self._drawn:
+            return
+        path = np.array([self.sensor_pose(body) for body in self._poses_of(self._drawn_at)])
+        drawn = np.array(self._shown)
+        off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
+            self.config.key_scans.lever_m
+        )
+        if float(off.max()) > 0.5 * self.grid.resolution:
+            self.grid.redraw(path, self._drawn)
+            self._shown = list(path)
+
+    # ---- the belief ----------------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Array:
+        """Pose mean ``(3,)``."""
+        return self._mean.copy()
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)``."""
+        return self._cov.copy()
+
+    @property
+    def scan_poses(self) -> Array:
+        """The poses at every update ``(updates, 3)`` as they are known by now; the graph is solved for it."""
+        self.atlas.graph.solve()
+        return self._poses_of(range(len(self._at)))
+
+    def _poses_of(self, updates: Sequence[int]) -> Array:
+        """Return the poses at some of the updates ``(k, 3)``."""
+        keys = self.atlas.graph.poses[[self._at[k] for k in updates]]
+        seen = np.array([self._from[k] for k in updates]).reshape(-1, 3)
+        c, s = np.cos(keys[:, 2]), np.sin(keys[:, 2])
+        x = keys[:, 0] + c * seen[:, 0] - s * seen[:, 1]
+        y = keys[:, 1] + s * seen[:, 0] + c * seen[:, 1]
+        return np.column_stack([x, y, wrap(keys[:, 2] + seen[:, 2])])
+
+    @property
+    def belief(self) -> Belief:
+        """Pose and grid; landmarks are empty, and there is no joint covariance."""
+        return Belief(
+            pose=self.pose,
+            pose_cov=self.pose_cov,
+            landmarks=np.zeros((0, 2)),
+            landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64),
+            grid=self.grid,
+        )
+
+
+def _full(upper: Array) -> Array:
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).T, np.float64)
