@@ -110,7 +110,7 @@ class DpSlam(Backend):
         self._odometry.predict(odometry)
         self._believed = None
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
         points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
         self._odometry.correct(points)
@@ -204,6 +204,13 @@ class DpSlam(Backend):
         self._weights[:] = 1.0 / n
         self._log_weights[:] = -math.log(n)
         self._updates = 0
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        n = self.config.particles
+        self._poses = scattered(pose, pose_cov, n, self._rng)
+        self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
+        self._odometry.settle()
+        self._believed = None
 
     # ---- the map that is shown -----------------------------------------------------------------------------
 

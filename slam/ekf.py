@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import BackendConfig
+from slam.backend import BackendConfig, found_cov
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
@@ -32,6 +32,8 @@ from slam.types import LINE, Observations, Odometry, Scan
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam", "state_rows"]
 
 Array = NDArray[np.float64]
+
+_WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 
 ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
@@ -107,13 +109,17 @@ class EkfSlam(LandmarkBackend):
         vx, vy, omega, var_v, var_w = self._measured(odometry, self._noise)
         predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
-        corners = self.extractor.extract(scan)
-        self._take((self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS], scan)
+        self._take(self._features(scan), scan)
         self._draw(scan)
         if self.key_scans.due():
             self.key_scans.redraw_if_moved(self.grid, *self._map_points())
+
+    def _features(self, scan: Scan) -> Array:
+        """Return what a scan shows as observation rows ``(m, 10)``."""
+        corners = self.extractor.extract(scan)
+        return (self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS]
 
     def _take(self, z: Array, scan: Scan | None) -> None:
         """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
@@ -154,6 +160,7 @@ class EkfSlam(LandmarkBackend):
             for k in np.flatnonzero(match == UNMATCHED):
                 if self._book.row(int(ids[k])) < 0:  # not added by this very call
                     self._add(part[k], int(ids[k]))
+        self.recovery.monitor.take_innovations(self.nis, self.nis_dof)
 
     def _associate(self, z: Array) -> NDArray[np.int64]:
         config, book = self.config, self._book
@@ -280,6 +287,28 @@ class EkfSlam(LandmarkBackend):
         p[: self._n, : self._n] = self._p[: self._n, : self._n]
         self._x, self._p = x, p
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
+
+    # ---- a pose from elsewhere ------------------------------------------------------------------------------
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        self._x[:3] = pose
+        self._p[:3, : self._n] = 0.0
+        self._p[:3, :3] = np.triu(pose_cov)
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        """Go on from a pose ``(3,)`` that a scan was found to be taken from.
+
+        The match says which landmarks are seen; where the robot is, these say, so that it inherits what is not
+        known of them, and is correlated with them as it should be.
+        """
+        self._place(pose, cov + found_cov())
+        z = self._features(scan)
+        match = self._associate(z).copy()
+        self._place(pose, np.diag(np.square(_WIDE)))
+        self._correct(z, match)
+        self._unseen_motion = (0.0, 0.0)
+        self._manage(z, match, scan)
+        self._draw(scan)
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""

@@ -104,7 +104,7 @@ class FastSlam(LandmarkBackend):
     def _move(self, twist: Array, dt: float, var_v: float, var_w: float) -> None:
         """Move every particle by a measured twist of these variances."""
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self.extractor.extract(scan)[:MAX_OBSERVATIONS]
         match, leader = self._associate(z)
@@ -221,6 +221,16 @@ class FastSlam(LandmarkBackend):
         pose, offset = pose.copy(), self.config.lidar_offset_m
         narrow(pose, cov.copy(), landmarks, np.arange(len(landmarks)), z, match, offset, 0.0)
         return self.grid.agreement(self.sensor_pose(pose), scan)
+
+    # ---- a pose from elsewhere -------------------------------------------------------------------------------
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        n = self.config.particles
+        self._poses[:] = scattered(pose, pose_cov, n, self._rng)
+        self._covs[:] = 0.0
+        self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
+        self._unseen_motion = (0.0, 0.0)
+        self._believe()
 
     # ---- the book of landmarks -----------------------------------------------------------------------------
 

@@ -98,6 +98,11 @@ class InvariantEkfSlam(EkfSlam):
             self._wheels.drop(self._n, 3 + 2 * row)
         super()._drop(row)
 
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        super()._place(pose, pose_cov)
+        if self._wheels is not None:
+            self._wheels.cross[:, :3] = 0.0
+
     def _enlarge(self) -> None:
         super()._enlarge()
         self._delta = np.zeros(len(self._x))

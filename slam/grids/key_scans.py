@@ -109,6 +109,16 @@ class KeyScans:
         return True
 
 
+    def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
+        """Keep the first scans only, as many as there are sensor poses ``(n, 3)``, and redraw ``grid`` from these."""
+        n = len(poses)
+        del self._scans[n:]
+        self._poses[:n] = poses
+        self._anchor_ids[n:] = -1
+        self._last = tuple(poses[-1].tolist()) if n else (0.0, 0.0, 0.0)
+        grid.redraw(poses, self._scans)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
     sensor_pose: Array, ids: NDArray[np.int64], points: Array, n: int, poses: Array,

@@ -1,0 +1,118 @@
+"""What a scan says for or against a map and a pose: beams that end on its walls, and beams that end in the open.
+
+Cells that the map does not know say nothing. So does a beam that returned nothing, or was lost.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from slam.grids.occupancy import OccupancyGrid
+from slam.grids.scan_drawing import FREE_UP_TO, OCCUPIED_FROM
+from slam.types import Scan
+
+__all__ = ["Agreement", "agreement", "through_walls"]
+
+Array = NDArray[np.float64]
+
+
+class Agreement(NamedTuple):
+    """Beams of a scan that say something about a pose on a map."""
+
+    on_walls: int  # ended in an occupied cell, or beside one
+    sharp: int  # of those, ended in it
+    in_the_open: int  # ended among cells that are known to be free
+
+    @property
+    def beams(self) -> int:
+        """Number of beams that said anything."""
+        return self.on_walls + self.in_the_open
+
+    @property
+    def against(self) -> float:
+        """Share of the beams that speak against the pose; 0 where none said anything."""
+        beams = self.on_walls + self.in_the_open
+        return self.in_the_open / beams if beams else 0.0
+
+
+def agreement(grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int) -> Agreement:
+    """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ)."""
+    row0, col0 = grid.lattice_origin
+    x, y, theta = sensor_pose
+    return Agreement(*_count_beams(
+        grid.log_odds, row0, col0, grid.resolution, scan.ranges, scan.angle_min, scan.angle_increment,
+        scan.range_max, x, y, theta, max(len(scan.ranges) // beams, 1),
+    ))  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_beams(
+    log_odds: NDArray[np.int8], row0: int, col0: int, resolution: float, ranges: Array, angle_min: float,
+    increment: float, range_max: float, x: float, y: float, theta: float, stride: int,
+) -> tuple[int, int, int]:  # fmt: skip
+    rows, cols = log_odds.shape
+    on_walls, sharp, in_the_open = 0, 0, 0
+    # Directions of the beams one after the other, each turned on from the one before it.
+    c, s = math.cos(theta + angle_min), math.sin(theta + angle_min)
+    turn_c, turn_s = math.cos(stride * increment), math.sin(stride * increment)
+    u0, v0 = x / resolution - col0, y / resolution - row0
+    for k in range(0, ranges.shape[0], stride):
+        r = ranges[k]
+        if r <= range_max:  # neither lost nor without return
+            reach = r / resolution + 0.25  # what stopped the beam lies behind where it returned from
+            col, row = int(u0 + c * reach), int(v0 + s * reach)
+            if 0 < row < rows - 1 and 0 < col < cols - 1:
+                highest, lowest_known = -128, 1
+                for i in range(row - 1, row + 2):
+                    for j in range(col - 1, col + 2):
+                        value = log_odds[i, j]
+                        highest = max(highest, value)
+                        lowest_known = min(lowest_known, 1 if value != 0 else 0)
+                if highest >= OCCUPIED_FROM:
+                    on_walls += 1
+                    sharp += log_odds[row, col] >= OCCUPIED_FROM
+                elif highest <= FREE_UP_TO and lowest_known == 1:
+                    in_the_open += 1
+        c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
+    return on_walls, sharp, in_the_open
+
+
+def through_walls(
+    grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int
+) -> tuple[int, int]:
+    """Return how many of at most ``beams`` beams come through a wall, and how many have an end at all."""
+    row0, col0 = grid.lattice_origin
+    x, y, theta = sensor_pose
+    return _count_crossings(
+        grid.log_odds, row0, col0, grid.resolution, scan.ranges, scan.angle_min, scan.angle_increment,
+        scan.range_max, x, y, theta, max(len(scan.ranges) // beams, 1),
+    )  # fmt: skip
+
+
+_SHORT_CELLS = 5.0  # of a beam's end, where the wall is that it ended on
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _count_crossings(
+    log_odds: NDArray[np.int8], row0: int, col0: int, resolution: float, ranges: Array, angle_min: float,
+    increment: float, range_max: float, x: float, y: float, theta: float, stride: int,
+) -> tuple[int, int]:  # fmt: skip
+    rows, cols = log_odds.shape
+    crossing = beams = 0
+    u0, v0 = x / resolution - col0, y / resolution - row0
+    for k in range(0, ranges.shape[0], stride):
+        if not ranges[k] <= range_max:
+            continue
+        beams += 1
+        c, s = math.cos(theta + angle_min + k * increment), math.sin(theta + angle_min + k * increment)
+        for step in range(1, int(2.0 * (ranges[k] / resolution - _SHORT_CELLS))):
+            col, row = int(u0 + 0.5 * step * c), int(v0 + 0.5 * step * s)
+            if 0 <= row < rows and 0 <= col < cols and log_odds[row, col] >= OCCUPIED_FROM:
+                crossing += 1
+                break
+    return crossing, beams

@@ -1,0 +1,141 @@
+"""How likely a belief is true: a recursive Bayes filter over what scans and innovations say.
+
+Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map. A
+filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be *too
+sure*: about right, yet by more off than the covariance says. That is in no single scan; a logistic function of what
+lasts, how sharply scans lie on the map and how large the innovations are, says how often that is so.
+
+    health = P(fine) · P(within the 99.7 % region | fine)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from slam.health.evidence import Agreement
+from slam.settings import require
+
+__all__ = ["HealthConfig", "HealthMonitor"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HealthConfig:
+    """What evidence weighs, and when a belief is given up.
+
+    Likelihoods and weights were measured on rooms of seeds below 1000 and on two floors
+    (docs/reference/health.md); they are properties of the evidence, not of a room.
+    """
+
+    recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
+    beams: int = 90  # of a scan that are looked at, at most
+    fewest_beams: int = 12  # that say anything, for a scan to count
+    # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
+    # lost, falls into each: in logarithms, since products of them are taken.
+    against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
+    against_fine: tuple[float, ...] = (0.985, 0.012, 0.002, 0.0006, 0.0004)
+    against_lost: tuple[float, ...] = (0.05, 0.10, 0.20, 0.30, 0.35)
+    # The same of the share of the beams on walls that end in the very cell of one.
+    sharp_edges: tuple[float, ...] = (0.5, 0.65, 0.8, 0.9)
+    sharp_fine: tuple[float, ...] = (0.0005, 0.0015, 0.01, 0.1, 0.888)
+    sharp_lost: tuple[float, ...] = (0.30, 0.30, 0.25, 0.10, 0.05)
+    # Scans one after the other err together: each counts as this part of one.
+    scan_weight: float = 0.4
+    lost_per_scan: float = 1e-5  # how likely a robot gets lost from one scan to the next
+    blur_m: float = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
+    doubt_against: float = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
+    doubt_sharp: float = 0.6  # … where it agrees from the corrected pose
+    give_up: float = 0.2  # P(fine) below which the belief is lost
+    while_lost: float = 0.02  # the health then
+    found: float = 0.9  # P(fine) right after a relocalisation
+    memory: float = 50.0  # scans over which sharpness and innovations are averaged
+    # P(within the region | fine) = 1 / (1 + exp(-(bias + Σ weight · (feature - centre))))
+    bias: float = 4.0
+    sharp_weight: float = 0.0  # of the mean sharpness less 0.97
+    nis_weight: float = 0.0  # of the logarithm of NIS over its degrees of freedom
+
+    def __post_init__(self) -> None:
+        for name in ("against", "sharp"):
+            bins = len(getattr(self, f"{name}_edges")) + 1
+            for state in ("fine", "lost"):
+                values = getattr(self, f"{name}_{state}")
+                require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values")
+                require(all(v > 0 for v in values), f"HealthConfig.{name}_{state} must be > 0")
+        require(0 < self.give_up < self.found < 1, "HealthConfig needs 0 < give_up < found < 1")
+        require(self.beams >= 8, "HealthConfig.beams must be at least 8")
+        require(self.memory >= 1 and self.blur_m > 0, "HealthConfig.memory must be ≥ 1, blur_m > 0")
+        require(0 < self.lost_per_scan < 1, "HealthConfig.lost_per_scan must be in (0, 1)")
+
+
+class HealthMonitor:
+    """Takes evidence in and says how likely the belief is true.
+
+    Attributes
+    ----------
+    fine : float
+        Probability that the robot is about where it is believed to be.
+    """
+
+    def __init__(self, config: HealthConfig) -> None:
+        self.config = config
+        self._against = _log_ratios(config.against_lost, config.against_fine)
+        self._sharp = _log_ratios(config.sharp_lost, config.sharp_fine)
+        self._prior_odds = config.lost_per_scan
+        self.restart(1.0)
+
+    def restart(self, fine: float) -> None:
+        """Begin anew with this probability of being fine."""
+        self._odds = (1.0 - fine) / max(fine, 1e-12)  # of being lost
+        self._mean_sharp, self._mean_nis = 0.97, 0.0
+
+    @property
+    def fine(self) -> float:
+        """P(fine)."""
+        return 1.0 / (1.0 + self._odds)
+
+    @property
+    def health(self) -> float:
+        """Probability that the true pose lies within the 99.7 % region of the belief."""
+        c = self.config
+        score = c.bias + c.sharp_weight * (self._mean_sharp - 0.97) + c.nis_weight * self._mean_nis
+        return 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
+
+    def doubtful(self, seen: Agreement) -> bool:
+        """Tell whether a scan speaks against the pose that it was looked at from."""
+        on_walls, sharp, in_the_open = seen
+        beams = on_walls + in_the_open
+        if beams < self.config.fewest_beams:
+            return False
+        return in_the_open > self.config.doubt_against * beams or sharp < self.config.doubt_sharp * on_walls
+
+    def take(self, seen: Agreement, variance: float) -> None:
+        """Take in what a scan says, the ends of its beams being known to ``variance`` [m²]."""
+        c = self.config
+        on_walls, sharp, in_the_open = seen
+        beams = on_walls + in_the_open
+        odds = self._odds + self._prior_odds
+        if beams >= c.fewest_beams:
+            ratio = self._against[_bin(in_the_open / beams, c.against_edges)]
+            if on_walls:
+                share = sharp / on_walls
+                ratio += self._sharp[_bin(share, c.sharp_edges)]
+                self._mean_sharp += (share - self._mean_sharp) / c.memory
+            odds *= math.exp(c.scan_weight * ratio / (1.0 + variance / c.blur_m**2))
+        self._odds = min(max(odds, 1e-6), 1e6)
+
+    def take_innovations(self, nis: float, dof: int) -> None:
+        """Take in the NIS of an update with so many degrees of freedom."""
+        if dof > 0 and math.isfinite(nis):
+            value = math.log(max(nis / dof, 1e-3))
+            self._mean_nis += (value - self._mean_nis) / self.config.memory
+
+
+def _log_ratios(lost: tuple[float, ...], fine: tuple[float, ...]) -> list[float]:
+    return [math.log(a / b) for a, b in zip(lost, fine, strict=True)]
+
+
+def _bin(value: float, edges: tuple[float, ...]) -> int:
+    for k, edge in enumerate(edges):
+        if value < edge:
+            return k
+    return len(edges)
