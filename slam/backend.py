@@ -223,7 +223,10 @@ class Backend(abc.ABC):
 
     def _copy(self) -> dict[str, Any]:
         """Return a copy of all that estimates; not of the map that is shown, which is redrawn instead."""
-        kept = {name: copy.deepcopy(value) for name, value in self.__dict__.items() if name not in _NOT_COPIED}
+        kept: dict[str, Any] = {}
+        for name, value in self.__dict__.items():
+            if name not in _NOT_COPIED:  # what is in lists does not change
+                kept[name] = list(value) if isinstance(value, list) else copy.deepcopy(value)
         kept["key_scan_poses"], kept["grid_revision"] = self.key_scans.poses, self.grid.revision
         return kept
 
@@ -233,6 +236,10 @@ class Backend(abc.ABC):
         poses, revision = kept.pop("key_scan_poses"), kept.pop("grid_revision")
         self.__dict__.update(kept)
         self._place(pose, pose_cov)
+        self._redraw_kept(poses, revision)
+
+    def _redraw_kept(self, poses: Array, revision: int) -> None:
+        """Redraw the map from the key scans at these poses ``(n, 3)``, where it has changed since that revision."""
         if self.grid.revision != revision or len(self.key_scans) != len(poses):
             self.key_scans.put_back(self.grid, poses)
 

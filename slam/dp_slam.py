@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend, BackendConfig
+from slam.backend import Backend, BackendConfig, found_cov
 from slam.belief import Belief
 from slam.geometry import compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
@@ -114,18 +114,23 @@ class DpSlam(Backend):
         """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
         points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
         self._odometry.correct(points)
+        self._take(scan, points, due=self._moved_on())
+
+    def _take(self, scan: Scan, points: Array, *, due: bool) -> None:
+        """Update the particles where that is due; draw the scan, unless it contradicts the map."""
         self.extractor.extract(scan)  # the surfaces that the grid is drawn with
-        if self._moved_on():
+        if due:
             self._update_particles(points)
             self._key.append((scan, self.extractor.surface.copy()))
             self._follow_the_lead()
             self._shown = np.vstack([self._shown, self.sensor_pose(self._poses[self._lead])])
         self._believed = None
         body = compose(self._poses[self._lead], self._motion())
-        self.grid.integrate(
-            self.sensor_pose(body), scan, self.extractor.surface,
-            body=(float(body[0]), float(body[1]), self.config.body_radius_m),
-        )  # fmt: skip
+        x, y, theta = body.tolist()
+        if not (self._doubtful and self._recovers and self._contradicts((x, y, theta), scan)):
+            self.grid.integrate(
+                self.sensor_pose(body), scan, self.extractor.surface, body=(x, y, self.config.body_radius_m)
+            )
 
     def observe(self, observations: Observations) -> None:
         """Refuse: maps of occupied cells have no use for landmark observations."""
@@ -209,8 +214,17 @@ class DpSlam(Backend):
         n = self.config.particles
         self._poses = scattered(pose, pose_cov, n, self._rng)
         self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
-        self._odometry.settle()
+        self._odometry.forget()
         self._believed = None
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        """Draw every particle where the scan fits its map, next to a pose ``(3,)``."""
+        self._place(pose, cov + found_cov())
+        self._poses[:] = pose  # they are drawn anew, around the best fit
+        self._take(scan, body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m), due=True)
+
+    def _redraw_kept(self, poses: Array, revision: int) -> None:
+        self.grid.redraw(self._shown, self._key)
 
     # ---- the map that is shown -----------------------------------------------------------------------------
 

@@ -225,9 +225,9 @@ class FastSlam(LandmarkBackend):
     # ---- a pose from elsewhere -------------------------------------------------------------------------------
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
+        # Drawn by what is seen, as after wheels that spun: in three dimensions none of the particles would hit it.
         n = self.config.particles
-        self._poses[:] = scattered(pose, pose_cov, n, self._rng)
-        self._covs[:] = 0.0
+        self._poses[:], self._covs[:] = pose, np.triu(pose_cov)
         self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
         self._unseen_motion = (0.0, 0.0)
         self._believe()

@@ -98,6 +98,16 @@ _SHORT_CELLS = 5.0  # of a beam's end, where the wall is that it ended on
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _alone(log_odds: NDArray[np.int8], row: int, col: int) -> bool:
+    """Tell whether a cell has no occupied neighbour."""
+    for i in range(row - 1, row + 2):
+        for j in range(col - 1, col + 2):
+            if log_odds[i, j] >= OCCUPIED_FROM:
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _count_crossings(
     log_odds: NDArray[np.int8], row0: int, col0: int, resolution: float, ranges: Array, angle_min: float,
     increment: float, range_max: float, x: float, y: float, theta: float, stride: int,
@@ -110,9 +120,14 @@ def _count_crossings(
             continue
         beams += 1
         c, s = math.cos(theta + angle_min + k * increment), math.sin(theta + angle_min + k * increment)
+        met = False
         for step in range(1, int(2.0 * (ranges[k] / resolution - _SHORT_CELLS))):
             col, row = int(u0 + 0.5 * step * c), int(v0 + 0.5 * step * s)
-            if 0 <= row < rows and 0 <= col < cols and log_odds[row, col] >= OCCUPIED_FROM:
-                crossing += 1
+            if not (1 <= row < rows - 1 and 1 <= col < cols - 1):
+                continue
+            if log_odds[row, col] >= OCCUPIED_FROM:
+                met = True
+            elif met and log_odds[row, col] <= FREE_UP_TO and _alone(log_odds, row, col):
+                crossing += 1  # and out again: what runs along a wall does not count
                 break
     return crossing, beams

@@ -43,7 +43,8 @@ class RelocalisationConfig:
     check_beams: int = 180  # that a candidate is held against the map by
     fewest_beams: int = 25  # that must say anything of a place
     least_known: float = 0.35  # share of the beams that must end where the map is known
-    most_against: float = 0.05  # share of those that may end in the open or come through a wall
+    most_against: float = 0.05  # share of those that may end in the open …
+    most_through: float = 0.1  # … and of all, that may come through a wall: some pass close by a corner
     least_sharp: float = 0.65  # of those on walls, that end in the very cell
     margin: float = 0.12  # by which the best place must be better than the next, in shares of the beams
     radii_m: tuple[float, ...] = (1.5, 4.0, math.inf)  # around the last known pose, one after the other …
@@ -168,7 +169,8 @@ class Relocaliser:
         known = seen.on_walls + seen.in_the_open
         good = (
             known >= max(config.fewest_beams, config.least_known * beams)
-            and against <= config.most_against * known
+            and seen.in_the_open <= config.most_against * known
+            and crossing <= config.most_through * beams
             and seen.sharp >= config.least_sharp * seen.on_walls
         )
         return Place(found.pose, found.cov, quality, good)
