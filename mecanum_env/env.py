@@ -257,7 +257,10 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         truth = self.truth
         record, collisions = truth.record, truth.world.collisions
         time_s = self._steps * self.config.step_s
-        record.append((true_x, true_y, true_theta, x, y, theta, time_s, coverage, nees))
+        recovery = self.backend.recovery
+        health, lost = recovery.health, float(recovery.lost)
+        record.append((true_x, true_y, true_theta, x, y, theta, time_s, coverage, nees, health, lost))
+        record.relocalisations = recovery.relocalisations
         record.collisions = collisions
         return {
             "coverage": coverage,

@@ -61,6 +61,8 @@ class Backend(abc.ABC):
     relocalises: ClassVar[bool] = True
     """Whether the pose is found anew where the belief is lost; where not, ``health`` tells, and that is all."""
 
+    _looks_seldom: ClassVar[bool] = True  # every second scan is enough where all is well
+
     def __init__(self, config: BackendConfig) -> None:
         self.config = config
         self.extractor = FeatureExtractor(config.features)
@@ -68,6 +70,7 @@ class Backend(abc.ABC):
         self.key_scans = KeyScans(config.key_scans)
         self.recovery = Recovery(config.health, config.relocalisation, config.lidar_offset_m)
         self._doubtful = False  # whether the scan at hand spoke against the predicted pose
+        self._calm = False  # whether the scan before it agreed with the map
         self._recovers = self.relocalises and config.health.recover
 
     def reset(
@@ -90,7 +93,7 @@ class Backend(abc.ABC):
         self.grid = OccupancyGrid(self.config.grid_resolution_m)
         self.key_scans = KeyScans(self.config.key_scans)
         self.recovery.reset()
-        self._doubtful = False
+        self._doubtful = self._calm = False
         self._start(start, cov, seed)
 
     @abc.abstractmethod
@@ -104,13 +107,21 @@ class Backend(abc.ABC):
     def update(self, scan: Scan) -> None:
         """Correct by a scan, and draw it into the grid; while the belief is lost, look for where it was taken."""
         recovery = self.recovery
+        if self._calm:  # the scan before this one agreed with the map: every second one is looked at
+            self._calm = False
+            self._update(scan)
+            return
         if recovery.lost:
-            place = recovery.search(self.grid, scan, self.pose)
+            place = recovery.search(self.grid, scan, self._foreseen(scan))
             if place is not None:
                 self._relocate(place.pose, place.cov, scan)
             return
-        x, y, theta = self.pose.tolist()
+        x, y, theta = self._foreseen(scan).tolist()
         seen = recovery.look(self.grid, (x, y, theta), scan)
+        if recovery.monitor.calm(seen):
+            recovery.kept, self._doubtful, self._calm = None, False, self._looks_seldom
+            self._update(scan)
+            return
         self._doubtful = recovery.monitor.doubtful(seen)
         if not self._doubtful:
             recovery.kept = None
@@ -123,9 +134,13 @@ class Backend(abc.ABC):
             if recovery.kept is None:
                 recovery.kept = self._copy()
             self._update(scan)
-            if recovery.monitor.fine < recovery.config.give_up:
+            if recovery.kept is not None and recovery.monitor.fine < recovery.config.give_up:
                 self._put_back(recovery.kept)
                 recovery.give_up()
+
+    def _foreseen(self, scan: Scan) -> Array:
+        """Return the pose of the body ``(3,)`` that a scan is first held against the map from."""
+        return self.pose
 
     @abc.abstractmethod
     def _update(self, scan: Scan) -> None:
@@ -259,5 +274,5 @@ def found_cov() -> Array:
 
 
 _NOT_COPIED = {
-    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_recovers",
+    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_calm", "_recovers",
 }  # fmt: skip

@@ -20,6 +20,7 @@ from slam.belief import Belief
 from slam.geometry import compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
+from slam.health.monitor import HealthConfig
 from slam.particles.grids import ParticleGrids, ScanCells
 from slam.particles.match import ParticleMatcher
 from slam.particles.paths import Paths
@@ -60,6 +61,8 @@ class DpSlamConfig(BackendConfig):
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     matching: MatchConfig = field(default_factory=MatchConfig)
     scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
+    # Particles close loops by themselves: until another one leads, the leading one's map contradicts the scans.
+    health: HealthConfig = field(default_factory=lambda: HealthConfig(scan_weight=0.1))
     copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
 
     def __post_init__(self) -> None:
@@ -78,6 +81,7 @@ class DpSlam(Backend):
     """
 
     observes_landmarks = False
+    _looks_seldom = False  # each scan is followed before it is looked at
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:
@@ -98,6 +102,7 @@ class DpSlam(Backend):
         self._key: list[tuple[Scan, NDArray[np.int16]]] = []  # one scan an update
         self._odometry = ScanOdometry(config.scan_odometry, config.matching, config.odometry)
         self._lead = 0
+        self._points = np.zeros((0, 2))  # where the scan's beams ended, in the body frame
         self._updates = 0  # since the last resampling
         self.n_eff = float(n)
         self.resampled = False
@@ -112,9 +117,14 @@ class DpSlam(Backend):
 
     def _update(self, scan: Scan) -> None:
         """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
-        points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
-        self._odometry.correct(points)
-        self._take(scan, points, due=self._moved_on())
+        self._take(scan, self._points, due=self._moved_on())
+
+    def _foreseen(self, scan: Scan) -> Array:
+        """Follow the motion by the scan; return where that has the leading particle."""
+        self._points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
+        self._odometry.correct(self._points)
+        self._believed = None
+        return compose(self._poses[self._lead], self._motion())
 
     def _take(self, scan: Scan, points: Array, *, due: bool) -> None:
         """Update the particles where that is due; draw the scan, unless it contradicts the map."""
@@ -282,6 +292,7 @@ class DpSlam(Backend):
             landmark_cov=np.zeros((0, 2, 2)),
             landmark_ids=np.zeros(0, np.int64),
             grid=self.grid,
+            health=self.health,
         )
 
 

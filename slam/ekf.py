@@ -378,6 +378,7 @@ class EkfSlam(LandmarkBackend):
             landmark_cov=cov,
             landmark_ids=self._ids[rows],
             grid=self.grid,
+            health=self.health,
             joint_cov=joint,
             landmark_kinds=marks[rows, 0].astype(np.int8),
             lines=points[lines],

@@ -311,6 +311,7 @@ class FastSlam(LandmarkBackend):
             landmark_cov=cov.copy(),
             landmark_ids=self._book.ids.copy(),
             grid=self.grid,
+            health=self.health,
             landmark_kinds=self._marks[:, 0].astype(np.int8),
         )
 

@@ -44,10 +44,23 @@ def agreement(grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan
     """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ)."""
     row0, col0 = grid.lattice_origin
     x, y, theta = sensor_pose
+    ranges, angle_min, increment, range_max, _ = scan
     return Agreement(*_count_beams(
-        grid.log_odds, row0, col0, grid.resolution, scan.ranges, scan.angle_min, scan.angle_increment,
-        scan.range_max, x, y, theta, max(len(scan.ranges) // beams, 1),
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, x, y, theta,
+        len(ranges) // beams or 1,
     ))  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _around(log_odds: NDArray[np.int8], row: int, col: int) -> tuple[int, bool]:
+    """Return the highest value of a cell and its neighbours, and whether all of them were ever observed."""
+    highest, known = -128, True
+    for i in range(row - 1, row + 2):
+        for j in range(col - 1, col + 2):
+            value = log_odds[i, j]
+            highest = max(highest, value)
+            known &= value != 0
+    return highest, known
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -67,17 +80,13 @@ def _count_beams(
             reach = r / resolution + 0.25  # what stopped the beam lies behind where it returned from
             col, row = int(u0 + c * reach), int(v0 + s * reach)
             if 0 < row < rows - 1 and 0 < col < cols - 1:
-                highest, lowest_known = -128, 1
-                for i in range(row - 1, row + 2):
-                    for j in range(col - 1, col + 2):
-                        value = log_odds[i, j]
-                        highest = max(highest, value)
-                        lowest_known = min(lowest_known, 1 if value != 0 else 0)
-                if highest >= OCCUPIED_FROM:
+                if log_odds[row, col] >= OCCUPIED_FROM:  # as most are
                     on_walls += 1
-                    sharp += log_odds[row, col] >= OCCUPIED_FROM
-                elif highest <= FREE_UP_TO and lowest_known == 1:
-                    in_the_open += 1
+                    sharp += 1
+                else:
+                    highest, known = _around(log_odds, row, col)
+                    on_walls += highest >= OCCUPIED_FROM
+                    in_the_open += highest <= FREE_UP_TO and known
         c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
     return on_walls, sharp, in_the_open
 

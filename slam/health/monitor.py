@@ -33,14 +33,14 @@ class HealthConfig:
     # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
     # lost, falls into each: in logarithms, since products of them are taken.
     against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
-    against_fine: tuple[float, ...] = (0.985, 0.012, 0.002, 0.0006, 0.0004)
-    against_lost: tuple[float, ...] = (0.05, 0.10, 0.20, 0.30, 0.35)
+    against_fine: tuple[float, ...] = (0.70, 0.20, 0.08, 0.015, 0.005)
+    against_lost: tuple[float, ...] = (0.06, 0.10, 0.15, 0.25, 0.44)
     # The same of the share of the beams on walls that end in the very cell of one.
     sharp_edges: tuple[float, ...] = (0.5, 0.65, 0.8, 0.9)
-    sharp_fine: tuple[float, ...] = (0.0005, 0.0015, 0.01, 0.1, 0.888)
-    sharp_lost: tuple[float, ...] = (0.30, 0.30, 0.25, 0.10, 0.05)
+    sharp_fine: tuple[float, ...] = (0.01, 0.06, 0.20, 0.30, 0.43)
+    sharp_lost: tuple[float, ...] = (0.35, 0.30, 0.20, 0.10, 0.05)
     # Scans one after the other err together: each counts as this part of one.
-    scan_weight: float = 0.4
+    scan_weight: float = 0.3
     lost_per_scan: float = 1e-5  # how likely a robot gets lost from one scan to the next
     blur_m: float = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
     doubt_against: float = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
@@ -67,6 +67,9 @@ class HealthConfig:
         require(0 < self.lost_per_scan < 1, "HealthConfig.lost_per_scan must be in (0, 1)")
 
 
+_LEAST_ODDS = 2e-5  # of being lost
+
+
 class HealthMonitor:
     """Takes evidence in and says how likely the belief is true.
 
@@ -74,6 +77,8 @@ class HealthMonitor:
     ----------
     fine : float
         Probability that the robot is about where it is believed to be.
+    health : float
+        Probability that the true pose lies within the 99.7 % region of the belief.
     """
 
     def __init__(self, config: HealthConfig) -> None:
@@ -87,18 +92,22 @@ class HealthMonitor:
         """Begin anew with this probability of being fine."""
         self._odds = (1.0 - fine) / max(fine, 1e-12)  # of being lost
         self._mean_sharp, self._mean_nis = 0.97, 0.0
+        self._judge()
 
     @property
     def fine(self) -> float:
         """P(fine)."""
         return 1.0 / (1.0 + self._odds)
 
-    @property
-    def health(self) -> float:
-        """Probability that the true pose lies within the 99.7 % region of the belief."""
+    def _judge(self) -> None:
         c = self.config
         score = c.bias + c.sharp_weight * (self._mean_sharp - 0.97) + c.nis_weight * self._mean_nis
-        return 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
+        self.health = 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
+
+    def calm(self, seen: Agreement) -> bool:
+        """Tell whether a scan says no more than what is known: that all is well. Most do, and cost nothing else."""
+        on_walls, sharp, in_the_open = seen
+        return self._odds <= _LEAST_ODDS and in_the_open <= 0.03 * on_walls and sharp >= 0.9 * on_walls
 
     def doubtful(self, seen: Agreement) -> bool:
         """Tell whether a scan speaks against the pose that it was looked at from."""
@@ -121,13 +130,15 @@ class HealthMonitor:
                 ratio += self._sharp[_bin(share, c.sharp_edges)]
                 self._mean_sharp += (share - self._mean_sharp) / c.memory
             odds *= math.exp(c.scan_weight * ratio / (1.0 + variance / c.blur_m**2))
-        self._odds = min(max(odds, 1e-6), 1e6)
+        self._odds = min(max(odds, _LEAST_ODDS), 1e6)
+        self._judge()
 
     def take_innovations(self, nis: float, dof: int) -> None:
         """Take in the NIS of an update with so many degrees of freedom."""
         if dof > 0 and math.isfinite(nis):
             value = math.log(max(nis / dof, 1e-3))
             self._mean_nis += (value - self._mean_nis) / self.config.memory
+            self._judge()
 
 
 def _log_ratios(lost: tuple[float, ...], fine: tuple[float, ...]) -> list[float]:
