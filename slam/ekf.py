@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig, found_cov
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks, read_block, symmetric_block
+from slam.gaussian import joint_gaussian as joint
+from slam.gaussian.joint_gaussian import near_landmarks, read_block, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
@@ -263,7 +264,7 @@ class EkfSlam(LandmarkBackend):
     def _add(self, z: Array, known_id: int | None) -> None:
         if self._n + 2 > len(self._x):
             self._enlarge()
-        add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
+        joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
         extent = (0.0, 0.0)
         if z[KIND] == LINE:
@@ -276,7 +277,7 @@ class EkfSlam(LandmarkBackend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
-        leave_out(self._x, self._p, self._n, 3 + 2 * row)
+        joint.leave_out(self._x, self._p, self._n, 3 + 2 * row)
         self._n -= 2
         self._book.drop(row)
 
@@ -298,8 +299,7 @@ class EkfSlam(LandmarkBackend):
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
         """Go on from a pose ``(3,)`` that a scan was found to be taken from.
 
-        The match says which landmarks are seen; where the robot is, these say, so that it inherits what is not
-        known of them, and is correlated with them as it should be.
+        It says which landmarks are seen. Where the robot is these say, so that it inherits what is unknown of them.
         """
         self._place(pose, cov + found_cov())
         z = self._features(scan)
@@ -365,24 +365,24 @@ class EkfSlam(LandmarkBackend):
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
         whole = self._covariance(np.concatenate([rows, lines]))
         points, _ = self._map_points()
-        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
+        points_cov = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
         index = 3 + 2 * np.arange(len(rows))
         cov = np.empty((len(index), 2, 2))
         for a in range(2):
             for b in range(2):
-                cov[:, a, b] = joint[index + a, index + b]
+                cov[:, a, b] = points_cov[index + a, index + b]
         return Belief(
             pose=self.pose,
-            pose_cov=joint[:3, :3].copy(),
+            pose_cov=points_cov[:3, :3].copy(),
             landmarks=points[rows],
             landmark_cov=cov,
             landmark_ids=self._ids[rows],
             grid=self.grid,
             health=self.health,
-            joint_cov=joint,
+            joint_cov=points_cov,
             landmark_kinds=marks[rows, 0].astype(np.int8),
             lines=points[lines],
-            line_ends=_ends_of(points[lines], marks[lines, 6:8]),
+            line_ends=joint.wall_ends(points[lines], marks[lines, 6:8]),
             whole_cov=whole,
         )
 
@@ -391,11 +391,3 @@ def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64
     """Return the state's indices of landmarks, after the robot's three if wanted."""
     rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
     return np.concatenate([np.arange(3), rows]) if robot else rows
-
-
-def _ends_of(lines: Array, extent: Array) -> Array:
-    """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
-    alpha, r = lines.T
-    n = np.column_stack([np.cos(alpha), np.sin(alpha)])
-    along = np.column_stack([-n[:, 1], n[:, 0]])
-    return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

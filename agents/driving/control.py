@@ -21,6 +21,8 @@ __all__ = ["ControlConfig", "PathFollower"]
 
 Array = NDArray[np.float64]
 
+_CREEP_M_S, _CREEP_HALF_RAD = 0.15, 0.35  # and half the width of the way that must be free
+
 
 @dataclass(frozen=True, kw_only=True)
 class ControlConfig:
@@ -155,6 +157,22 @@ class PathFollower:
         pose = np.asarray(belief.pose, dtype=np.float64)
         near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
         return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+
+    def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return a slow twist ``(3,)`` to where the scan shows most room, whatever the map says.
+
+        For a robot that does not know where on the map it is. Without a scan it stands.
+        """
+        hits, pose = scan_points(observation, self._lidar), np.asarray(belief.pose, dtype=np.float64)
+        if observation is None or not len(hits):
+            self.reset()
+            return np.zeros(3)
+        share, lidar = np.asarray(observation["scan"], np.float64), self._lidar
+        width = max(round(_CREEP_HALF_RAD / lidar.angle_increment), 1)
+        room = np.min([np.roll(share, k) for k in range(-width, width + 1)], axis=0)
+        angle = pose[2] + lidar.angle_min + lidar.angle_increment * int(np.argmax(room))
+        velocity = _CREEP_M_S * np.array([math.cos(angle), math.sin(angle)])
+        return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, hits)
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""

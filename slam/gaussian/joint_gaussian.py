@@ -25,6 +25,7 @@ __all__ = [
     "near_landmarks",
     "read_block",
     "symmetric_block",
+    "wall_ends",
 ]
 
 Array = NDArray[np.float64]
@@ -150,3 +151,11 @@ def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -
         for q in range(5):
             out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
         out[j, 5] = 1.0
+
+
+def wall_ends(lines: Array, extent: Array) -> Array:
+    """Return the ends ``(k, 4)`` of walls (α, r): as far as they were seen, along them from their feet."""
+    alpha, r = lines.T
+    n = np.column_stack([np.cos(alpha), np.sin(alpha)])
+    along = np.column_stack([-n[:, 1], n[:, 0]])
+    return np.hstack([r[:, None] * n + extent[:, [e]] * along for e in range(2)])

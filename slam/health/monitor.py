@@ -28,8 +28,8 @@ class HealthConfig:
     """
 
     recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
-    beams: int = 90  # of a scan that are looked at, at most
-    fewest_beams: int = 12  # that say anything, for a scan to count
+    beams: int = 60  # of a scan that are looked at, at most
+    fewest_beams: int = 10  # that say anything, for a scan to count
     # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
     # lost, falls into each: in logarithms, since products of them are taken.
     against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
