@@ -61,8 +61,6 @@ class Backend(abc.ABC):
     relocalises: ClassVar[bool] = True
     """Whether the pose is found anew where the belief is lost; where not, ``health`` tells, and that is all."""
 
-    _looks_seldom: ClassVar[bool] = True  # every second scan is enough where all is well
-
     def __init__(self, config: BackendConfig) -> None:
         self.config = config
         self.extractor = FeatureExtractor(config.features)
@@ -70,7 +68,6 @@ class Backend(abc.ABC):
         self.key_scans = KeyScans(config.key_scans)
         self.recovery = Recovery(config.health, config.relocalisation, config.lidar_offset_m)
         self._doubtful = False  # whether the scan at hand spoke against the predicted pose
-        self._calm = False  # whether the scan before it agreed with the map
         self._recovers = self.relocalises and config.health.recover
 
     def reset(
@@ -93,7 +90,7 @@ class Backend(abc.ABC):
         self.grid = OccupancyGrid(self.config.grid_resolution_m)
         self.key_scans = KeyScans(self.config.key_scans)
         self.recovery.reset()
-        self._doubtful = self._calm = False
+        self._doubtful = False
         self._start(start, cov, seed)
 
     @abc.abstractmethod
@@ -107,21 +104,18 @@ class Backend(abc.ABC):
     def update(self, scan: Scan) -> None:
         """Correct by a scan, and draw it into the grid; while the belief is lost, look for where it was taken."""
         recovery = self.recovery
-        if self._calm:  # the scan before this one agreed with the map: every second one is looked at
-            self._calm = False
-            self._update(scan)
-            return
         if recovery.lost:
-            place = recovery.search(self.grid, scan, self._foreseen(scan))
+            place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())
             if place is not None:
                 self._relocate(place.pose, place.cov, scan)
             return
-        x, y, theta = self._foreseen(scan).tolist()
-        seen = recovery.look(self.grid, (x, y, theta), scan)
-        if recovery.monitor.calm(seen):
-            recovery.kept, self._doubtful, self._calm = None, False, self._looks_seldom
+        foreseen = self._foreseen(scan)
+        if recovery.calm(self.grid, foreseen, scan):
+            recovery.kept, self._doubtful = None, False
             self._update(scan)
             return
+        x, y, theta = foreseen[:3].tolist()
+        seen = recovery.look(self.grid, (x, y, theta), scan)
         self._doubtful = recovery.monitor.doubtful(seen)
         if not self._doubtful:
             recovery.kept = None
@@ -139,7 +133,7 @@ class Backend(abc.ABC):
                 recovery.give_up()
 
     def _foreseen(self, scan: Scan) -> Array:
-        """Return the pose of the body ``(3,)`` that a scan is first held against the map from."""
+        """Return the pose of the body ``(≥ 3,)`` that a scan is first held against the map from; maybe a view."""
         return self.pose
 
     @abc.abstractmethod
@@ -242,21 +236,20 @@ class Backend(abc.ABC):
         for name, value in self.__dict__.items():
             if name not in _NOT_COPIED:  # what is in lists does not change
                 kept[name] = list(value) if isinstance(value, list) else copy.deepcopy(value)
-        kept["key_scan_poses"], kept["grid_revision"] = self.key_scans.poses, self.grid.revision
+        kept["key_scan_poses"] = self.key_scans.poses
         return kept
 
     def _put_back(self, kept: dict[str, Any]) -> None:
         """Become again what was copied, except for the pose: that the wheels have carried on."""
         pose, pose_cov = self.pose, self.pose_cov
-        poses, revision = kept.pop("key_scan_poses"), kept.pop("grid_revision")
+        poses = kept.pop("key_scan_poses")
         self.__dict__.update(kept)
         self._place(pose, pose_cov)
-        self._redraw_kept(poses, revision)
+        self._redraw_kept(poses)
 
-    def _redraw_kept(self, poses: Array, revision: int) -> None:
-        """Redraw the map from the key scans at these poses ``(n, 3)``, where it has changed since that revision."""
-        if self.grid.revision != revision or len(self.key_scans) != len(poses):
-            self.key_scans.put_back(self.grid, poses)
+    def _redraw_kept(self, poses: Array) -> None:
+        """Redraw the map from the key scans that there were when their poses ``(n, 3)`` were kept."""
+        self.key_scans.put_back(self.grid, poses)
 
     @abc.abstractmethod
     def _place(self, pose: Array, pose_cov: Array) -> None:
@@ -274,5 +267,5 @@ def found_cov() -> Array:
 
 
 _NOT_COPIED = {
-    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_calm", "_recovers",
+    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_recovers",
 }  # fmt: skip

@@ -81,7 +81,6 @@ class DpSlam(Backend):
     """
 
     observes_landmarks = False
-    _looks_seldom = False  # each scan is followed before it is looked at
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:
@@ -233,7 +232,7 @@ class DpSlam(Backend):
         self._poses[:] = pose  # they are drawn anew, around the best fit
         self._take(scan, body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m), due=True)
 
-    def _redraw_kept(self, poses: Array, revision: int) -> None:
+    def _redraw_kept(self, poses: Array) -> None:
         self.grid.redraw(self._shown, self._key)
 
     # ---- the map that is shown -----------------------------------------------------------------------------

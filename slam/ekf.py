@@ -289,6 +289,9 @@ class EkfSlam(LandmarkBackend):
         self._x, self._p = x, p
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
 
+    def _foreseen(self, scan: Scan) -> Array:
+        return self._x
+
     # ---- a pose from elsewhere ------------------------------------------------------------------------------
 
     def _place(self, pose: Array, pose_cov: Array) -> None:

@@ -16,7 +16,7 @@ from slam.grids.occupancy import OccupancyGrid
 from slam.grids.scan_drawing import FREE_UP_TO, OCCUPIED_FROM
 from slam.types import Scan
 
-__all__ = ["Agreement", "agreement", "through_walls"]
+__all__ = ["Agreement", "agreement", "agrees", "through_walls"]
 
 Array = NDArray[np.float64]
 
@@ -89,6 +89,32 @@ def _count_beams(
                     in_the_open += highest <= FREE_UP_TO and known
         c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
     return on_walls, sharp, in_the_open
+
+
+def agrees(grid: OccupancyGrid, body: Array, offset_m: float, scan: Scan, beams: int) -> bool:
+    """Tell whether a scan agrees with a map as well as scans do, from a pose of the body ``(3,)``.
+
+    Nine tenths of the beams on walls end in the very cell of one, and next to none in the open.
+    """
+    ranges, angle_min, increment, range_max, _ = scan
+    row0, col0 = grid.lattice_origin
+    return bool(_agrees(
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, body, offset_m,
+        len(ranges) // beams or 1,
+    ))  # fmt: skip
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _agrees(
+    log_odds: NDArray[np.int8], row0: int, col0: int, resolution: float, ranges: Array, angle_min: float,
+    increment: float, range_max: float, body: Array, offset: float, stride: int,
+) -> bool:  # fmt: skip
+    theta = body[2]
+    x, y = body[0] + offset * math.cos(theta), body[1] + offset * math.sin(theta)
+    on_walls, sharp, in_the_open = _count_beams(
+        log_odds, row0, col0, resolution, ranges, angle_min, increment, range_max, x, y, theta, stride
+    )
+    return in_the_open <= 0.03 * on_walls and sharp >= 0.9 * on_walls
 
 
 def through_walls(

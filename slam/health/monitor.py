@@ -28,8 +28,9 @@ class HealthConfig:
     """
 
     recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
-    beams: int = 60  # of a scan that are looked at, at most
-    fewest_beams: int = 10  # that say anything, for a scan to count
+    glance_beams: int = 36  # of a scan that are looked at, at most …
+    beams: int = 120  # … and where these do not agree
+    fewest_beams: int = 15  # that say anything, for a scan to count
     # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
     # lost, falls into each: in logarithms, since products of them are taken.
     against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
@@ -62,7 +63,7 @@ class HealthConfig:
                 require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values")
                 require(all(v > 0 for v in values), f"HealthConfig.{name}_{state} must be > 0")
         require(0 < self.give_up < self.found < 1, "HealthConfig needs 0 < give_up < found < 1")
-        require(self.beams >= 8, "HealthConfig.beams must be at least 8")
+        require(min(self.beams, self.glance_beams) >= 8, "HealthConfig.beams and glance_beams must be at least 8")
         require(self.memory >= 1 and self.blur_m > 0, "HealthConfig.memory must be ≥ 1, blur_m > 0")
         require(0 < self.lost_per_scan < 1, "HealthConfig.lost_per_scan must be in (0, 1)")
 
@@ -77,6 +78,8 @@ class HealthMonitor:
     ----------
     fine : float
         Probability that the robot is about where it is believed to be.
+    sure : bool
+        Whether a scan that agrees as ever would make no difference.
     health : float
         Probability that the true pose lies within the 99.7 % region of the belief.
     """
@@ -102,12 +105,8 @@ class HealthMonitor:
     def _judge(self) -> None:
         c = self.config
         score = c.bias + c.sharp_weight * (self._mean_sharp - 0.97) + c.nis_weight * self._mean_nis
+        self.sure = self._odds <= _LEAST_ODDS
         self.health = 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
-
-    def calm(self, seen: Agreement) -> bool:
-        """Tell whether a scan says no more than what is known: that all is well. Most do, and cost nothing else."""
-        on_walls, sharp, in_the_open = seen
-        return self._odds <= _LEAST_ODDS and in_the_open <= 0.03 * on_walls and sharp >= 0.9 * on_walls
 
     def doubtful(self, seen: Agreement) -> bool:
         """Tell whether a scan speaks against the pose that it was looked at from."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import compose, inverse
 from slam.grids.occupancy import OccupancyGrid
-from slam.health.evidence import Agreement, agreement
+from slam.health.evidence import Agreement, agreement, agrees
 from slam.health.monitor import HealthConfig, HealthMonitor
 from slam.health.relocalisation import Place, RelocalisationConfig, Relocaliser
 from slam.types import Scan
@@ -66,6 +66,10 @@ class Recovery:
     def health(self) -> float:
         """Probability that the true pose lies within the 99.7 % region of the belief."""
         return self.config.while_lost if self.lost else self.monitor.health
+
+    def calm(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
+        """Tell by a glance, at few beams, whether a scan from a pose of the body ``(3,)`` agrees as ever; most do."""
+        return self.monitor.sure and agrees(grid, body, self._offset_m, scan, self.config.glance_beams)
 
     def look(self, grid: OccupancyGrid, body: tuple[float, float, float], scan: Scan) -> Agreement:
         """Return what a scan says of a pose of the body (x, y, θ)."""

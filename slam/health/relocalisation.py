@@ -9,6 +9,7 @@ no beam ends in the open or comes through a wall, and only where no other place 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -51,6 +52,7 @@ class RelocalisationConfig:
     scans_each: tuple[int, ...] = (5, 15)  # … for so many scans, the last one until it is found
     every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
     confirm: int = 3  # scans that a place must explain, one after the other
+    sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
     matching: MatchConfig = field(default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01))
 
     def __post_init__(self) -> None:
@@ -86,7 +88,9 @@ class Relocaliser:
         room = cv2.erode((classes == FREE).astype(np.uint8), np.ones((3, 3), np.uint8))
         free = np.argwhere(room[::step, ::step]) * step
         self._free = grid.to_points(free)
+        self._sharp_matching = dataclasses.replace(config.matching, smooth_m=config.sharp_smooth_m)
         self._field: LikelihoodField | None = None
+        self._sharp_field: LikelihoodField
         self._field_of: tuple[float, float, float] = (math.nan, math.nan, math.nan)
 
     def find(self, scan: Scan, around: Array, radius_m: float) -> Place | None:
@@ -120,6 +124,7 @@ class Relocaliser:
             if math.isfinite(reach):
                 walls = walls[np.hypot(walls[:, 0] - x, walls[:, 1] - y) <= reach + 1.0]
             self._field = LikelihoodField(self.config.matching, walls)
+            self._sharp_field = LikelihoodField(self._sharp_matching, walls)
             self._field_of = (x, y, reach + 0.5)
         return self._field
 
@@ -159,7 +164,8 @@ class Relocaliser:
         """Refine a pose, and hold the scan against the map from there."""
         config = self.config
         found = match(likelihood, points, pose, config.matching)
-        found = refine(likelihood, points, found.pose, config.matching)
+        # Walls that the map does not have yet pull towards those that it has beside them: from near by only.
+        found = refine(self._sharp_field, points, found.pose, self._sharp_matching)
         x, y, theta = found.pose.tolist()
         sensor = (x + self._offset_m * math.cos(theta), y + self._offset_m * math.sin(theta), theta)
         seen = agreement(self._grid, sensor, scan, config.check_beams)
