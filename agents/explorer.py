@@ -250,7 +250,6 @@ class Explorer(Agent):
         self._lost_for += self._step_s
         self._anchored_at = self._time
         if self._lost_for < self.config.patience.lost_s:
-            self._follower.reset()
             return np.zeros(3, dtype=np.float32)
         return self._to_action(self._follower.creep(observation, belief))
 
