@@ -51,8 +51,8 @@ class BackendConfig:
 class Backend(abc.ABC):
     """An estimator: feed it odometry and scans (or landmark observations), read its belief.
 
-    Subclasses estimate; this class draws the grid from the estimated poses, and watches whether scans agree with it
-    (:mod:`slam.health.recovery`).
+    Subclasses estimate; this class draws the grid from the estimated poses, and watches whether scans agree with
+    it (:mod:`slam.health.recovery`).
     """
 
     observes_landmarks: ClassVar[bool] = True

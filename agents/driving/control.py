@@ -164,8 +164,8 @@ class PathFollower:
     def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
 
-        For a robot that does not know where on the map it is; where it came from, the map shows most. Without a scan
-        it stands.
+        For a robot that does not know where on the map it is; where it came from, the map shows most.
+        Without a scan it stands.
         """
         hits, pose = scan_points(observation, self._lidar), np.asarray(belief.pose, dtype=np.float64)
         if observation is None or not len(hits):

@@ -227,7 +227,7 @@ class World:
         self._check_start()
 
     def put(self, pose: ArrayLike) -> bool:
-        """Put the robot at rest at another pose ``(3,)`` of the world frame; tell whether it touches nothing there.
+        """Put the robot at rest at another pose ``(3,)`` of the world frame; tell whether it fits there.
 
         Where it would touch something it stays where it is. For studies of what a belief makes of it.
         """

@@ -110,9 +110,8 @@ class KeyScans:
         grid.redraw(corrected, self._scans)
         return True
 
-
     def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
-        """Keep the first scans only, as many as there are sensor poses ``(n, 3)``, and redraw ``grid`` from these."""
+        """Keep only as many scans as there are sensor poses ``(n, 3)``, the first ones, and redraw ``grid``."""
         n = len(poses)
         del self._scans[n:]
         self._poses[:n] = poses

@@ -1,9 +1,9 @@
 """How likely a belief is true: a recursive Bayes filter over what scans and innovations say.
 
-Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map. A
-filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be *too
-sure*: about right, yet by more off than the covariance says. That is in no single scan; a logistic function of what
-lasts, how sharply scans lie on the map and how large the innovations are, says how often that is so.
+Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map.
+A filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be *too
+sure*: about right, yet by more off than the covariance says. That is in no single scan; how often it is so was
+measured, and depends on how large the innovations are and on how evenly particles weigh.
 
     health = P(fine) · P(within the 99.7 % region | fine)
 """

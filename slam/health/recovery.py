@@ -68,7 +68,7 @@ class Recovery:
         return self.config.while_lost if self.lost else self.monitor.health
 
     def calm(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
-        """Tell by a glance, at few beams, whether a scan from a pose of the body ``(3,)`` agrees as ever; most do."""
+        """Tell by a glance, at few beams, whether a scan from a pose of the body agrees as ever; most do."""
         return self.monitor.sure and agrees(grid, body, self._offset_m, scan, self.config.glance_beams)
 
     def look(self, grid: OccupancyGrid, body: tuple[float, float, float], scan: Scan) -> Agreement:

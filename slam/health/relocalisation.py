@@ -53,7 +53,9 @@ class RelocalisationConfig:
     every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
     confirm: int = 3  # scans that a place must explain, one after the other
     sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
-    matching: MatchConfig = field(default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01))
+    matching: MatchConfig = field(
+        default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01)
+    )
 
     def __post_init__(self) -> None:
         require(self.spacing_m > 0 and self.spacing_rad > 0, "RelocalisationConfig.spacing_* must be > 0")
@@ -103,7 +105,9 @@ class Relocaliser:
         if len(points) < config.fewest_beams or not len(near) or not len(self._walls):
             return None
         likelihood = self._field_around(around, radius_m)
-        places = [self._look_at(likelihood, pose, points, scan) for pose in self._candidates(likelihood, near, points)]
+        places = [
+            self._look_at(likelihood, pose, points, scan) for pose in self._candidates(likelihood, near, points)
+        ]
         places.sort(key=lambda place: -place.quality)
         best = places[0]
         rival = next((p.quality for p in places[1:] if self._apart(p.pose, best.pose)), -math.inf)
@@ -133,7 +137,7 @@ class Relocaliser:
         config = self.config
         few = points[np.linspace(0, len(points) - 1, min(config.beams, len(points))).astype(np.int64)]
         block = round(config.spacing_m / likelihood.cell_m) | 1
-        highest = cv2.dilate(likelihood.values, np.ones((block, block), np.uint8))
+        highest = cv2.dilate(likelihood.values, np.ones((block, block), np.uint8)).astype(np.float32)
         turns = math.ceil(2.0 * math.pi / config.spacing_rad)
         scores = np.zeros((len(near), turns), np.float32)
         _score(highest, likelihood.x0, likelihood.y0, likelihood.cell_m, few, near, scores)
@@ -186,14 +190,17 @@ class Relocaliser:
 def _score(
     values: Values, x0: float, y0: float, cell: float, points: Array, positions: Array, scores: Values
 ) -> None:
-    """Write the mean field value of points ``(n, 2)`` from each position ``(m, 2)`` at each of so many headings."""
+    """Write the mean field value of points ``(n, 2)`` from each position ``(m, 2)`` at each heading."""
     rows, cols = values.shape
     turns, n = scores.shape[1], points.shape[0]
     du, dv = np.empty(n), np.empty(n)
     for t in range(turns):
         c, s = math.cos(2.0 * math.pi * t / turns), math.sin(2.0 * math.pi * t / turns)
         for k in range(n):
-            du[k], dv[k] = (c * points[k, 0] - s * points[k, 1]) / cell, (s * points[k, 0] + c * points[k, 1]) / cell
+            du[k], dv[k] = (
+                (c * points[k, 0] - s * points[k, 1]) / cell,
+                (s * points[k, 0] + c * points[k, 1]) / cell,
+            )
         for i in range(positions.shape[0]):
             u0, v0 = (positions[i, 0] - x0) / cell + 0.5, (positions[i, 1] - y0) / cell + 0.5
             total = 0.0

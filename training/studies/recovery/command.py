@@ -1,4 +1,4 @@
-"""``mecanum study recovery``: faults are made mid-episode; is the robot lost, does it notice, is it found again?
+"""``mecanum study recovery``: faults are made mid-episode, and it is seen whether the belief survives them.
 
 Every fault, backend and seed is one episode; episodes without a fault give false alarms, and how reliable the
 health is. ``docs/studies/recovery.md`` has what was measured.
@@ -38,14 +38,16 @@ def study(
     faults: Annotated[str, typer.Option(help=f"Of {', '.join(FAULTS)}; separated by commas.")] = ",".join(FAULTS),
     slam: Backends = "invariant-ekf",
     agent: Annotated[str, typer.Option(help="Who explores.")] = "nearest-frontier",
-    rooms: Annotated[str, typer.Option(help="Generators of rooms, files of plans, separated by commas.")] = "apartment",
+    rooms: Annotated[
+        str, typer.Option(help="Generators of rooms, files of plans, separated by commas.")
+    ] = "apartment",
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     seeds: Seeds = "10000:10049",
     max_steps: MaxSteps = 3000,
     workers: Workers = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/recovery"),
 ) -> None:
-    """Make faults mid-episode: is the belief lost, does it know, is it right again? And is its health true?"""
+    """Make faults mid-episode: whether the belief is lost, knows it, and is right again; how true its health is."""
     with bad_input():
         agents.check(agent)
         names = backend_names(slam)

@@ -17,6 +17,7 @@ __all__ = ["draw_recovery", "draw_reliability", "false_alarms", "recovered", "re
 
 Array = NDArray[np.float64]
 
+_COUNTED = ("count", "true", "sum")
 _IN_TIME_S = 20.0
 _DOUBLED = 0.02  # share of the mapped walls by which their precision may fall: more is a wall drawn twice
 
@@ -59,11 +60,9 @@ def false_alarms(rows: Sequence[Row]) -> dict[str, float]:
 def reliability(rows: Sequence[Row]) -> dict[str, Any]:
     """Return a reliability diagram's figures: per bin of health its mean, how often the belief was true, seconds.
 
-    ``brier`` is the mean square of health less 1 where it was true and less 0 where not; ``expected_error`` the mean
-    distance of the two means, each bin by its seconds.
+    ``expected_error`` is the mean distance of the two, each bin by its seconds.
     """
-    count = np.sum([row["count"] for row in rows], axis=0, dtype=np.float64)
-    true, total = (np.sum([row[key] for row in rows], axis=0, dtype=np.float64) for key in ("true", "sum"))
+    count, true, total = (np.array([row[key] for row in rows], np.float64).sum(axis=0) for key in _COUNTED)
     filled = count > 0
     health, share = total[filled] / count[filled], true[filled] / count[filled]
     weight = count[filled] / count.sum()
@@ -92,7 +91,9 @@ def draw_reliability(found: Mapping[str, Mapping[str, Any]]) -> Figure:
         health, true, seconds = np.array(points, np.float64).T
         # 95 % of what so many seconds would give if they were independent, which they are not.
         spread = 1.96 * np.sqrt(np.maximum(true * (1.0 - true), 0.25 / seconds) / seconds)
-        diagram.errorbar(health, true, yerr=spread, fmt="o-", color=COLOURS[k % len(COLOURS)], capsize=3, label=name)
+        diagram.errorbar(
+            health, true, yerr=spread, fmt="o-", color=COLOURS[k % len(COLOURS)], capsize=3, label=name
+        )
         bars = np.arange(len(one["seconds"])) + (k - 0.5 * (len(found) - 1)) * width
         counts.bar(bars, np.maximum(one["seconds"], 0.5), width, color=COLOURS[k % len(COLOURS)], label=name)
     diagram.set_xlim(0.0, 1.0)

@@ -41,8 +41,9 @@ def within(nees: float) -> bool:
 def run_job(job: Job) -> Row:
     """Do one episode.
 
-    Of one with a fault the row has ``possible`` (False: no place to be put to), ``begun_s``, ``recovered_s`` (after the
-    fault's end; None: never), ``worst_m``, ``contacts``, wall ``precision`` before and at the end. Every row has
+    Of one with a fault the row has ``possible`` (False: no place to be put to), ``begun_s``, ``recovered_s``
+    (after the fault's end; None: never), ``worst_m``, ``contacts``, walls' ``precision`` before and at the end.
+    Every row has
     ``seconds``, ``lost`` and ``found`` (how often), ``lost_s``, and per bin of :data:`BINS` how many seconds' ends
     fell into it, ``count``, at how many of those the true pose was within the region, ``true``, and the sum of the
     health there, ``sum``.
