@@ -302,7 +302,7 @@ class EkfSlam(LandmarkBackend):
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
         """Go on from a pose ``(3,)`` that a scan was found to be taken from.
 
-        It says which landmarks are seen; these say where the robot is, so that it inherits what is unknown of them.
+        It says which landmarks are seen; these say where the robot is: so it inherits what is unknown of them.
         """
         self._place(pose, cov + found_cov())
         z = self._features(scan)

@@ -2,8 +2,8 @@
 
 Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map.
 A filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be *too
-sure*: about right, yet by more off than the covariance says. That is in no single scan; how often it is so was
-measured, and depends on how large the innovations are and on how evenly particles weigh.
+sure*: about right, yet by more off than the covariance says. No single scan tells of that. How often it is so was
+measured; where landmarks are observed without a scan, it depends on how large the innovations are.
 
     health = P(fine) · P(within the 99.7 % region | fine)
 """
@@ -49,11 +49,12 @@ class HealthConfig:
     give_up: float = 0.2  # P(fine) below which the belief is lost
     while_lost: float = 0.02  # the health then
     found: float = 0.9  # P(fine) right after a relocalisation
-    memory: float = 50.0  # scans over which sharpness and innovations are averaged
-    # P(within the region | fine) = 1 / (1 + exp(-(bias + Σ weight · (feature - centre))))
-    bias: float = 4.0
-    sharp_weight: float = 0.0  # of the mean sharpness less 0.97
-    nis_weight: float = 0.0  # of the logarithm of NIS over its degrees of freedom
+    # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the weight
+    # times by how much the mean logarithm of NIS over its degrees of freedom exceeds where it begins to tell.
+    bias: float = 3.5
+    nis_weight: float = 2.9
+    nis_from: float = -2.2
+    memory: float = 50.0  # updates that the mean is taken over
 
     def __post_init__(self) -> None:
         for name in ("against", "sharp"):
@@ -94,7 +95,7 @@ class HealthMonitor:
     def restart(self, fine: float) -> None:
         """Begin anew with this probability of being fine."""
         self._odds = (1.0 - fine) / max(fine, 1e-12)  # of being lost
-        self._mean_sharp, self._mean_nis = 0.97, 0.0
+        self._mean_nis = self.config.nis_from
         self._judge()
 
     @property
@@ -104,7 +105,7 @@ class HealthMonitor:
 
     def _judge(self) -> None:
         c = self.config
-        score = c.bias + c.sharp_weight * (self._mean_sharp - 0.97) + c.nis_weight * self._mean_nis
+        score = c.bias - c.nis_weight * max(self._mean_nis - c.nis_from, 0.0)
         self.sure = self._odds <= _LEAST_ODDS
         self.health = 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
 
@@ -125,9 +126,7 @@ class HealthMonitor:
         if beams >= c.fewest_beams:
             ratio = self._against[_bin(in_the_open / beams, c.against_edges)]
             if on_walls:
-                share = sharp / on_walls
-                ratio += self._sharp[_bin(share, c.sharp_edges)]
-                self._mean_sharp += (share - self._mean_sharp) / c.memory
+                ratio += self._sharp[_bin(sharp / on_walls, c.sharp_edges)]
             odds *= math.exp(c.scan_weight * ratio / (1.0 + variance / c.blur_m**2))
         self._odds = min(max(odds, _LEAST_ODDS), 1e6)
         self._judge()

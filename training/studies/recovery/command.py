@@ -47,7 +47,7 @@ def study(
     workers: Workers = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/recovery"),
 ) -> None:
-    """Make faults mid-episode: whether the belief is lost, knows it, and is right again; how true its health is."""
+    """Make faults mid-episode: whether a belief is lost, knows it, and is right again; how true its health is."""
     with bad_input():
         agents.check(agent)
         names = backend_names(slam)
