@@ -1,9 +1,9 @@
 """How likely a belief is true: a recursive Bayes filter over what scans and innovations say.
 
 Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map.
-A filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be *too
-sure*: about right, yet by more off than the covariance says. No single scan tells of that. How often it is so was
-measured; where landmarks are observed without a scan, it depends on how large the innovations are.
+A filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be
+*too sure*: about right, yet by more off than the covariance says. No single scan tells of that. How often it is so
+was measured; where landmarks are observed without a scan, it depends on how large the innovations are.
 
     health = P(fine) · P(within the 99.7 % region | fine)
 """
@@ -49,8 +49,8 @@ class HealthConfig:
     give_up: float = 0.2  # P(fine) below which the belief is lost
     while_lost: float = 0.02  # the health then
     found: float = 0.9  # P(fine) right after a relocalisation
-    # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the weight
-    # times by how much the mean logarithm of NIS over its degrees of freedom exceeds where it begins to tell.
+    # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the
+    # weight, times by how much the mean logarithm of NIS over its degrees of freedom exceeds where it begins to tell.
     bias: float = 3.5
     nis_weight: float = 2.9
     nis_from: float = -2.2
