@@ -50,7 +50,7 @@ class HealthConfig:
     while_lost: float = 0.02  # the health then
     found: float = 0.9  # P(fine) right after a relocalisation
     # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the
-    # weight, times by how much the mean logarithm of NIS over its degrees of freedom exceeds where it begins to tell.
+    # weight, times what the mean logarithm of NIS over its degrees of freedom has above where it begins to tell.
     bias: float = 3.5
     nis_weight: float = 2.9
     nis_from: float = -2.2

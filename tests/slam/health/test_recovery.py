@@ -73,12 +73,9 @@ def test_the_landmarks_decide_where_a_found_robot_is() -> None:
 def test_dead_reckoning_is_never_found_anew() -> None:
     env = driven("odometry", 40)
     assert make_fault("teleport").begin(env, np.random.default_rng(0))
-    lowest = 1.0
     for _ in range(30):
         env.step(np.zeros(3, np.float32))
-        lowest = min(lowest, env.backend.health)
     assert env.backend.recovery.times_lost == 0
-    assert lowest < 0.9  # until what it draws from there has covered the map
     assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) > 0.8
 
 

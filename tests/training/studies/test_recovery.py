@@ -51,10 +51,10 @@ def test_a_wheel_without_grip_turns_the_robot() -> None:
         env = ExploreEnv(rooms="rectangular", noise={"preset": "nominal", "radius_error": 0.0, "base_error": 0.0})
         env.reset(seed=1)
         env.truth.world.grip[0] = grip
-        for _ in range(8):
+        for _ in range(12):
             env.step(np.array([0.4, 0.0, 0.0], np.float32))
         turned.append(abs(float(env.truth.pose[2])))
-    assert turned[0] < 0.02 < turned[1]
+    assert turned[0] < 0.3 * turned[1]
 
 
 def a_row(**changes: Any) -> Row:
