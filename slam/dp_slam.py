@@ -62,7 +62,7 @@ class DpSlamConfig(BackendConfig):
     matching: MatchConfig = field(default_factory=MatchConfig)
     scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
     # Particles close loops by themselves: until another one leads, the leading one's map contradicts the scans.
-    health: HealthConfig = field(default_factory=lambda: HealthConfig(scan_weight=0.1))
+    health: HealthConfig = field(default_factory=lambda: HealthConfig(scan_weight=0.1, bias=2.7))
     copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
 
     def __post_init__(self) -> None:
