@@ -58,8 +58,8 @@ class Backend(abc.ABC):
     observes_landmarks: ClassVar[bool] = True
     """Whether ``observe`` has a use for landmark observations; where not, it raises ``ValueError``."""
 
-    relocalises: ClassVar[bool] = True
-    """Whether the pose is found anew where the belief is lost; where not, ``health`` tells, and that is all."""
+    relocalises: ClassVar[bool] = False
+    """Whether the pose is found anew where the belief is lost, which takes ``_place``; if not, ``health`` tells."""
 
     def __init__(self, config: BackendConfig) -> None:
         self.config = config
@@ -136,9 +136,9 @@ class Backend(abc.ABC):
         """Return the pose of the body ``(≥ 3,)`` that a scan is first held against the map from; maybe a view."""
         return self.pose
 
-    @abc.abstractmethod
     def _update(self, scan: Scan) -> None:
-        """Correct by a scan, and draw it into the grid."""
+        """Correct by a scan, and draw it into the grid. One that overrides ``update`` instead is not watched."""
+        raise NotImplementedError(f"{type(self).__name__} has neither update nor _update")
 
     @abc.abstractmethod
     def observe(self, observations: Observations) -> None:
@@ -251,9 +251,12 @@ class Backend(abc.ABC):
         """Redraw the map from the key scans that there were when their poses ``(n, 3)`` were kept."""
         self.key_scans.put_back(self.grid, poses)
 
-    @abc.abstractmethod
     def _place(self, pose: Array, pose_cov: Array) -> None:
-        """Set the robot's pose ``(3,)`` with a covariance ``(3, 3)`` that is correlated with nothing."""
+        """Set the robot's pose ``(3,)`` with a covariance ``(3, 3)`` that is correlated with nothing.
+
+        To be overridden where ``relocalises``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be placed elsewhere")
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
         """Go on from a pose ``(3,)`` that a scan was found to be taken from."""

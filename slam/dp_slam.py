@@ -81,6 +81,7 @@ class DpSlam(Backend):
     """
 
     observes_landmarks = False
+    relocalises = True
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:

@@ -24,6 +24,8 @@ FEWEST_BACK = 2
 class LandmarkBackend(Backend):
     """A backend that keeps a book of landmarks."""
 
+    relocalises = True
+
     def _begin(self, policy: LandmarkPolicy) -> None:
         self._book = LandmarkBook(policy)
         self._twist = (0.0, 0.0, 0.0)

@@ -55,7 +55,7 @@ def study(
         for name in chosen:
             if name not in FAULTS:
                 raise unknown_name("fault", name, FAULTS)
-        places = [str(Path(p).absolute()) if Path(p).suffix else p for p in rooms.split(",")]
+        places = [place.strip() for place in rooms.split(",")]
         for place in places:
             where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}
             make_config(noise=noise, **where)  # type: ignore[arg-type]
