@@ -59,7 +59,7 @@ class Backend(abc.ABC):
     """Whether ``observe`` has a use for landmark observations; where not, it raises ``ValueError``."""
 
     relocalises: ClassVar[bool] = False
-    """Whether the pose is found anew where the belief is lost, which takes ``_place``; else ``health`` just tells."""
+    """Whether the pose is found anew where the belief is lost, which takes ``_place``; else health just tells."""
 
     def __init__(self, config: BackendConfig) -> None:
         self.config = config

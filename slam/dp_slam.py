@@ -62,7 +62,10 @@ class DpSlamConfig(BackendConfig):
     matching: MatchConfig = field(default_factory=MatchConfig)
     scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
     # Particles close loops by themselves: until another one leads, the leading one's map contradicts the scans.
-    health: HealthConfig = field(default_factory=lambda: HealthConfig(scan_weight=0.1, bias=2.7))
+    # How often a scan of a robot that is fine falls into each bin is that of the Intel log.
+    health: HealthConfig = field(default_factory=lambda: HealthConfig(
+        against_fine=(0.60, 0.25, 0.10, 0.04, 0.01), sharp_fine=(0.02, 0.12, 0.33, 0.33, 0.20), bias=2.7
+    ))  # fmt: skip
     copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
 
     def __post_init__(self) -> None:
