@@ -31,6 +31,8 @@ __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 
 Array = NDArray[np.float64]
 
+_LOST = 0.1  # health of a belief below which it is no good for driving
+
 
 @dataclass(frozen=True, kw_only=True)
 class PatienceConfig:
@@ -42,6 +44,7 @@ class PatienceConfig:
     looks: int = 1  # at one piece of frontier before it is let be
     stuck_s: float = 4.0  # without moving or turning: recover
     recover_s: float = 1.5
+    lost_s: float = 2.0  # how long to stand still when the belief is lost, before creeping on
     avoid_s: float = 20.0  # how long a goal that did not work out is put last; doubled each time
     attempts: int = 3  # at one goal that does not work out
     slowest_m_s: float = 0.15  # a goal gets 10 s and the time its path takes at this speed
@@ -101,6 +104,7 @@ class Explorer(Agent):
         self._recover_until = -math.inf
         self._anchor = (0.0, 0.0, 0.0)  # pose [m, m, rad] from which it has to get away in time
         self._anchored_at = 0.0
+        self._lost_for = 0.0
         self._troubles = Troubles(0.6 * self.config.patience.same_m)
         self._ending = "covered"  # why there is nothing left to choose, once there is nothing
         self._track: list[Array] = []  # sensor poses (3,) that frontiers were seen from
@@ -211,6 +215,9 @@ class Explorer(Agent):
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
+        if belief.health < _LOST:
+            return self._wait(observation, belief)
+        self._lost_for = 0.0
         self._keep_watch(belief)
         if self._due(belief):
             self._goal = self.choose(belief)
@@ -232,6 +239,19 @@ class Explorer(Agent):
             twist = self._follower.follow(observation, belief)
         self._watch(belief)
         return self._to_action(twist)
+
+    def _wait(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Stand still while the belief is lost; after a while creep to where the scan has most room.
+
+        From where it stands, two places may look alike.
+        """
+        self._status = "lost"
+        self._time += self._step_s
+        self._lost_for += self._step_s
+        self._anchored_at = self._time
+        if self._lost_for < self.config.patience.lost_s:
+            return np.zeros(3, dtype=np.float32)
+        return self._to_action(self._follower.creep(observation, belief))
 
     def _due(self, belief: Belief) -> bool:
         patience = self.config.patience

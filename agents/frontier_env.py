@@ -108,7 +108,7 @@ class _Beneath(ExploreEnv):
         backend, nothing = self.backend, np.zeros((0, 2))
         return Belief(
             pose=backend.pose, pose_cov=backend.pose_cov, landmarks=nothing, landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64), grid=backend.grid,
+            landmark_ids=np.zeros(0, np.int64), grid=backend.grid, health=backend.health,
         )  # fmt: skip
 
 

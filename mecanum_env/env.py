@@ -237,7 +237,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         known, map_entropy, pose_entropy = self._before
         config = self.config
         cell = config.grid_resolution_m**2
-        vx, vy, omega = np.asarray(self._odometry.twist).tolist()
+        twist = self._odometry.twist
+        vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
         robot = config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
         # By position: names would take as long again.
@@ -257,7 +258,10 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         truth = self.truth
         record, collisions = truth.record, truth.world.collisions
         time_s = self._steps * self.config.step_s
-        record.append((true_x, true_y, true_theta, x, y, theta, time_s, coverage, nees))
+        recovery = self.backend.recovery
+        health, lost = recovery.health, float(recovery.lost)
+        record.append((true_x, true_y, true_theta, x, y, theta, time_s, coverage, nees, health, lost))
+        record.relocalisations = recovery.relocalisations
         record.collisions = collisions
         return {
             "coverage": coverage,

@@ -25,12 +25,12 @@ WALL_TOLERANCE_M = 0.1
 """A mapped wall stands rightly where a true one is no farther than this."""
 
 # Columns of the record.
-_TRUE, _ESTIMATE, _TIME, _COVERAGE, _NEES = slice(0, 3), slice(3, 6), 6, 7, 8
-_COLUMNS = 9
+_TRUE, _ESTIMATE, _TIME, _COVERAGE, _NEES, _HEALTH, _LOST = slice(0, 3), slice(3, 6), 6, 7, 8, 9, 10
+_COLUMNS = 11
 
 
 class EpisodeRecord:
-    """Poses (true and believed, in the start frame), coverage and NEES of every step."""
+    """Poses (true and believed, in the start frame), coverage, NEES and health of every step."""
 
     def __init__(self) -> None:
         self._numbers = array("d")  # rows one after the other; a row of a NumPy array takes 1 µs longer to write
@@ -38,9 +38,13 @@ class EpisodeRecord:
         self._last = (0.0, 0.0)
         self.path_length_m = 0.0
         self.collisions = 0
+        self.relocalisations = 0
 
     def append(self, row: tuple[float, ...]) -> None:
-        """Add one step: true and believed pose (x, y, θ), time [s], coverage, NEES; first the start itself."""
+        """Add one step: true and believed pose (x, y, θ), time [s], coverage, NEES, health, 1 if lost.
+
+        The first is the start itself.
+        """
         self._numbers.extend(row)
         x, y = row[0], row[1]
         if self._count:
@@ -78,6 +82,11 @@ class EpisodeRecord:
         """Pose NEES of each row ``(n,)``, ideally 3 on average."""
         return self._rows[:, _NEES]
 
+    @property
+    def health(self) -> Array:
+        """Health of the belief after each row ``(n,)``."""
+        return self._rows[:, _HEALTH]
+
     def metrics(self, truth: GroundTruth, belief: Belief) -> dict[str, float | int | None]:
         """Return ``episode_metrics``: plain numbers, deterministic, ``None`` where not reached or not defined."""
         rows = self._rows
@@ -108,6 +117,9 @@ class EpisodeRecord:
             "final_position_error_m": float(np.hypot(end[0] - end[3], end[1] - end[4])),
             "final_heading_error_rad": abs(float(heading[0])),
             "anees": float(nees.mean() / 3.0) if len(nees) else None,
+            "health_mean": float(rows[:, _HEALTH].mean()),
+            "lost_s": round(float(rows[:, _LOST] @ np.diff(times, prepend=times[0])), 6),
+            "relocalisations": self.relocalisations,
             "landmarks": len(belief.landmarks),
         }
 

@@ -47,6 +47,7 @@ def observation_space(config: EnvConfig) -> spaces.Dict:
             ),
             "twist": spaces.Box(-_TWIST_LIMIT, _TWIST_LIMIT, (3,), np.float32),
             "progress": spaces.Box(0.0, 1.0, (2,), np.float32),
+            "health": spaces.Box(0.0, 1.0, (1,), np.float32),
         }
     )
 
@@ -97,13 +98,14 @@ def observe(
     vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
     maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
     ranges = np.empty(len(scan.ranges), np.float32)
-    numbers = np.empty(15, np.float32)
+    numbers = np.empty(16, np.float32)
     landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
     _fill(
         maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution, grid.overview_sums,
         grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov, vx / robot.max_speed_m_s,
         vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2,
     )  # fmt: skip
+    numbers[15] = backend.health
     backend.near_landmarks(landmarks)
     return {
         "map_local": maps[0],
@@ -114,6 +116,7 @@ def observe(
         "landmarks": landmarks,
         "twist": numbers[10:13],
         "progress": numbers[13:15],
+        "health": numbers[15:],
     }
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import abc
+import copy
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,15 @@ from slam.belief import Belief
 from slam.features.extraction import FeatureConfig, FeatureExtractor
 from slam.grids.key_scans import KeyScanConfig, KeyScans
 from slam.grids.occupancy import OccupancyGrid
+from slam.health.monitor import HealthConfig
+from slam.health.recovery import Recovery
+from slam.health.relocalisation import RelocalisationConfig
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
 from slam.settings import require
 from slam.types import Observations, Odometry, Scan
 
-__all__ = ["Backend", "BackendConfig"]
+__all__ = ["Backend", "BackendConfig", "found_cov"]
 
 Array = NDArray[np.float64]
 
@@ -34,6 +38,8 @@ class BackendConfig:
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     key_scans: KeyScanConfig = field(default_factory=KeyScanConfig)
+    health: HealthConfig = field(default_factory=HealthConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     start_sigma_m: float = 1e-4  # of the start pose where none is given: never exactly zero
     start_sigma_rad: float = 1e-4
 
@@ -45,17 +51,24 @@ class BackendConfig:
 class Backend(abc.ABC):
     """An estimator: feed it odometry and scans (or landmark observations), read its belief.
 
-    Subclasses estimate; this class draws the grid from the estimated poses.
+    Subclasses estimate; this class draws the grid from the estimated poses, and watches whether scans agree with
+    it (:mod:`slam.health.recovery`).
     """
 
     observes_landmarks: ClassVar[bool] = True
     """Whether ``observe`` has a use for landmark observations; where not, it raises ``ValueError``."""
+
+    relocalises: ClassVar[bool] = False
+    """Whether the pose is found anew where the belief is lost, which takes ``_place``; else health just tells."""
 
     def __init__(self, config: BackendConfig) -> None:
         self.config = config
         self.extractor = FeatureExtractor(config.features)
         self.grid = OccupancyGrid(config.grid_resolution_m)
         self.key_scans = KeyScans(config.key_scans)
+        self.recovery = Recovery(config.health, config.relocalisation, config.lidar_offset_m)
+        self._doubtful = False  # whether the scan at hand spoke against the predicted pose
+        self._recovers = self.relocalises and config.health.recover
 
     def reset(
         self, pose: Array | tuple[float, float, float] = (0.0, 0.0, 0.0), *,
@@ -76,6 +89,8 @@ class Backend(abc.ABC):
             raise ValueError("a pose covariance is a finite (3, 3) matrix")
         self.grid = OccupancyGrid(self.config.grid_resolution_m)
         self.key_scans = KeyScans(self.config.key_scans)
+        self.recovery.reset()
+        self._doubtful = False
         self._start(start, cov, seed)
 
     @abc.abstractmethod
@@ -86,9 +101,44 @@ class Backend(abc.ABC):
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
 
-    @abc.abstractmethod
     def update(self, scan: Scan) -> None:
-        """Correct by a scan, and draw it into the grid."""
+        """Correct by a scan, and draw it into the grid; while the belief is lost, look for where it was taken."""
+        recovery = self.recovery
+        if recovery.lost:
+            place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())
+            if place is not None:
+                self._relocate(place.pose, place.cov, scan)
+            return
+        foreseen = self._foreseen(scan)
+        if recovery.calm(self.grid, foreseen, scan):
+            recovery.kept, self._doubtful = None, False
+            self._update(scan)
+            return
+        x, y, theta = foreseen[:3].tolist()
+        seen = recovery.look(self.grid, (x, y, theta), scan)
+        self._doubtful = recovery.monitor.doubtful(seen)
+        if not self._doubtful:
+            recovery.kept = None
+            recovery.monitor.take(seen, self._end_variance())
+            self._update(scan)
+        elif not self._recovers:
+            recovery.monitor.take(seen, self._end_variance())
+            self._update(scan)
+        else:
+            if recovery.kept is None:
+                recovery.kept = self._copy()
+            self._update(scan)
+            if recovery.kept is not None and recovery.monitor.fine < recovery.config.give_up:
+                self._put_back(recovery.kept)
+                recovery.give_up()
+
+    def _foreseen(self, scan: Scan) -> Array:
+        """Return the pose of the body ``(≥ 3,)`` that a scan is first held against the map from; maybe a view."""
+        return self.pose
+
+    def _update(self, scan: Scan) -> None:
+        """Correct by a scan, and draw it into the grid. One that overrides ``update`` instead is not watched."""
+        raise NotImplementedError(f"{type(self).__name__} has neither update nor _update")
 
     @abc.abstractmethod
     def observe(self, observations: Observations) -> None:
@@ -139,9 +189,14 @@ class Backend(abc.ABC):
         return np.array([x + offset * math.cos(theta), y + offset * math.sin(theta), theta])
 
     def _draw(self, scan: Scan) -> None:
-        """Draw a scan from the believed pose, and keep it where the sensor has moved on."""
+        """Draw a scan from the believed pose, and keep it where the sensor has moved on.
+
+        Not one that contradicts the map from there.
+        """
         config, grid, surface = self.config, self.grid, self.extractor.surface
         body_x, body_y, theta = self.pose.tolist()
+        if self._doubtful and self._recovers and self._contradicts((body_x, body_y, theta), scan):
+            return
         offset = config.lidar_offset_m
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
         grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
@@ -152,3 +207,68 @@ class Backend(abc.ABC):
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
         """Return ids ``(k,)`` and estimates ``(k, 2)`` of the landmarks that the last scan showed."""
         return np.zeros(0, np.int64), np.zeros((0, 2))
+
+    # ---- health ------------------------------------------------------------------------------------------------
+
+    @property
+    def health(self) -> float:
+        """Probability that the true pose lies within the belief's 99.7 % region (NEES ≤ 14.16)."""
+        return self.recovery.health
+
+    def _end_variance(self) -> float:
+        """Return the variance [m²] of a beam's end three metres off, by the covariance of the pose."""
+        cov = self.pose_cov
+        return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
+
+    def _contradicts(self, body: tuple[float, float, float], scan: Scan) -> bool:
+        """Take in what a doubtful scan says of the corrected pose of the body; tell whether it still disagrees."""
+        recovery = self.recovery
+        seen = recovery.look(self.grid, body, scan)
+        recovery.monitor.take(seen, self._end_variance())
+        if recovery.monitor.doubtful(seen):
+            return True
+        recovery.kept = None
+        return False
+
+    def _copy(self) -> dict[str, Any]:
+        """Return a copy of all that estimates; not of the map that is shown, which is redrawn instead."""
+        kept: dict[str, Any] = {}
+        for name, value in self.__dict__.items():
+            if name not in _NOT_COPIED:  # what is in lists does not change
+                kept[name] = list(value) if isinstance(value, list) else copy.deepcopy(value)
+        kept["key_scan_poses"] = self.key_scans.poses
+        return kept
+
+    def _put_back(self, kept: dict[str, Any]) -> None:
+        """Become again what was copied, except for the pose: that the wheels have carried on."""
+        pose, pose_cov = self.pose, self.pose_cov
+        poses = kept.pop("key_scan_poses")
+        self.__dict__.update(kept)
+        self._place(pose, pose_cov)
+        self._redraw_kept(poses)
+
+    def _redraw_kept(self, poses: Array) -> None:
+        """Redraw the map from the key scans that there were when their poses ``(n, 3)`` were kept."""
+        self.key_scans.put_back(self.grid, poses)
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        """Set the robot's pose ``(3,)`` with a covariance ``(3, 3)`` that is correlated with nothing.
+
+        To be overridden where ``relocalises``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} cannot be placed elsewhere")
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        """Go on from a pose ``(3,)`` that a scan was found to be taken from."""
+        self._place(pose, cov + found_cov())
+        self._update(scan)
+
+
+def found_cov() -> Array:
+    """Return the covariance ``(3, 3)`` of a place on a map of cells, besides what the match says."""
+    return np.diag(np.square([0.03, 0.03, 0.01]))
+
+
+_NOT_COPIED = {
+    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_recovers",
+}  # fmt: skip

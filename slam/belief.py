@@ -30,4 +30,5 @@ class Belief:
     )
     lines: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (k, 2) walls: α [rad], r [m]
     line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]
+    health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)

@@ -93,10 +93,10 @@ class CompressedEkfSlam(EkfSlam):
         self._phi[0] -= (self._x[1] - y) * self._phi[2]
         self._phi[1] += (self._x[0] - x) * self._phi[2]
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, in the region of what it can show."""
         self._settle(scan.range_max)
-        super().update(scan)
+        super()._update(scan)
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations, in the region that holds them."""
@@ -109,6 +109,11 @@ class CompressedEkfSlam(EkfSlam):
             if strangers and np.isin(strangers, self._map_ids[self._far]).any():
                 self._choose_region(ids)
         super().observe(observations)
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        self._place(pose, cov)
+        self._choose_region(np.zeros(0, np.int64))
+        super()._relocate(pose, cov, scan)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         super()._correct(z, match)
@@ -134,10 +139,6 @@ class CompressedEkfSlam(EkfSlam):
             self._free.append(len(self._near) + len(self._far))  # every place before it is taken
         self._near = np.append(self._near, self._free.pop())
 
-    def _forget_pose(self, pose: Array) -> None:
-        super()._forget_pose(pose)
-        self._phi[:3] = 0.0  # the robot's rows of P_ab are none of what they were
-
     def _drop(self, row: int) -> None:
         n, i = self._n, 3 + 2 * row
         self._phi[i : n - 2] = self._phi[i + 2 : n]
@@ -148,6 +149,11 @@ class CompressedEkfSlam(EkfSlam):
     def _enlarge(self) -> None:
         super()._enlarge()
         self._u = aligned_zeros(len(self._s), self._n0)
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        self.flush()
+        super()._place(pose, pose_cov)
+        self._cross[:3] = 0.0
 
     # ---- regions -------------------------------------------------------------------------------------------
 

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 class OdometrySlam(EkfSlam):
     """Dead reckoning: the pose is what the wheels say, with the covariance that follows from V."""
 
+    relocalises = False  # the pose is not for the scan to doubt
+
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._robot_cov = np.array(pose_cov)

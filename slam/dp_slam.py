@@ -15,11 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend, BackendConfig
+from slam.backend import Backend, BackendConfig, found_cov
 from slam.belief import Belief
 from slam.geometry import compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
+from slam.health.monitor import HealthConfig
 from slam.particles.grids import ParticleGrids, ScanCells
 from slam.particles.inherited import beyond, common_descent
 from slam.particles.map_error import MapError, transport
@@ -63,6 +64,11 @@ class DpSlamConfig(BackendConfig):
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     matching: MatchConfig = field(default_factory=MatchConfig)
     scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
+    # Particles close loops by themselves: until another one leads, the leading one's map contradicts the scans.
+    # How often a scan of a robot that is fine falls into each bin is that of the Intel log.
+    health: HealthConfig = field(default_factory=lambda: HealthConfig(
+        against_fine=(0.60, 0.25, 0.10, 0.04, 0.01), sharp_fine=(0.02, 0.12, 0.33, 0.33, 0.20), bias=2.7
+    ))  # fmt: skip
     copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
 
     def __post_init__(self) -> None:
@@ -83,6 +89,7 @@ class DpSlam(Backend):
     """
 
     observes_landmarks = False
+    relocalises = True
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:
@@ -106,6 +113,7 @@ class DpSlam(Backend):
         self._odometry = ScanOdometry(config.scan_odometry, config.matching, config.odometry)
         self._lead, self._drawn_from = 0, pose.copy()  # the lead's pose at the last update
         self._drift = np.diag(np.square([config.drift_m, config.drift_m, config.drift_rad]))
+        self._points = np.zeros((0, 2))  # where the scan's beams ended, in the body frame
         self._updates = 0  # since the last resampling
         self.n_eff = float(n)
         self.resampled = False
@@ -118,22 +126,32 @@ class DpSlam(Backend):
         self._odometry.predict(odometry)
         self._believed = None
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Follow the motion by the scan; where the robot has moved on, weigh and correct the particles by it."""
-        points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
-        self._odometry.correct(points)
+        self._take(scan, self._points, due=self._moved_on())
+
+    def _foreseen(self, scan: Scan) -> Array:
+        """Follow the motion by the scan; return where that has the leading particle."""
+        self._points = body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m)
+        self._odometry.correct(self._points)
+        self._believed = None
+        return compose(self._poses[self._lead], self._motion())
+
+    def _take(self, scan: Scan, points: Array, *, due: bool) -> None:
+        """Update the particles where that is due; draw the scan, unless it contradicts the map."""
         self.extractor.extract(scan)  # the surfaces that the grid is drawn with
-        if self._moved_on():
+        if due:
             self._update_particles(points)
             self._key.append((scan, self.extractor.surface.copy()))
             self._follow_the_lead()
             self._shown = np.vstack([self._shown, self.sensor_pose(self._poses[self._lead])])
         self._believed = None
         body = compose(self._poses[self._lead], self._motion())
-        self.grid.integrate(
-            self.sensor_pose(body), scan, self.extractor.surface,
-            body=(float(body[0]), float(body[1]), self.config.body_radius_m),
-        )  # fmt: skip
+        x, y, theta = body.tolist()
+        if not (self._doubtful and self._recovers and self._contradicts((x, y, theta), scan)):
+            self.grid.integrate(
+                self.sensor_pose(body), scan, self.extractor.surface, body=(x, y, self.config.body_radius_m)
+            )
 
     def observe(self, observations: Observations) -> None:
         """Refuse: maps of occupied cells have no use for landmark observations."""
@@ -238,6 +256,22 @@ class DpSlam(Backend):
         self._log_weights[:] = -math.log(n)
         self._updates = 0
 
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        n = self.config.particles
+        self._poses = scattered(pose, pose_cov, n, self._rng)
+        self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
+        self._odometry.forget()
+        self._believed = None
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        """Draw every particle where the scan fits its map, next to a pose ``(3,)``."""
+        self._place(pose, cov + found_cov())
+        self._poses[:] = pose  # they are drawn anew, around the best fit
+        self._take(scan, body_points(scan, self.config.matching, offset_m=self.config.lidar_offset_m), due=True)
+
+    def _redraw_kept(self, poses: Array) -> None:
+        self.grid.redraw(self._shown, self._key)
+
     # ---- the map that is shown -----------------------------------------------------------------------------
 
     def _follow_the_lead(self) -> None:
@@ -296,6 +330,7 @@ class DpSlam(Backend):
             landmark_cov=np.zeros((0, 2, 2)),
             landmark_ids=np.zeros(0, np.int64),
             grid=self.grid,
+            health=self.health,
         )
 
 

@@ -13,18 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import BackendConfig
+from slam.backend import BackendConfig, found_cov
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import (
-    add_landmark,
-    forget_pose,
-    leave_out,
-    line_ends,
-    near_landmarks,
-    read_block,
-    state_rows,
-    symmetric_block,
-)
+from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
@@ -42,6 +33,8 @@ from slam.types import LINE, Observations, Odometry, Scan
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
 
 Array = NDArray[np.float64]
+
+_WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 
 ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
@@ -87,9 +80,8 @@ class EkfSlam(LandmarkBackend):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
-        self.witness: Callable[[list[Innovation]], object] | None = (
-            None  # told of every correction before it is made
-        )
+        # Told of every correction before it is made.
+        self.witness: Callable[[list[Innovation]], object] | None = None
         self._max_turn = math.radians(c.max_turn_deg)
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
@@ -117,13 +109,17 @@ class EkfSlam(LandmarkBackend):
         vx, vy, omega, var_v, var_w = self._measured(odometry, self._noise)
         predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
-        corners = self.extractor.extract(scan)
-        self._take((self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS], scan)
+        self._take(self._features(scan), scan)
         self._draw(scan)
         if self.key_scans.due():
             self.key_scans.redraw_if_moved(self.grid, *self._map_points())
+
+    def _features(self, scan: Scan) -> Array:
+        """Return what a scan shows as observation rows ``(m, 10)``."""
+        corners = self.extractor.extract(scan)
+        return (self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS]
 
     def _take(self, z: Array, scan: Scan | None) -> None:
         """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
@@ -144,10 +140,7 @@ class EkfSlam(LandmarkBackend):
         self._manage(z, match, scan)
 
     def observe(self, observations: Observations) -> None:
-        """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``).
-
-        New ids are added at once; without ids, landmarks are confirmed as with scans.
-        """
+        """Correct by observations without a scan; known ids are believed up to ``known_gate``, new ones added."""
         z = observation_rows(observations)
         for begin in range(0, len(z), MAX_OBSERVATIONS):
             part = z[begin : begin + MAX_OBSERVATIONS]
@@ -155,6 +148,7 @@ class EkfSlam(LandmarkBackend):
                 self._take(part, None)
             else:
                 self._take_known(part, [int(i) for i in observations.ids[begin : begin + MAX_OBSERVATIONS]])
+        self.recovery.monitor.take_innovations(self.nis, self.nis_dof)
 
     def _take_known(self, z: Array, ids: list[int]) -> None:
         """Correct by observations of these landmarks, but those that cannot be theirs, and add new ones."""
@@ -182,18 +176,13 @@ class EkfSlam(LandmarkBackend):
             return
         match, n = self._rows(found.ids), self._n
         x, p = self._x.copy(), self._p.copy()
-        forget_pose(x, p, n, found.pose)
-        dof, nis = stacked_update(
-            x, p, n, found.rows, match, self.config.lidar_offset_m, self._h, self._w, self._s
-        )
+        joint.place(x, p, n, found.pose, joint.ANYWHERE_COV)
+        offset, work = self.config.lidar_offset_m, (self._h, self._w, self._s)
+        dof, nis = stacked_update(x, p, n, found.rows, match, offset, *work)
         if nis < chi2_quantile(0.999, dof - 3):  # three of them went into the pose
-            self._forget_pose(found.pose)
+            self._place(found.pose, joint.ANYWHERE_COV)
             self._correct(found.rows, match)
             self._known.forget()
-
-    def _forget_pose(self, pose: Array) -> None:
-        """Have the robot anywhere, linearised at a pose ``(3,)``, and the map as it is."""
-        forget_pose(self._x, self._p, self._n, pose)
 
     def _associate(self, z: Array) -> NDArray[np.int64]:
         config, book = self.config, self._book
@@ -241,9 +230,8 @@ class EkfSlam(LandmarkBackend):
         Against a wall, or pulling away too hard, the wheels turn and the robot does not follow. V knows nothing
         of that, and a filter that trusts it has every gate closed within two steps and is lost for good. So the
         pose may be off by as much as the wheels claim to have moved since the landmarks were last in sight.
-        Gates as wide as that would take any corner near by for a landmark. So one pose must explain them all, and
-        the scan must fit the map far better from there: what changed may be the view, through a door, say, where
-        the next corner of the jamb fits a little better by chance.
+        Gates so wide take any corner for a landmark. So one pose must explain them all, and the scan must fit the
+        map far better from there: in a door, where the view changes, another corner fits a bit better by chance.
         """
         n = self._n
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
@@ -283,9 +271,8 @@ class EkfSlam(LandmarkBackend):
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
-        # The first scan is taken at the start, whose pose is known. Landmarks that had to wait for two more would
-        # be placed from where the wheels alone have the robot by then, and pass that on to all that is mapped
-        # later: over apartments with slippery floors it was four fifths of the whole.
+        # where the wheels alone have the robot by then: four fifths of all errors, on slippery floors.
+        # where the wheels alone have the robot by then: that was four fifths of all errors on slippery floors.
         at_once = scan is not None and self._book.now == 0
         new, gone = self._book.review(self._x, self.config.lidar_offset_m, z, match, scan, at_once=at_once)
         for k in new:
@@ -296,7 +283,7 @@ class EkfSlam(LandmarkBackend):
     def _add(self, z: Array, known_id: int | None) -> None:
         if self._n + 2 > len(self._x):
             self._enlarge()
-        add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
+        joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
         extent = (float(z[EDGE]), 0.0)
         if z[KIND] == LINE:
@@ -309,7 +296,7 @@ class EkfSlam(LandmarkBackend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
-        leave_out(self._x, self._p, self._n, 3 + 2 * row)
+        joint.leave_out(self._x, self._p, self._n, 3 + 2 * row)
         self._n -= 2
         self._book.drop(row)
 
@@ -320,6 +307,26 @@ class EkfSlam(LandmarkBackend):
         p[: self._n, : self._n] = self._p[: self._n, : self._n]
         self._x, self._p = x, p
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
+
+    def _foreseen(self, scan: Scan) -> Array:
+        return self._x
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        joint.place(self._x, self._p, self._n, pose, pose_cov)
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        """Go on from a pose ``(3,)`` that a scan was found to be taken from.
+
+        It says which landmarks are seen; these say where the robot is: so it inherits what is unknown of them.
+        """
+        self._place(pose, cov + found_cov())
+        z = self._features(scan)
+        match = self._associate(z).copy()
+        self._place(pose, np.diag(np.square(_WIDE)))
+        self._correct(z, match)
+        self._unseen_motion = (0.0, 0.0)
+        self._manage(z, match, scan)
+        self._draw(scan)
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
@@ -340,7 +347,7 @@ class EkfSlam(LandmarkBackend):
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)``."""
         out = np.empty((3, 3))
-        symmetric_block(self._p, out)
+        joint.symmetric_block(self._p, out)
         return out
 
     def pose_nees(self, true_pose: Array) -> float:
@@ -355,9 +362,9 @@ class EkfSlam(LandmarkBackend):
 
     def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         """Return the covariance of the robot and some landmarks."""
-        rows = state_rows(landmarks, robot=True)
+        rows = joint.state_rows(landmarks, robot=True)
         out = np.empty((len(rows), len(rows)))
-        read_block(self._p, rows, out)
+        joint.read_block(self._p, rows, out)
         return out
 
     @property
@@ -367,7 +374,7 @@ class EkfSlam(LandmarkBackend):
 
     def near_landmarks(self, out: NDArray[np.float32]) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
-        near_landmarks(self._x, self._p, self._book.marks, out)
+        joint.near_landmarks(self._x, self._p, self._book.marks, out)
 
     @property
     def belief(self) -> Belief:
@@ -376,22 +383,18 @@ class EkfSlam(LandmarkBackend):
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
         whole = self._covariance(np.concatenate([rows, lines]))
         points, _ = self._map_points()
-        joint = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
-        index = 3 + 2 * np.arange(len(rows))
-        cov = np.empty((len(index), 2, 2))
-        for a in range(2):
-            for b in range(2):
-                cov[:, a, b] = joint[index + a, index + b]
+        points_cov = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
         return Belief(
             pose=self.pose,
-            pose_cov=joint[:3, :3].copy(),
+            pose_cov=points_cov[:3, :3].copy(),
             landmarks=points[rows],
-            landmark_cov=cov,
+            landmark_cov=joint.point_covs(points_cov),
             landmark_ids=self._ids[rows],
             grid=self.grid,
-            joint_cov=joint,
+            health=self.health,
+            joint_cov=points_cov,
             landmark_kinds=marks[rows, 0].astype(np.int8),
             lines=points[lines],
-            line_ends=line_ends(points[lines], marks[lines, 6:8]),
+            line_ends=joint.line_ends(points[lines], marks[lines, 6:8]),
             whole_cov=whole,
         )

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import ANYWHERE_M, OBSERVED_LIMIT
+from slam.gaussian.joint_gaussian import ANYWHERE_COV, OBSERVED_LIMIT
 from slam.geometry import rotation
+from slam.health.monitor import HealthConfig
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
@@ -58,6 +59,8 @@ class FastSlamConfig(BackendConfig):
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
     unexplained: float = 11.83
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
+    # The true pose lies within the 99.7 % region a third of the time: docs/reference/health.md.
+    health: HealthConfig = field(default_factory=lambda: HealthConfig(bias=-0.7))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,7 +115,7 @@ class FastSlam(LandmarkBackend):
     def _move(self, twist: Array, dt: float, var_v: float, var_w: float) -> None:
         """Move every particle by a measured twist of these variances."""
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self.extractor.extract(scan)[:MAX_OBSERVATIONS]
         match, leader = self._associate(z)
@@ -173,9 +176,8 @@ class FastSlam(LandmarkBackend):
         ])  # fmt: skip
         for i in range(len(self._poses)):
             self._poses[i] = rigid_fit(ahead, self._maps.of(i)[rows, :2])
-        anywhere = np.diag([ANYWHERE_M**2, ANYWHERE_M**2, math.pi**2])
-        self._covs[:] = anywhere
-        self._inherited.widen(anywhere)
+        self._covs[:] = ANYWHERE_COV
+        self._inherited.widen(ANYWHERE_COV)
         match = self._match_buffer(len(rows))
         match[:] = rows
         self._correct(found.rows, match)
@@ -276,6 +278,16 @@ class FastSlam(LandmarkBackend):
         narrow(pose, cov.copy(), landmarks, np.arange(len(landmarks)), z, match, offset, 0.0)
         return self.grid.agreement(self.sensor_pose(pose), scan)
 
+    # ---- a pose from elsewhere -------------------------------------------------------------------------------
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        # Drawn by what is seen, as after wheels that spun: in three dimensions none of the particles would hit it.
+        n = self.config.particles
+        self._poses[:], self._covs[:] = pose, np.triu(pose_cov)
+        self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
+        self._unseen_motion = (0.0, 0.0)
+        self._believe()
+
     # ---- the book of landmarks -----------------------------------------------------------------------------
 
     def _manage(self, z: Array, match: Indices, best: int, scan: Scan | None) -> None:
@@ -361,6 +373,7 @@ class FastSlam(LandmarkBackend):
             landmark_cov=cov.copy(),
             landmark_ids=self._book.ids.copy(),
             grid=self.grid,
+            health=self.health,
             landmark_kinds=self._marks[:, 0].astype(np.int8),
         )
 

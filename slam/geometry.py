@@ -66,8 +66,8 @@ def relative(poses: Array, seen: Array) -> Array:
 def exp(twist: Array) -> Array:
     """Return the pose reached from the origin by a body twist (vx, vy, ω) held for one unit of time."""
     vx, vy, omega = (float(v) for v in twist)
-    if abs(omega) < 1e-9:
-        # Second-order series: exact to rounding below this angle.
+    if abs(omega) < 1e-6:
+        # Second-order series: exact to rounding below this angle, where 1 - cos ω is all rounding.
         a, b = 1.0 - omega * omega / 6.0, 0.5 * omega
     else:
         a, b = math.sin(omega) / omega, (1.0 - math.cos(omega)) / omega

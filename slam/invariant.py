@@ -98,8 +98,8 @@ class InvariantEkfSlam(EkfSlam):
             self._wheels.drop(self._n, 3 + 2 * row)
         super()._drop(row)
 
-    def _forget_pose(self, pose: Array) -> None:
-        super()._forget_pose(pose)
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        super()._place(pose, pose_cov)
         if self._wheels is not None:
             self._wheels.forget_pose()
 

@@ -26,6 +26,8 @@ FEWEST_BACK = 2
 class LandmarkBackend(Backend):
     """A backend that keeps a book of landmarks."""
 
+    relocalises = True
+
     def _begin(self, policy: LandmarkPolicy) -> None:
         self._book = LandmarkBook(policy)
         self._known = KnownIds(self.config.lidar_offset_m)
@@ -34,7 +36,8 @@ class LandmarkBackend(Backend):
 
     def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
         """Count a step by the wheels; return its vx, vy, ω and V's variances of speed and turn rate."""
-        vx, vy, omega = np.asarray(odometry.twist, dtype=np.float64).tolist()
+        given = odometry.twist
+        vx, vy, omega = given if isinstance(given, tuple) else np.asarray(given, np.float64).tolist()
         twist, dt, lever = (vx, vy, omega), odometry.dt, noise.lever_m
         var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
         self._twist = twist

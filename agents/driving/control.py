@@ -21,6 +21,9 @@ __all__ = ["ControlConfig", "PathFollower"]
 
 Array = NDArray[np.float64]
 
+_CREEP_M_S, _CREEP_ROOM_M = 0.2, 1.0
+_CREEP_HALF_RAD = 0.35  # half the width of the way that must be free
+
 
 @dataclass(frozen=True, kw_only=True)
 class ControlConfig:
@@ -119,6 +122,7 @@ class PathFollower:
         self._path = np.zeros((1, 2))
         self._arc = np.zeros(1)
         self._heading: float | None = None
+        self._creeping: float | None = None  # direction [rad, belief's frame] that it creeps in
         self._index = 0
         self.blocked = False  # the last step wanted to move and could not
         self.arrived = False
@@ -127,6 +131,7 @@ class PathFollower:
     def set_path(self, path: Array, heading: float | None) -> None:
         """Follow ``path`` ``(n, 2)`` and end with ``heading`` [rad], or with any where it is ``None``."""
         self._path = np.ascontiguousarray(path, dtype=np.float64)
+        self._creeping = None
         self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self._path, axis=0).T))])
         self._heading = heading
         self._index = 0
@@ -155,6 +160,27 @@ class PathFollower:
         pose = np.asarray(belief.pose, dtype=np.float64)
         near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
         return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+
+    def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
+
+        For a robot that does not know where on the map it is; where it came from, the map shows most.
+        Without a scan it stands.
+        """
+        hits, pose = scan_points(observation, self._lidar), np.asarray(belief.pose, dtype=np.float64)
+        if observation is None or not len(hits):
+            return np.zeros(3)
+        share, lidar = np.asarray(observation["scan"], np.float64), self._lidar
+        width = max(round(_CREEP_HALF_RAD / lidar.angle_increment), 1)
+        room = np.min([np.roll(share, k) for k in range(-width, width + 1)], axis=0) * lidar.range_max_m
+        angles = pose[2] + lidar.angle_min + lidar.angle_increment * np.arange(lidar.beams)
+        if self._creeping is None:
+            back = self._path[0] - pose[:2]
+            self._creeping = math.atan2(back[1], back[0])
+        worth = np.minimum(room, _CREEP_ROOM_M) * (2.0 + np.cos(angles - self._creeping))
+        self._creeping = angle = float(angles[int(np.argmax(worth))])
+        velocity = _CREEP_M_S * np.array([math.cos(angle), math.sin(angle)])
+        return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, hits)
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""

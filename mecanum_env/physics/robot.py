@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -34,6 +35,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+_FLOAT32 = np.dtype(np.float32)  # of what agents send
 
 GRAVITY_M_S2 = 9.80665
 
@@ -116,8 +119,10 @@ class WheelTargets:
         return wheels
 
 
-def _numbers(action: ArrayLike) -> Array:
-    """Return an action as a contiguous array of its own: the kernels are compiled for nothing else."""
+def _numbers(action: ArrayLike) -> NDArray[Any]:
+    """Return an action as a contiguous array of float32 or float64: the kernels are compiled for nothing else."""
+    if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.flags.c_contiguous:
+        return action
     try:
         return np.array(action, np.float64)
     except (TypeError, ValueError):
@@ -129,7 +134,7 @@ def _no_action(action: ArrayLike, size: int) -> ValueError:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _twist_to_wheels(fractions: Array, limits: Array, wheels: Array) -> bool:
+def _twist_to_wheels(fractions: NDArray[Any], limits: Array, wheels: Array) -> bool:
     """Write the wheel speeds of a twist; tell whether its numbers are finite (see :class:`WheelTargets`)."""
     if not math.isfinite(fractions[0] + fractions[1] + fractions[2]):
         return False
@@ -147,7 +152,7 @@ def _twist_to_wheels(fractions: Array, limits: Array, wheels: Array) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scale_wheels(fractions: Array, limits: Array, wheels: Array) -> bool:
+def _scale_wheels(fractions: NDArray[Any], limits: Array, wheels: Array) -> bool:
     """Write wheel speeds from fractions of the limit; tell whether these are finite."""
     if not math.isfinite(fractions[0] + fractions[1] + fractions[2] + fractions[3]):
         return False

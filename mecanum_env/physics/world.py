@@ -67,13 +67,14 @@ _CONSTANTS = slice(4, 14)  # from :func:`mecanum_env.physics.robot.dynamics_cons
 _RASTER = slice(14, 17)  # the floor's: x, y of its corner [m], cells a metre
 _WHEELS_X, _WHEELS_Y = slice(17, 21), slice(21, 25)  # in the body frame [m]
 _HALF_X, _HALF_Y, _SLIP = 25, 26, 27
-_FIXED_SIZE = 28
+_GRIP = slice(28, 32)  # share of the floor's friction that each wheel has
+_FIXED_SIZE = 32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
     """Run :func:`turn_wheels` over a physics step with the μ that the wheels stand on at its start."""
-    state, raster, mu = work[_STATE], fixed[_RASTER], work[_MU]
+    state, raster, mu, grip = work[_STATE], fixed[_RASTER], work[_MU], fixed[_GRIP]
     wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
     c, s = math.cos(state[2]), math.sin(state[2])
     rows, cols = friction.shape
@@ -82,7 +83,7 @@ def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: flo
         y = state[1] + s * wheels_x[i] + c * wheels_y[i]
         col = min(max(int((x - raster[0]) * raster[2]), 0), cols - 1)
         row = min(max(int((y - raster[1]) * raster[2]), 0), rows - 1)
-        mu[i] = friction[row, col]
+        mu[i] = friction[row, col] * grip[i]
     turn_wheels(
         state, work[_TARGETS], work[_GROUND_RADII], mu, fixed[_CONSTANTS], work[_MOTOR], h, substeps, work[_MOTION]
     )
@@ -212,6 +213,7 @@ class World:
         self._fastest = max(
             robot.max_speed_m_s, robot.max_turn_rate_rad_s * robot.circumscribed_radius_m
         )  # [m/s] of any point of the body
+        fixed[_GRIP] = 1.0
         self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
         self._work = np.zeros(_WORK_SIZE)
@@ -224,11 +226,33 @@ class World:
         self._forgotten = _PERSISTENCE  # pymunk's steps since it last found a contact
         self._check_start()
 
-    def _check_start(self) -> None:
+    def put(self, pose: ArrayLike) -> bool:
+        """Put the robot at rest at another pose ``(3,)`` of the world frame; tell whether it fits there.
+
+        Where it would touch something it stays where it is. For studies of what a belief makes of it.
+        """
+        before = self._work[_STATE].copy()
+        self._work[POSE], self._work[TWIST], self._work[WHEELS] = np.asarray(pose, np.float64), 0.0, 0.0
+        free = self._touches_nothing()
+        if not free:
+            self._work[_STATE] = before
+            self._place_body()
+        self._wrap_pose()
+        return free
+
+    @property
+    def grip(self) -> Array:
+        """Share of the floor's friction that each wheel has ``(4,)``; a view, which studies may write to."""
+        return self._fixed[_GRIP]
+
+    def _touches_nothing(self) -> bool:
         self._place_body()
         (shape,) = self._body.shapes
         shape.cache_bb()
-        if self._space.shape_query(shape):
+        return not self._space.shape_query(shape)
+
+    def _check_start(self) -> None:
+        if not self._touches_nothing():
             at = ", ".join(f"{v:.2f}" for v in self.plan.start)
             raise FloorPlanError(
                 f"the start ({at}) in {self.plan.name!r} has the robot touch something; choose another"

@@ -18,14 +18,15 @@ from slam.landmarks.joint_compatibility import insert_nearest
 from slam.types import LINE
 
 __all__ = [
-    "ANYWHERE_M",
+    "ANYWHERE_COV",
     "OBSERVED_LIMIT",
     "add_landmark",
-    "forget_pose",
     "landmark_by_pose",
     "leave_out",
     "line_ends",
     "near_landmarks",
+    "place",
+    "point_covs",
     "read_block",
     "state_rows",
     "symmetric_block",
@@ -36,8 +37,8 @@ Array = NDArray[np.float64]
 OBSERVED_LIMIT = 1e4
 """Bound of what :func:`near_landmarks` writes, m and m²: Gymnasium asks for finite spaces."""
 
-ANYWHERE_M = 10.0
-"""Standard deviation of a place that is as good as unknown."""
+ANYWHERE_COV = np.diag([10.0**2, 10.0**2, math.pi**2])
+"""Covariance of a pose that is as good as unknown."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -103,15 +104,14 @@ def leave_out(x: Array, p: Array, n: int, i: int) -> None:
         x[a] = x[a + 2]
 
 
-def forget_pose(x: Array, p: Array, n: int, pose: Array) -> None:
-    """Put the robot at a pose ``(3,)`` that is as good as unknown: of P's robot rows only a wide diagonal is left.
+def place(x: Array, p: Array, n: int, pose: Array, cov: Array) -> None:
+    """Put the robot at a pose ``(3,)`` of covariance ``(3, 3)`` that has nothing to do with any landmark.
 
-    So the next update finds it by the landmarks alone, and ``pose`` is only where that is linearised.
+    With :data:`ANYWHERE_COV` the next update finds it by the landmarks alone, linearised at ``pose``.
     """
     x[:3] = pose
     p[:3, :n] = 0.0
-    p[0, 0] = p[1, 1] = ANYWHERE_M**2
-    p[2, 2] = math.pi**2
+    p[:3, :3] = np.triu(cov)
 
 
 def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:
@@ -174,6 +174,12 @@ def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64
     """Return the state's indices of landmarks, after the robot's three if wanted."""
     rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
     return np.concatenate([np.arange(3), rows]) if robot else rows
+
+
+def point_covs(cov: Array) -> Array:
+    """Return the landmarks' own covariances ``(n, 2, 2)``, of a joint one ``(3 + 2n, 3 + 2n)``."""
+    rows = 3 + np.arange(len(cov) - 3).reshape(-1, 2)
+    return cov[rows[:, :, None], rows[:, None, :]]
 
 
 def line_ends(lines: Array, extent: Array) -> Array:

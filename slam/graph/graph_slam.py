@@ -41,6 +41,7 @@ class GraphSlam(Backend):
     """
 
     observes_landmarks = False
+    relocalises = True
     config: GraphSlamConfig
 
     def __init__(self, config: GraphSlamConfig | None = None) -> None:
@@ -80,7 +81,7 @@ class GraphSlam(Backend):
         self._mean, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
         self._cov = rows[:, :3]
 
-    def update(self, scan: Scan) -> None:
+    def _update(self, scan: Scan) -> None:
         """Align the scan with the patches in reach; where the robot has moved on, make it a key scan."""
         config, atlas = self.config, self.atlas
         self.extractor.extract(scan)
@@ -201,16 +202,30 @@ class GraphSlam(Backend):
     # ---- the map that is shown -----------------------------------------------------------------------------
 
     def _draw_it(self, scan: Scan) -> None:
-        body, surface = self._mean, self.extractor.surface
-        sensor = self.sensor_pose(body)
-        self.grid.integrate(
-            sensor, scan, surface, body=(float(body[0]), float(body[1]), self.config.body_radius_m)
-        )
+        x, y, theta = self._mean.tolist()
+        if self._doubtful and self._recovers and self._contradicts((x, y, theta), scan):
+            return
+        sensor, surface = self.sensor_pose(self._mean), self.extractor.surface
+        self.grid.integrate(sensor, scan, surface, body=(x, y, self.config.body_radius_m))
         if self.key_scans.wants(*sensor.tolist()):
             self.key_scans.keep(sensor, scan, surface, np.zeros(0, np.int64), np.zeros((0, 2)))
             self._drawn.append((scan, surface.copy()))
             self._drawn_at.append(len(self._at) - 1)
             self._shown.append(sensor)
+
+    def _place(self, pose: Array, pose_cov: Array) -> None:
+        """Have the motion since the key scan lead to a pose ``(3,)``, as well known as that is."""
+        key = self.atlas.window.pose
+        back = about_z(float(-key[2]))
+        self._motion, self._upper = relative(key[None], pose[None])[0], np.triu(back @ pose_cov @ back.T)
+        back = about_z(float(-pose[2]))
+        self._step, self._step_upper = np.zeros(3), np.triu(back @ pose_cov @ back.T)
+        self._last, self._mean, self._cov = pose.copy(), pose.copy(), pose_cov.copy()
+
+    def _redraw_kept(self, poses: Array) -> None:
+        super()._redraw_kept(poses)
+        if self._drawn:
+            self.grid.redraw(np.array(self._shown), self._drawn)
 
     def _redraw_if_moved(self) -> None:
         """Redraw the grid where a scan would be drawn from more than half a cell from where it was."""
@@ -262,6 +277,7 @@ class GraphSlam(Backend):
             landmark_cov=np.zeros((0, 2, 2)),
             landmark_ids=np.zeros(0, np.int64),
             grid=self.grid,
+            health=self.health,
         )
 
 

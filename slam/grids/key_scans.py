@@ -85,9 +85,11 @@ class KeyScans:
     def due(self) -> bool:
         """Count an update; tell whether it is time to look at the landmarks again."""
         self._since_check += 1
-        n = len(self._scans)
+        if self._since_check < self.config.check_every:
+            return False
         # A redraw costs as much as there are key scans: the longer the journey, the rarer the look.
-        return self._since_check >= max(self.config.check_every, n // 8) and n >= 2
+        n = len(self._scans)
+        return self._since_check >= n // 8 and n >= 2
 
     def redraw_if_moved(self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64]) -> bool:
         """Redraw ``grid`` if a landmark's correction moved a key scan by more than half a cell; tell whether.
@@ -107,6 +109,15 @@ class KeyScans:
         self._last = tuple(corrected[-1].tolist())
         grid.redraw(corrected, self._scans)
         return True
+
+    def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
+        """Keep only as many scans as there are sensor poses ``(n, 3)``, the first ones, and redraw ``grid``."""
+        n = len(poses)
+        del self._scans[n:]
+        self._poses[:n] = poses
+        self._anchor_ids[n:] = -1
+        self._last = tuple(poses[-1].tolist()) if n else (0.0, 0.0, 0.0)
+        grid.redraw(poses, self._scans)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

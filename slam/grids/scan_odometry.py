@@ -120,6 +120,12 @@ class ScanOdometry:
         self.settled = self.pose.copy()
         self._upper = np.zeros((3, 3))
 
+    def forget(self) -> None:
+        """Begin with new surroundings, and count motion from here."""
+        self._scans.clear()
+        self._field, self._claimed = None, (0.0, 0.0)
+        self.settle()
+
     def _moved_on(self) -> bool:
         if not self._scans:
             return True

@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.gaussian.joint_gaussian import point_covs
 from slam.particles.maps import innovation
 
 __all__ = ["InheritedError", "beyond", "common_descent"]
@@ -89,9 +90,7 @@ class InheritedError:
 
     def of_landmarks(self) -> Array:
         """Return the landmarks' own covariances ``(n, 2, 2)``."""
-        at = np.arange(3, self._size, 2)
-        index = np.stack([at, at + 1], axis=1)
-        return self._p[index[:, :, None], index[:, None, :]]
+        return point_covs(self.cov)
 
 
 def common_descent(origin: Indices, weights: Array) -> float:

@@ -30,6 +30,10 @@ STUDIES = {
     ),
     "paper-d": ("training.studies.paper_d", "how far mapped corners are from the true ones, backend by backend"),
     "ratios": ("training.benchmark.ratios", "one agent's errors and times against the others' in a benchmark"),
+    "recovery": (
+        "training.studies.recovery.command",
+        "faults made mid-episode: is the belief lost, does it know, is it found again?",
+    ),
     "recording-cost": ("training.studies.recording_cost", "what recording an episode takes"),
 }
 """Name → the module whose function ``study`` it is, and a line for the list."""

@@ -55,6 +55,7 @@ class Recording:
     twists: Array  # (n, 3) the wheels' account of the step: vx, vy [m/s], ω [rad/s] in the body frame
     coverage: Array  # (n,)
     nees: Array  # (n,) of the pose, ideally 3 on average
+    health: Array  # (n,) of the belief
     collisions: Ints  # (n,) so far
     resolution: float  # [m] of a cell
     scan: Scan  # the first one: its angles and limits are those of all
@@ -117,7 +118,7 @@ class Recorder:
         return Recording(
             step_s=env.config.step_s, times=record.times, true_poses=record.true_poses, estimates=record.estimates,
             pose_covs=np.array(self._covs), twists=np.array(self._twists), coverage=record.coverage,
-            nees=record.nees, collisions=np.array(self._collisions, np.int32),
+            nees=record.nees, health=record.health, collisions=np.array(self._collisions, np.int32),
             resolution=env.backend.grid.resolution, scan=self._scan, scans=_recorded(self._scans),
             goals=_recorded(self._goals), landmarks=_recorded(self._landmarks), map_changes=_recorded(self._maps),
         )  # fmt: skip

@@ -58,7 +58,10 @@ def metrics(replay: Replay) -> dict[str, Any]:
         found["landmark_rmse_m"] = ate(surveyed[mapped], belief.landmarks[mapped])
         if np.count_nonzero(mapped) > 1:
             found["landmark_rmse_aligned_m"] = ate_aligned(surveyed[mapped], belief.landmarks[mapped])
+    recovery = replay.backend.recovery
     found |= {
+        "health_mean": float(np.mean(replay.health)) if replay.health else None,
+        "times_lost": recovery.times_lost, "relocalisations": recovery.relocalisations,
         "landmarks": len(belief.landmarks), "samples": len(true), "steps": replay.steps,
         "observations": replay.observations, "duration_s": replay.time_s, "wall_s": round(replay.wall_time_s, 3),
         "realtime_factor": round(replay.time_s / max(replay.wall_time_s, 1e-9), 1),

@@ -103,7 +103,7 @@ def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
     ``header["arrays"]`` lists name, type and length of the arrays in their order. What was noted now and then has
     its steps in ``*_step`` and how many values belong to each in ``*_count``.
 
-    - Each row: ``true`` and ``estimate`` (x, y, θ), ``cov`` (xx, xy, yy, θθ), ``coverage``, ``nees``,
+    - Each row: ``true`` and ``estimate`` (x, y, θ), ``cov`` (xx, xy, yy, θθ), ``coverage``, ``nees``, ``health``,
       ``collisions``; the time is the row's number times ``step_s``.
     - ``scan``: ranges in 252nds of the lidar's reach, each less the one before it, modulo 256.
     - ``landmark``: x, y [mm], semi-axes of the covariance (1σ) [0.1 mm], the longer's direction [°]; a table of
@@ -122,6 +122,7 @@ def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
         "cov": covs[:, (0, 0, 1, 2), (0, 1, 1, 2)].astype(np.float32),
         "coverage": recording.coverage.astype(np.float32),
         "nees": recording.nees.astype(np.float32),
+        "health": recording.health.astype(np.float32),
         "collisions": np.minimum(recording.collisions, 65535).astype(np.uint16),
         "scan_step": scans.steps.astype(np.uint32),
         "scan": _ranges(scans, recording.scan.range_max),

@@ -191,6 +191,7 @@ class _Log:
             "error/position_m": np.hypot(off[:, 0], off[:, 1]),
             "error/heading_rad": np.abs(wrap(off[:, 2])),
             "nees": recording.nees,
+            "health": recording.health,
             "collisions": recording.collisions.astype(np.float64),
         }
         steps = np.arange(len(recording.times))

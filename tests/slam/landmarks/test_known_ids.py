@@ -9,6 +9,7 @@ import pytest
 
 import slam
 from slam import Observations, Odometry
+from slam.gaussian.joint_gaussian import ANYWHERE_COV
 from slam.geometry import compose, transform_points, wrap
 from slam.landmarks.association import IGNORED
 from slam.landmarks.known_ids import KnownIds, rigid_fit
@@ -82,7 +83,7 @@ def test_the_region_of_the_compressed_filter_forgets_a_pose_as_the_full_one_does
         backend, *_ = run(name, steps=60)
         if name == "compressed-ekf":
             backend._choose_region(np.array([0]))
-        backend._forget_pose(backend.pose + np.array([0.02, -0.01, 0.01]))
+        backend._place(backend.pose + np.array([0.02, -0.01, 0.01]), ANYWHERE_COV)
         rng = np.random.default_rng(3)
         backend.predict(Odometry(np.array([0.1, 0.0, 0.1]), 0.1))
         seen = observe_landmarks(backend.pose, LANDMARKS, 0.1, COV, rng, reach=3.0)
@@ -101,7 +102,7 @@ def test_a_forgotten_pose_is_found_by_the_landmarks_alone():
     belief, pose = backend.belief, backend.pose
     rng = np.random.default_rng(5)
     seen = observe_landmarks(pose, belief.landmarks, 0.1, 1e-12 * np.eye(2), rng)
-    backend._forget_pose(pose + np.array([0.01, 0.02, -0.01]))
+    backend._place(pose + np.array([0.01, 0.02, -0.01]), ANYWHERE_COV)
     backend.observe(Observations(seen.range_bearing, np.tile(1e-6 * np.eye(2), (len(seen.ids), 1, 1)),
                                  belief.landmark_ids[seen.ids]))  # fmt: skip
     np.testing.assert_allclose(backend.pose, pose, atol=2e-3)

@@ -109,7 +109,7 @@ def test_raw_odometry_is_found_again(kind, tmp_path):
 
 def test_predict_composes_to_the_odometry(tmp_path):
     log = scan_log(put_lines(tmp_path / "a.log", carmen_lines(30)))
-    backend = slam.make("odometry", config=log.settings)
+    backend = slam.make("odometry")
     backend.reset(log.start_pose)
     now = 0.0
     for event, expected in zip(log.events(), log.dead_reckoning(), strict=True):

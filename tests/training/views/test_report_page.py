@@ -267,7 +267,7 @@ def test_the_page_replays_the_episode_in_a_browser(browser: Any, episode: Record
         walls = browser.execute_script("return replay.map.classes.filter((c) => c === 101).length")
         assert walls == sum(now == OCCUPIED for now in expected.values())
     outputs = [e.text for e in browser.find_elements("css selector", "#curves output")]
-    assert outputs[0] == f"{100 * recording.coverage[0]:.1f}" and len(outputs) == 4
+    assert outputs[0] == f"{100 * recording.coverage[0]:.1f}" and len(outputs) == 5
     assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
 
 

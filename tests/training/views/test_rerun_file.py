@@ -75,7 +75,8 @@ def test_entities_and_their_rows(path: Path, columns: Columns, episode: Recorded
         "/world/true": n, "/world/true_path": n - 1, "/world/believed": n, "/world/believed_path": n - 1,
         "/world/believed/lidar/scan": len(recording.scans.steps), "/world/plan": len(recording.goals.steps),
         "/world/landmarks": landmark_notes, "/world/landmarks/ellipses": landmark_notes,
-        "/coverage": n, "/error/position_m": n, "/error/heading_rad": n, "/nees": n, "/collisions": n,
+        "/coverage": n, "/error/position_m": n, "/error/heading_rad": n, "/nees": n, "/health": n,
+        "/collisions": n,
     }  # fmt: skip
     static = Counter(c.entity_path for c in RrdReader(path).stream().to_chunks() if c.is_static)
     assert {"/world", "/world/true/body", "/world/believed/body", "/world/believed/lidar"} <= set(static)
@@ -138,6 +139,7 @@ def test_curves_are_those_recorded(columns: Columns, episode: Recorded) -> None:
     for entity, values in (
         ("/coverage", recording.coverage),
         ("/nees", recording.nees),
+        ("/health", recording.health),
         ("/collisions", recording.collisions),
         ("/error/position_m", np.hypot(off[:, 0], off[:, 1])),
         ("/error/heading_rad", np.abs(wrap(off[:, 2]))),

@@ -24,6 +24,10 @@ function openCurves(header, { data, poseEllipse }, pick) {
       name: "NEES / 3, ideally 1 on average", unit: "", digits: 2, colour: "--landmark", goal: 1,
       values: series((k) => (k ? data.nees[k] / 3 : NaN)),
     },
+    {
+      name: "health of the belief", unit: "", digits: 2, colour: "--link", least: 1, goal: 1,
+      values: series((k) => data.health[k]),
+    },
   ];
 
   for (const curve of curves) {

@@ -1,0 +1,150 @@
+"""How likely a belief is true: a recursive Bayes filter over what scans and innovations say.
+
+Two things can be wrong with a belief. It can be *lost*: the robot is somewhere else, and scans contradict the map.
+A filter with two states, fine and lost, takes each scan's evidence in by the likelihoods of both. Or it can be
+*too sure*: about right, yet by more off than the covariance says. No single scan tells of that. How often it is so
+was measured; where landmarks are observed without a scan, it depends on how large the innovations are.
+
+    health = P(fine) · P(within the 99.7 % region | fine)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from slam.health.evidence import Agreement
+from slam.settings import require
+
+__all__ = ["HealthConfig", "HealthMonitor"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class HealthConfig:
+    """What evidence weighs, and when a belief is given up.
+
+    Likelihoods and weights were measured on rooms of seeds below 1000 and on two floors
+    (docs/reference/health.md); they are properties of the evidence, not of a room.
+    """
+
+    recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
+    glance_beams: int = 36  # of a scan that are looked at, at most …
+    beams: int = 120  # … and where these do not agree
+    fewest_beams: int = 15  # that say anything, for a scan to count
+    # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
+    # lost, falls into each: in logarithms, since products of them are taken.
+    against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
+    against_fine: tuple[float, ...] = (0.70, 0.20, 0.08, 0.015, 0.005)
+    against_lost: tuple[float, ...] = (0.06, 0.10, 0.15, 0.25, 0.44)
+    # The same of the share of the beams on walls that end in the very cell of one.
+    sharp_edges: tuple[float, ...] = (0.5, 0.65, 0.8, 0.9)
+    sharp_fine: tuple[float, ...] = (0.01, 0.06, 0.20, 0.30, 0.43)
+    sharp_lost: tuple[float, ...] = (0.35, 0.30, 0.20, 0.10, 0.05)
+    # Scans one after the other err together: each counts as this part of one.
+    scan_weight: float = 0.3
+    lost_per_scan: float = 1e-5  # how likely a robot gets lost from one scan to the next
+    blur_m: float = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
+    doubt_against: float = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
+    doubt_sharp: float = 0.6  # … where it agrees from the corrected pose
+    give_up: float = 0.2  # P(fine) below which the belief is lost
+    while_lost: float = 0.02  # the health then
+    found: float = 0.9  # P(fine) right after a relocalisation
+    # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the
+    # weight, times what the mean logarithm of NIS over its degrees of freedom has above where it begins to tell.
+    bias: float = 3.5
+    nis_weight: float = 2.9
+    nis_from: float = -2.2
+    memory: float = 50.0  # updates that the mean is taken over
+
+    def __post_init__(self) -> None:
+        for name in ("against", "sharp"):
+            bins = len(getattr(self, f"{name}_edges")) + 1
+            for state in ("fine", "lost"):
+                values = getattr(self, f"{name}_{state}")
+                require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values")
+                require(all(v > 0 for v in values), f"HealthConfig.{name}_{state} must be > 0")
+        require(0 < self.give_up < self.found < 1, "HealthConfig needs 0 < give_up < found < 1")
+        require(min(self.beams, self.glance_beams) >= 8, "HealthConfig.beams and glance_beams must be at least 8")
+        require(self.memory >= 1 and self.blur_m > 0, "HealthConfig.memory must be ≥ 1, blur_m > 0")
+        require(0 < self.lost_per_scan < 1, "HealthConfig.lost_per_scan must be in (0, 1)")
+
+
+_LEAST_ODDS = 2e-5  # of being lost
+
+
+class HealthMonitor:
+    """Takes evidence in and says how likely the belief is true.
+
+    Attributes
+    ----------
+    fine : float
+        Probability that the robot is about where it is believed to be.
+    sure : bool
+        Whether a scan that agrees as ever would make no difference.
+    health : float
+        Probability that the true pose lies within the 99.7 % region of the belief.
+    """
+
+    def __init__(self, config: HealthConfig) -> None:
+        self.config = config
+        self._against = _log_ratios(config.against_lost, config.against_fine)
+        self._sharp = _log_ratios(config.sharp_lost, config.sharp_fine)
+        self._prior_odds = config.lost_per_scan
+        self.restart(1.0)
+
+    def restart(self, fine: float) -> None:
+        """Begin anew with this probability of being fine."""
+        self._odds = (1.0 - fine) / max(fine, 1e-12)  # of being lost
+        self._mean_nis = self.config.nis_from
+        self._judge()
+
+    @property
+    def fine(self) -> float:
+        """P(fine)."""
+        return 1.0 / (1.0 + self._odds)
+
+    def _judge(self) -> None:
+        c = self.config
+        score = c.bias - c.nis_weight * max(self._mean_nis - c.nis_from, 0.0)
+        self.sure = self._odds <= _LEAST_ODDS
+        self.health = 1.0 / ((1.0 + self._odds) * (1.0 + math.exp(-min(max(score, -30.0), 30.0))))
+
+    def doubtful(self, seen: Agreement) -> bool:
+        """Tell whether a scan speaks against the pose that it was looked at from."""
+        on_walls, sharp, in_the_open = seen
+        beams = on_walls + in_the_open
+        if beams < self.config.fewest_beams:
+            return False
+        return in_the_open > self.config.doubt_against * beams or sharp < self.config.doubt_sharp * on_walls
+
+    def take(self, seen: Agreement, variance: float) -> None:
+        """Take in what a scan says, the ends of its beams being known to ``variance`` [m²]."""
+        c = self.config
+        on_walls, sharp, in_the_open = seen
+        beams = on_walls + in_the_open
+        odds = self._odds + self._prior_odds
+        if beams >= c.fewest_beams:
+            ratio = self._against[_bin(in_the_open / beams, c.against_edges)]
+            if on_walls:
+                ratio += self._sharp[_bin(sharp / on_walls, c.sharp_edges)]
+            odds *= math.exp(c.scan_weight * ratio / (1.0 + variance / c.blur_m**2))
+        self._odds = min(max(odds, _LEAST_ODDS), 1e6)
+        self._judge()
+
+    def take_innovations(self, nis: float, dof: int) -> None:
+        """Take in the NIS of an update with so many degrees of freedom."""
+        if dof > 0 and math.isfinite(nis):
+            value = math.log(max(nis / dof, 1e-3))
+            self._mean_nis += (value - self._mean_nis) / self.config.memory
+            self._judge()
+
+
+def _log_ratios(lost: tuple[float, ...], fine: tuple[float, ...]) -> list[float]:
+    return [math.log(a / b) for a, b in zip(lost, fine, strict=True)]
+
+
+def _bin(value: float, edges: tuple[float, ...]) -> int:
+    for k, edge in enumerate(edges):
+        if value < edge:
+            return k
+    return len(edges)

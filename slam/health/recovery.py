@@ -1,0 +1,127 @@
+"""Lost, and found again: what a backend does where scans contradict its map.
+
+A scan that speaks against the predicted pose is *doubtful*. The estimator is copied before the first one of a row,
+and tries to correct itself by them; one that still contradicts the map from the corrected pose is not drawn. Where
+the monitor gives the belief up, the copy is put back, so that neither wrong matches nor wrong drawings stay, and
+nothing is written any more until a place is found that explains several scans in a row. Scans that agree with the
+map cost one look at them and nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.geometry import compose, inverse
+from slam.grids.occupancy import OccupancyGrid
+from slam.health.evidence import Agreement, agreement, agrees
+from slam.health.monitor import HealthConfig, HealthMonitor
+from slam.health.relocalisation import Place, RelocalisationConfig, Relocaliser
+from slam.types import Scan
+
+__all__ = ["Recovery"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class _Trail:
+    """A place that may be it, and where the belief, which is carried on by the wheels, was then."""
+
+    place: Place
+    believed: Array  # (3,)
+    scans: int = 1
+
+
+class Recovery:
+    """Watches a backend's scans; knows whether it is lost, and looks for the way back.
+
+    Attributes
+    ----------
+    lost : bool
+        Whether the belief is given up.
+    times_lost, relocalisations, scans_lost : int
+        How often it was given up and found again, and for how many scans it was lost in all.
+    """
+
+    def __init__(self, config: HealthConfig, relocalisation: RelocalisationConfig, offset_m: float) -> None:
+        self.config, self._relocalisation, self._offset_m = config, relocalisation, offset_m
+        self.monitor = HealthMonitor(config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Start over, with a belief that is true."""
+        self.monitor.restart(1.0 - self.config.lost_per_scan)
+        self.lost = False
+        self.times_lost = self.relocalisations = self.scans_lost = 0
+        self.kept: Any = None  # what the backend was before the first doubtful scan of a row
+        self._relocaliser: Relocaliser | None = None
+        self._trail: _Trail | None = None
+
+    @property
+    def health(self) -> float:
+        """Probability that the true pose lies within the 99.7 % region of the belief."""
+        return self.config.while_lost if self.lost else self.monitor.health
+
+    def calm(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
+        """Tell by a glance, at few beams, whether a scan from a pose of the body agrees as ever; most do."""
+        return self.monitor.sure and agrees(grid, body, self._offset_m, scan, self.config.glance_beams)
+
+    def look(self, grid: OccupancyGrid, body: tuple[float, float, float], scan: Scan) -> Agreement:
+        """Return what a scan says of a pose of the body (x, y, θ)."""
+        x, y, theta = body
+        offset = self._offset_m
+        sensor = (x + offset * math.cos(theta), y + offset * math.sin(theta), theta)
+        return agreement(grid, sensor, scan, self.config.beams)
+
+    def give_up(self) -> None:
+        """Note that the belief is lost."""
+        self.lost = True
+        self.times_lost += 1
+        self.kept, self._relocaliser, self._trail = None, None, None
+        self._searched = 0
+
+    def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
+        """Look for the place of a scan; return it once several scans agree on it, else None.
+
+        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost.
+        """
+        self.scans_lost += 1
+        if self._relocaliser is None:
+            self._relocaliser = Relocaliser(self._relocalisation, grid, self._offset_m)
+        relocaliser, trail = self._relocaliser, self._trail
+        if trail is not None:
+            pose = compose(trail.place.pose, compose(inverse(trail.believed), believed))
+            place: Place | None = relocaliser.check(scan, pose)
+            if place is not None and place.good:
+                self._trail = _Trail(place, believed, trail.scans + 1)
+            else:
+                self._trail = None
+        else:
+            place = self._first(relocaliser, scan, believed)
+            self._trail = None if place is None else _Trail(place, believed)
+        if self._trail is None or self._trail.scans < self._relocalisation.confirm:
+            return None
+        self.lost = False
+        self.relocalisations += 1
+        self._relocaliser = None
+        self.monitor.restart(self.config.found)
+        return self._trail.place
+
+    def _first(self, relocaliser: Relocaliser, scan: Scan, believed: Array) -> Place | None:
+        """Search the radius that is due, where it is."""
+        config, count = self._relocalisation, self._searched
+        self._searched += 1
+        stage = 0
+        for scans in config.scans_each:
+            if count < scans:
+                break
+            count -= scans
+            stage += 1
+        if count % config.every[stage]:
+            return None
+        return relocaliser.find(scan, believed, config.radii_m[stage])

@@ -1,0 +1,91 @@
+"""Beams that speak for a pose and against it: counted as a simple loop counts them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.health.evidence import Agreement, agreement, agrees, through_walls
+from slam.types import Scan
+from tests.slam.simulated import room_scan
+
+poses = st.tuples(st.floats(0.5, 5.5), st.floats(0.5, 4.5), st.floats(-3.1, 3.1))
+TAKEN_AT = (np.array([2.0, 2.0, 0.3]), np.array([4.0, 3.0, -1.0]), np.array([3.0, 1.0, 2.0]))
+
+
+def room_grid() -> OccupancyGrid:
+    grid = OccupancyGrid(0.05)
+    for pose in TAKEN_AT:
+        for _ in range(3):
+            grid.integrate(pose, room_scan(pose))
+    return grid
+
+
+def simply(grid: OccupancyGrid, pose: tuple[float, float, float], scan: Scan, stride: int) -> Agreement:
+    """The same, cell by cell."""
+    classes = grid.classes()
+    on_walls = sharp = in_the_open = 0
+    for k in range(0, len(scan.ranges), stride):
+        r = scan.ranges[k]
+        if not r <= scan.range_max:
+            continue
+        angle, reach = pose[2] + scan.angle_min + k * scan.angle_increment, r + 0.25 * grid.resolution
+        end = np.array([[pose[0] + reach * math.cos(angle), pose[1] + reach * math.sin(angle)]])
+        row, col = grid.to_cells(end)[0]
+        if not (0 < row < grid.shape[0] - 1 and 0 < col < grid.shape[1] - 1):
+            continue
+        around = (slice(row - 1, row + 2), slice(col - 1, col + 2))
+        if (classes[around] == OCCUPIED).any():
+            on_walls += 1
+            sharp += classes[row, col] == OCCUPIED
+        elif (classes[around] == FREE).all() and (grid.log_odds[around] != 0).all():
+            in_the_open += 1
+    return Agreement(on_walls, int(sharp), in_the_open)
+
+
+@settings(max_examples=30)
+@given(poses, poses)
+def test_against_the_simple_version(
+    true: tuple[float, float, float], believed: tuple[float, float, float]
+) -> None:
+    grid, scan = room_grid(), room_scan(np.array(true), np.random.default_rng(0))
+    scan.ranges[::7], scan.ranges[1::7] = np.nan, np.inf
+    seen, simple = agreement(grid, believed, scan, 90), simply(grid, believed, scan, 4)
+    assert np.abs(np.array(seen) - np.array(simple)).max() <= 1  # a beam's end on the very edge of a cell
+
+
+@given(poses)
+def test_the_right_pose_agrees_and_the_map_of_nothing_says_nothing(true: tuple[float, float, float]) -> None:
+    scan = room_scan(np.array(true), np.random.default_rng(1))
+    seen = agreement(room_grid(), true, scan, 90)
+    assert seen.against == 0.0
+    assert seen.beams > 80
+    empty = agreement(OccupancyGrid(0.05), true, scan, 90)
+    assert empty == Agreement(0, 0, 0)
+    assert empty.against == 0.0
+
+
+def test_a_glance_at_the_body_s_pose_is_a_look_at_the_sensor_s() -> None:
+    grid, true = room_grid(), np.array([3.0, 2.0, 0.5])
+    scan = room_scan(true)
+    body = true - np.array([0.2 * math.cos(0.5), 0.2 * math.sin(0.5), 0.0])
+    assert agrees(grid, body, 0.2, scan, 36)
+    assert not agrees(grid, body + np.array([0.5, 0.0, 0.2]), 0.2, scan, 36)
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_beams_through_a_wall_are_counted_and_those_along_it_are_not(inside: bool) -> None:
+    classes = np.full((60, 100), FREE, np.int8)
+    classes[:, 70] = OCCUPIED  # x from 3.5 to 3.55 m
+    classes[:5] = UNKNOWN
+    grid = OccupancyGrid.from_classes(classes, 0.05, (0.0, 0.0))
+    ranges = np.full(8, 2.4 if inside else 2.5)
+    scan = Scan(ranges, -0.2, 0.05, 8.0)
+    crossing, beams = through_walls(grid, (1.05 if inside else 1.8, 1.5, 0.0), scan, 8)
+    assert beams == 8
+    assert crossing == (0 if inside else 8)

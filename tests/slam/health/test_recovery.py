@@ -1,0 +1,93 @@
+"""Every backend notices that it was carried elsewhere, undoes what it made of that, and is found again."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+import slam
+from mecanum_env.env import ExploreEnv
+from training.studies.recovery.faults import make_fault
+
+ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
+
+
+def driven(name: str, steps: int, *, seed: int = 3, settings: dict[str, object] | None = None) -> ExploreEnv:
+    env = ExploreEnv(rooms="apartment", slam={"name": name, **(settings or {})})
+    env.reset(seed=seed)
+    for k in range(steps):
+        env.step(np.array([0.4 * math.cos(k / 15), 0.3 * math.sin(k / 9), 0.3], np.float32))
+    return env
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_carried_off_and_found(name: str) -> None:
+    env = driven(name, 60)
+    walls = env.episode_metrics()["map_precision"]
+    backend, still = env.backend, np.zeros(3, np.float32)
+    assert backend.recovery.monitor.fine > 0.99
+    assert make_fault("teleport").begin(env, np.random.default_rng(0))
+    lowest = 1.0
+    for _ in range(60):
+        observation, *_ = env.step(still)
+        lowest = min(lowest, float(observation["health"][0]))
+        assert observation["health"].dtype == np.float32
+    assert lowest < 0.1
+    assert backend.recovery.times_lost == backend.recovery.relocalisations == 1
+    assert not backend.recovery.lost
+    assert backend.recovery.monitor.fine > 0.95
+    assert np.hypot(*(backend.pose - env.truth.pose)[:2]) < 0.08
+    metrics = env.episode_metrics()
+    assert metrics["relocalisations"] == 1
+    assert 0.0 < metrics["lost_s"] < 4.0
+    assert 0.2 < metrics["health_mean"] < 1.0
+    assert metrics["map_precision"] > walls - 0.02  # no wall stands twice
+
+
+@pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "dp-slam"])
+def test_where_nothing_is_wrong_nothing_changes(name: str) -> None:
+    watched, alone = driven(name, 40), driven(name, 40, settings={"health": {"recover": False}})
+    assert watched.backend.recovery.times_lost == 0
+    assert np.array_equal(watched.backend.pose, alone.backend.pose)
+    assert np.array_equal(watched.backend.pose_cov, alone.backend.pose_cov)
+    assert np.array_equal(watched.backend.grid.log_odds, alone.backend.grid.log_odds)
+
+
+def test_the_landmarks_decide_where_a_found_robot_is() -> None:
+    """The robot is correlated with the landmarks again, and as sure as they let it be."""
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    before = backend.belief
+    backend._relocate(env.truth.pose, np.eye(3) * 1e-6, env.scan)
+    after = backend.belief
+    assert after.whole_cov is not None and before.whole_cov is not None
+    assert np.linalg.eigvalsh(after.whole_cov).min() > -1e-12
+    assert np.abs(after.whole_cov[:3, 3:]).max() > 0.1 * np.abs(before.whole_cov[:3, 3:]).max()
+    assert np.sqrt(after.pose_cov[0, 0]) < 0.02
+    # What the pose was said to be known to, beforehand, has made no landmark surer than it can be.
+    assert np.diag(after.whole_cov)[3:].min() > 0.2 * np.diag(before.whole_cov)[3:].min()
+
+
+def test_dead_reckoning_is_never_found_anew() -> None:
+    env = driven("odometry", 40)
+    assert make_fault("teleport").begin(env, np.random.default_rng(0))
+    for _ in range(30):
+        env.step(np.zeros(3, np.float32))
+    assert env.backend.recovery.times_lost == 0
+    assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) > 0.8
+
+
+def test_a_blind_lidar_is_no_loss() -> None:
+    env = driven("invariant-ekf", 40)
+    fault = make_fault("blind")
+    fault.begin(env, np.random.default_rng(0))
+    for _ in range(20):
+        env.step(np.array([0.1, 0.0, 0.1], np.float32))
+    assert env.backend.health > 0.9
+    fault.end(env)
+    for _ in range(5):
+        env.step(np.zeros(3, np.float32))
+    assert env.backend.recovery.times_lost == 0
+    assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) < 0.02
