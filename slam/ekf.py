@@ -271,8 +271,8 @@ class EkfSlam(LandmarkBackend):
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
-        # where the wheels alone have the robot by then: four fifths of all errors, on slippery floors.
-        # where the wheels alone have the robot by then: that was four fifths of all errors on slippery floors.
+        # The first scan is taken at the start, whose pose is known. Landmarks that had to wait would be placed by
+        # the wheels alone: four fifths of all errors, on slippery floors.
         at_once = scan is not None and self._book.now == 0
         new, gone = self._book.review(self._x, self.config.lidar_offset_m, z, match, scan, at_once=at_once)
         for k in new:

@@ -50,6 +50,10 @@ class PoseGraph:
         self.links = 0
         self._factor: SuperLU | None = None
 
+    def __getstate__(self) -> dict[str, object]:
+        """Return all that a copy needs: the factor, which SciPy cannot copy, is made again when asked for."""
+        return {**self.__dict__, "_factor": None}
+
     @property
     def poses(self) -> Array:
         """Poses ``(n, 3)`` of the nodes; a view, to be written by who knows better."""
