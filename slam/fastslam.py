@@ -19,7 +19,6 @@ from slam.backend import BackendConfig
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import ANYWHERE_COV, OBSERVED_LIMIT
 from slam.geometry import rotation
-from slam.health.monitor import HealthConfig
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
@@ -59,8 +58,6 @@ class FastSlamConfig(BackendConfig):
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
     unexplained: float = 11.83
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
-    # The true pose lies within the 99.7 % region a third of the time: docs/reference/health.md.
-    health: HealthConfig = field(default_factory=lambda: HealthConfig(bias=-0.7))
 
     def __post_init__(self) -> None:
         super().__post_init__()
