@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend, BackendConfig, found_cov
 from slam.belief import Belief
-from slam.geometry import compose, inverse, wrap
+from slam.geometry import about_z, compose, inverse, wrap
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
 from slam.health.monitor import HealthConfig
@@ -209,7 +209,7 @@ class DpSlam(Backend):
     def _motion_cov(self, heading: float) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the last update, for a particle that heads so."""
         # From the local frame, in which the covariance is kept, to the particle's.
-        r = _about_z(heading - float(self._odometry.pose[2]))
+        r = about_z(heading - float(self._odometry.pose[2]))
         cov: Array = r @ self._odometry.cov @ r.T
         return cov
 
@@ -332,9 +332,3 @@ class DpSlam(Backend):
             grid=self.grid,
             health=self.health,
         )
-
-
-def _about_z(turn: float) -> Array:
-    """Return what turns the covariance of a pose into a frame turned by ``turn`` [rad]."""
-    c, s = math.cos(turn), math.sin(turn)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -13,7 +13,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["compose", "exp", "inverse", "log", "relative", "rotation", "transform_points", "wrap", "wrap_scalar"]
+__all__ = [
+    "about_z",
+    "compose",
+    "exp",
+    "inverse",
+    "log",
+    "relative",
+    "rotation",
+    "transform_points",
+    "wrap",
+    "wrap_scalar",
+]
 
 Array = NDArray[np.float64]
 
@@ -86,3 +97,9 @@ def log(pose: Array) -> Array:
 def transform_points(pose_a_b: Array, points_b: Array) -> Array:
     """Return points ``(n, 2)`` of frame b expressed in frame a."""
     return np.asarray(points_b) @ rotation(float(pose_a_b[2])).T + np.asarray(pose_a_b)[:2]
+
+
+def about_z(turn: float) -> Array:
+    """Return what turns the covariance of a pose into a frame turned by ``turn`` [rad]."""
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

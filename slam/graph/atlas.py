@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.features.surfaces import MAX_LINES
-from slam.geometry import relative
+from slam.geometry import about_z, relative
 from slam.graph.loop_closing import Candidate, agreeing, find_candidate
 from slam.graph.matching import Alignment, Links, SurfaceMap, align
 from slam.graph.patches import ModelError, Patch, extended, new_patches
@@ -17,7 +17,7 @@ from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds
 from slam.graph.window import Window
 
-__all__ = ["Atlas", "about_z"]
+__all__ = ["Atlas"]
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -255,9 +255,3 @@ class Atlas:
             return False
         self.closings += 1
         return True
-
-
-def about_z(turn: float) -> Array:
-    """Return what turns the covariance of a pose into a frame turned by ``turn`` [rad]."""
-    c, s = math.cos(turn), math.sin(turn)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

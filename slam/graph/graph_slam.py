@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.belief import Belief
-from slam.geometry import compose, relative, wrap
-from slam.graph.atlas import Atlas, about_z
+from slam.geometry import about_z, compose, relative, wrap
+from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, links
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
