@@ -117,6 +117,10 @@ class Backend(abc.ABC):
         x, y, theta = foreseen[:3].tolist()
         seen = recovery.look(self.grid, (x, y, theta), scan)
         self._doubtful = recovery.monitor.doubtful(seen)
+        # After a loop has closed, the map is another one than what is drawn: it may be that which disagrees.
+        if self._doubtful and recovery.kept is None and self._redraw_if_moved():
+            seen = recovery.look(self.grid, (x, y, theta), scan)
+            self._doubtful = recovery.monitor.doubtful(seen)
         if not self._doubtful:
             recovery.kept = None
             recovery.monitor.take(seen, self._end_variance())
@@ -250,6 +254,10 @@ class Backend(abc.ABC):
     def _redraw_kept(self, poses: Array) -> None:
         """Redraw the map from the key scans that there were when their poses ``(n, 3)`` were kept."""
         self.key_scans.put_back(self.grid, poses)
+
+    def _redraw_if_moved(self) -> bool:
+        """Redraw the map where the estimates have left what is drawn by more than half a cell; tell whether."""
+        return False
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
         """Set the robot's pose ``(3,)`` with a covariance ``(3, 3)`` that is correlated with nothing.

@@ -143,7 +143,7 @@ class DpSlam(Backend):
         if due:
             self._update_particles(points)
             self._key.append((scan, self.extractor.surface.copy()))
-            self._follow_the_lead()
+            self._redraw_if_moved()
             self._shown = np.vstack([self._shown, self.sensor_pose(self._poses[self._lead])])
         self._believed = None
         body = compose(self._poses[self._lead], self._motion())
@@ -274,17 +274,19 @@ class DpSlam(Backend):
 
     # ---- the map that is shown -----------------------------------------------------------------------------
 
-    def _follow_the_lead(self) -> None:
-        """Redraw the grid where the leading particle took another way than it was drawn from."""
+    def _redraw_if_moved(self) -> bool:
+        """Redraw the grid where the leading particle took another way than it was drawn from; tell whether."""
         drawn = self._shown
         bodies = self._paths.of(self._lead)[: len(drawn)]
         path = np.array([self.sensor_pose(body) for body in bodies]).reshape(-1, 3)
         off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
             self.config.key_scans.lever_m
         )
-        if len(off) and float(off.max()) > 0.5 * self.grid.resolution:
-            self.grid.redraw(path, self._key)
-            self._shown = path
+        if not len(off) or float(off.max()) <= 0.5 * self.grid.resolution:
+            return False
+        self.grid.redraw(path, self._key)
+        self._shown = path
+        return True
 
     # ---- the belief ----------------------------------------------------------------------------------------
 

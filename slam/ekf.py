@@ -114,7 +114,7 @@ class EkfSlam(LandmarkBackend):
         self._take(self._features(scan), scan)
         self._draw(scan)
         if self.key_scans.due():
-            self.key_scans.redraw_if_moved(self.grid, *self._map_points())
+            self._redraw_if_moved()
 
     def _features(self, scan: Scan) -> Array:
         """Return what a scan shows as observation rows ``(m, 10)``."""
@@ -327,10 +327,6 @@ class EkfSlam(LandmarkBackend):
         self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
         self._draw(scan)
-
-    def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
-        return self._points, self._book.row_of_id
 
     # ---- the belief ----------------------------------------------------------------------------------------
 

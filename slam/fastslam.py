@@ -126,7 +126,7 @@ class FastSlam(LandmarkBackend):
         self._believe()
         self._draw(scan)
         if self.key_scans.due():
-            self.key_scans.redraw_if_moved(self.grid, self._points, self._book.row_of_id)
+            self._redraw_if_moved()
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``)."""

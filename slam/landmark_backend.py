@@ -95,6 +95,13 @@ class LandmarkBackend(Backend):
         rows = self._book.just_seen()
         return self._book.ids[rows], self._points[rows]
 
+    def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
+        """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
+        return self._points, self._book.row_of_id
+
+    def _redraw_if_moved(self) -> bool:
+        return self.key_scans.redraw_if_moved(self.grid, *self._map_points())
+
 
 def far_better(fit: float, usual: float) -> bool:
     """Tell whether a scan fits the grid at least twice as well; where wheels did spin it is 25 times."""

@@ -227,18 +227,19 @@ class GraphSlam(Backend):
         if self._drawn:
             self.grid.redraw(np.array(self._shown), self._drawn)
 
-    def _redraw_if_moved(self) -> None:
-        """Redraw the grid where a scan would be drawn from more than half a cell from where it was."""
+    def _redraw_if_moved(self) -> bool:
         if not self._drawn:
-            return
+            return False
         path = np.array([self.sensor_pose(body) for body in self._poses_of(self._drawn_at)])
         drawn = np.array(self._shown)
         off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
             self.config.key_scans.lever_m
         )
-        if float(off.max()) > 0.5 * self.grid.resolution:
-            self.grid.redraw(path, self._drawn)
-            self._shown = list(path)
+        if float(off.max()) <= 0.5 * self.grid.resolution:
+            return False
+        self.grid.redraw(path, self._drawn)
+        self._shown = list(path)
+        return True
 
     # ---- the belief ----------------------------------------------------------------------------------------
 

@@ -300,7 +300,7 @@ def test_the_grid_follows_the_lead() -> None:
     lead = (backend._lead + 1) % 12
     backend._paths._poses[: backend._paths._count] += np.array([0.3, 0.0, 0.0])
     backend._lead = lead
-    backend._follow_the_lead()
+    assert backend._redraw_if_moved()
     assert backend.grid.revision == before + 1
     assert len(backend.grid.take_changes()) == 0
     np.testing.assert_allclose(backend._shown[:, 0], backend.path[:, 0] + OFFSET * np.cos(backend.path[:, 2]))
