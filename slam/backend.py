@@ -205,12 +205,12 @@ class Backend(abc.ABC):
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
         grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
         if self.key_scans.wants(x, y, theta):
-            ids, points = self._landmarks_in_view()
-            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, points)
+            ids, marks = self._landmarks_in_view()
+            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, marks)
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        """Return ids ``(k,)`` and estimates ``(k, 2)`` of the landmarks that the last scan showed."""
-        return np.zeros(0, np.int64), np.zeros((0, 2))
+        """Return ids ``(k,)`` of the landmarks that the last scan showed, and ``(k, 3)`` as key scans keep them."""
+        return np.zeros(0, np.int64), np.zeros((0, 3))
 
     # ---- health ------------------------------------------------------------------------------------------------
 

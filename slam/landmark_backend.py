@@ -73,7 +73,7 @@ class LandmarkBackend(Backend):
     @property
     @abc.abstractmethod
     def _points(self) -> Array:
-        """Estimates ``(n, 2)`` of the book's landmarks."""
+        """Estimates ``(n, 2)`` of the book's landmarks: x, y, of walls α, r."""
 
     @property
     def _marks(self) -> Array:
@@ -93,7 +93,9 @@ class LandmarkBackend(Backend):
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
         rows = self._book.just_seen()
-        return self._book.ids[rows], self._points[rows]
+        marks = np.empty((len(rows), 3))
+        marks[:, :2], marks[:, 2] = self._points[rows], self._book.marks[rows, 0] == LINE
+        return self._book.ids[rows], marks
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""

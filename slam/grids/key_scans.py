@@ -1,9 +1,10 @@
 """Key scans: what the map is redrawn from when the filter corrects the past.
 
 A grid is drawn from poses that the filter later corrects. Each key scan therefore hangs on the landmarks that
-were seen with it: where those have moved, the scan's pose moves along (least squares over SE(2)), and once a
-key scan would be drawn more than half a cell from where it was, the map is redrawn from all of them. So a
-closed loop mends the map instead of doubling its walls.
+were seen with it, points and walls: where those have moved, the scan's pose moves along (least squares over SE(2)),
+and once a key scan would be drawn more than half a cell from where it was, the map is redrawn from all of them. So a
+closed loop mends the map instead of doubling its walls. What the landmarks of a scan leave open, as the way along a
+single wall, follows the scan before it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ __all__ = ["KeyScanConfig", "KeyScans"]
 
 Array = NDArray[np.float64]
 
-_ANCHORS = 8  # landmarks that a key scan hangs on, at most
+_ANCHORS = 12  # landmarks that a key scan hangs on, at most
+
+# How well a key scan hangs on what: weights are σ⁻², σ in m and rad.
+_POINT = 0.02**-2  # a point, or how far off a wall is
+_TURN = 0.005**-2  # the direction of a wall
+_NEIGHBOUR_SHIFT, _NEIGHBOUR_TURN = 1.0**-2, 0.02**-2  # what moved the key scan before it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +50,7 @@ class KeyScans:
         self._scans: list[tuple[Scan, NDArray[np.int16]]] = []
         self._poses = np.zeros((64, 3))  # of the sensor, as last drawn
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
-        self._anchor_local = np.zeros((64, _ANCHORS, 2))  # in the frame of that pose
+        self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in the frame of that pose: x, y, 0, or of a wall α, r, 1
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
         self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
@@ -70,15 +76,18 @@ class KeyScans:
         )
 
     def keep(
-        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], points: Array
+        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array
     ) -> None:
-        """Keep a scan; ``ids`` and ``points`` ``(k, 2)`` are the landmarks seen with it, as estimated then."""
+        """Keep a scan, and what was seen with it.
+
+        ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as estimated then, or α, r, 1 of a wall.
+        """
         n = len(self._scans)
         if n == len(self._poses):
             self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
             self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
             self._anchor_local = np.vstack([self._anchor_local, np.zeros_like(self._anchor_local)])
-        _hang(sensor_pose, ids, points, n, self._poses, self._anchor_ids, self._anchor_local)
+        _hang(sensor_pose, ids, marks, n, self._poses, self._anchor_ids, self._anchor_local)
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan, surface.copy()))
 
@@ -94,7 +103,8 @@ class KeyScans:
     def redraw_if_moved(self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64]) -> bool:
         """Redraw ``grid`` if a landmark's correction moved a key scan by more than half a cell; tell whether.
 
-        ``landmarks`` ``(n, 2)`` are the current estimates, ``row_of_id`` maps a landmark's id to its row, or -1.
+        ``landmarks`` ``(n, 2)`` are the current estimates, of points x, y and of walls α, r; ``row_of_id`` maps a
+        landmark's id to its row, or -1.
         """
         n = len(self._scans)
         self._since_check = 0
@@ -122,16 +132,22 @@ class KeyScans:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
-    sensor_pose: Array, ids: NDArray[np.int64], points: Array, n: int, poses: Array,
+    sensor_pose: Array, ids: NDArray[np.int64], marks: Array, n: int, poses: Array,
     anchor_ids: NDArray[np.int64], anchor_local: Array,
 ) -> None:  # fmt: skip
     """Write the n-th key scan's pose, and its landmarks in that pose's frame."""
     poses[n] = sensor_pose
-    c, s = math.cos(sensor_pose[2]), math.sin(sensor_pose[2])
+    x, y, theta = sensor_pose
+    c, s = math.cos(theta), math.sin(theta)
     for k in range(min(ids.shape[0], anchor_ids.shape[1])):
-        dx, dy = points[k, 0] - sensor_pose[0], points[k, 1] - sensor_pose[1]
         anchor_ids[n, k] = ids[k]
-        anchor_local[n, k, 0], anchor_local[n, k, 1] = c * dx + s * dy, -s * dx + c * dy
+        u, v, wall = marks[k]
+        anchor_local[n, k, 2] = wall
+        if wall:
+            anchor_local[n, k, 0], anchor_local[n, k, 1] = u - theta, v - x * math.cos(u) - y * math.sin(u)
+        else:
+            dx, dy = u - x, v - y
+            anchor_local[n, k, 0], anchor_local[n, k, 1] = c * dx + s * dy, -s * dx + c * dy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -141,40 +157,54 @@ def _corrected_poses(
 ) -> float:  # fmt: skip
     """Write each key scan's pose as its landmarks now have it; return the largest shift [m]."""
     largest = 0.0
-    dx = dy = dtheta = 0.0  # the correction of the last scan with enough landmarks: its neighbours share it
+    shift = np.zeros(3)  # of the scan before
     for k in range(poses.shape[0]):
-        count = 0
-        ax = ay = bx = by = 0.0
-        for a in range(ids.shape[1]):
-            if ids[k, a] < 0 or row_of_id[ids[k, a]] < 0:
-                continue
-            row = row_of_id[ids[k, a]]
-            ax, ay = ax + local[k, a, 0], ay + local[k, a, 1]
-            bx, by = bx + landmarks[row, 0], by + landmarks[row, 1]
-            count += 1
-        solved = False
-        if count >= 2:
-            ax, ay, bx, by = ax / count, ay / count, bx / count, by / count
-            cos_sum = sin_sum = spread = 0.0
-            for a in range(ids.shape[1]):
-                if ids[k, a] < 0 or row_of_id[ids[k, a]] < 0:
-                    continue
-                row = row_of_id[ids[k, a]]
-                px, py = local[k, a, 0] - ax, local[k, a, 1] - ay
-                qx, qy = landmarks[row, 0] - bx, landmarks[row, 1] - by
-                cos_sum += px * qx + py * qy
-                sin_sum += px * qy - py * qx
-                spread += px * px + py * py
-            # Landmarks closer together than some two metres say too little about the heading.
-            if spread > 2.0:
-                theta = math.atan2(sin_sum, cos_sum)
-                c, s = math.cos(theta), math.sin(theta)
-                dx = bx - (c * ax - s * ay) - poses[k, 0]
-                dy = by - (s * ax + c * ay) - poses[k, 1]
-                dtheta = wrap_scalar(theta - poses[k, 2])
-                solved = True
-        out[k, 0], out[k, 1] = poses[k, 0] + dx, poses[k, 1] + dy
-        out[k, 2] = wrap_scalar(poses[k, 2] + dtheta)
-        if solved:
-            largest = max(largest, math.sqrt(dx * dx + dy * dy) + abs(dtheta) * lever)
+        pose = poses[k] + shift
+        for _ in range(2):  # Gauss-Newton; turns are small
+            pose += _step(pose, poses[k] + shift, ids[k], local[k], landmarks, row_of_id)
+        shift = pose - poses[k]
+        out[k, 0], out[k, 1], out[k, 2] = pose[0], pose[1], wrap_scalar(pose[2])
+        largest = max(largest, math.hypot(shift[0], shift[1]) + abs(shift[2]) * lever)
     return largest
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _step(
+    pose: Array, expected: Array, ids: NDArray[np.int64], local: Array, landmarks: Array,
+    row_of_id: NDArray[np.int64],
+) -> Array:  # fmt: skip
+    """Return the step from a key scan's pose to where its landmarks, and the scan before it, want it."""
+    x, y, theta = pose
+    c, s = math.cos(theta), math.sin(theta)
+    # The normal equations' upper triangle and right-hand side, at first of the scan before it alone.
+    xx = yy = _NEIGHBOUR_SHIFT
+    tt = _NEIGHBOUR_TURN
+    xy = xt = yt = 0.0
+    bx, by, bt = xx * (expected[0] - x), yy * (expected[1] - y), tt * (expected[2] - theta)
+    for a in range(ids.shape[0]):
+        if ids[a] < 0 or row_of_id[ids[a]] < 0:
+            continue
+        u, v = landmarks[row_of_id[ids[a]]]
+        if local[a, 2]:
+            turn = wrap_scalar(u - theta - local[a, 0])
+            if abs(turn) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
+                u, v, turn = u + math.pi, -v, wrap_scalar(turn + math.pi)
+            nx, ny = math.cos(u), math.sin(u)
+            off = v - nx * x - ny * y - local[a, 1]
+            xx, xy, yy = xx + _POINT * nx * nx, xy + _POINT * nx * ny, yy + _POINT * ny * ny
+            bx, by = bx + _POINT * nx * off, by + _POINT * ny * off
+            tt, bt = tt + _TURN, bt + _TURN * turn
+        else:
+            px, py = c * local[a, 0] - s * local[a, 1], s * local[a, 0] + c * local[a, 1]
+            ex, ey = u - x - px, v - y - py
+            xx, yy, tt = xx + _POINT, yy + _POINT, tt + _POINT * (px * px + py * py)
+            xt, yt = xt - _POINT * py, yt + _POINT * px
+            bx, by, bt = bx + _POINT * ex, by + _POINT * ey, bt + _POINT * (px * ey - py * ex)
+    # Solved by elimination of x and then y; the matrix is positive definite.
+    f, g = xy / xx, xt / xx
+    yy, yt, by = yy - f * xy, yt - f * xt, by - f * bx
+    tt, bt = tt - g * xt, bt - g * bx
+    h = yt / yy
+    turn = (bt - h * by) / (tt - h * yt)
+    dy = (by - yt * turn) / yy
+    return np.array([(bx - xy * dy - xt * turn) / xx, dy, turn])

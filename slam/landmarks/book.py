@@ -134,8 +134,8 @@ class LandmarkBook:
         self.count = count
 
     def just_seen(self) -> NDArray[np.int64]:
-        """Return the rows ``(k,)`` of the points that the last update showed."""
-        return _points_seen_at(self._marks, self.count, self._now)
+        """Return the rows ``(k,)`` of the landmarks that the last update showed."""
+        return _seen_at(self._marks, self.count, self._now)
 
     def _make_room(self, count: int) -> None:
         while count > len(self._ids):
@@ -178,12 +178,12 @@ class LandmarkBook:
 
 
 @njit(cache=True, nogil=True)
-def _points_seen_at(marks: Array, count: int, now: float) -> NDArray[np.int64]:
+def _seen_at(marks: Array, count: int, now: float) -> NDArray[np.int64]:
     out = np.empty(count, np.int64)
     found = 0
     for row in range(count):
         out[found] = row
-        found += marks[row, _LAST_SEEN] == now and marks[row, _KIND] != LINE
+        found += marks[row, _LAST_SEEN] == now
     return out[:found]
 
 
