@@ -9,6 +9,8 @@ import pytest
 
 import slam
 from mecanum_env.env import ExploreEnv
+from slam.ekf import EkfSlam
+from slam.geometry import compose, transform_points
 from training.studies.recovery.faults import make_fault
 
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
@@ -44,6 +46,24 @@ def test_carried_off_and_found(name: str) -> None:
     assert 0.0 < metrics["lost_s"] < 4.0
     assert 0.2 < metrics["health_mean"] < 1.0
     assert metrics["map_precision"] > walls - 0.02  # no wall stands twice
+
+
+@pytest.mark.parametrize("redraws", [True, False])
+def test_a_closed_loop_is_no_reason_to_be_lost(redraws: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that is believed moves at once, long before the drawing is looked at again: it is brought up to date."""
+    env = driven("ekf", 60, settings={"key_scans": {"check_every": 10**6}})
+    backend, shift = env.backend, np.array([0.3, 0.2, 0.05])
+    assert isinstance(backend, EkfSlam)
+    if not redraws:
+        monkeypatch.setattr(backend, "_redraw_if_moved", lambda: False)
+    backend._x[:3] = compose(shift, backend._x[:3])
+    backend._points[:] = transform_points(shift, backend._points)
+    for _ in range(40):
+        env.step(np.zeros(3, np.float32))
+    assert (backend.recovery.times_lost == 0) == redraws
+    if redraws:
+        assert backend.health > 0.9
+        assert np.hypot(*(backend.pose - compose(shift, env.truth.pose))[:2]) < 0.05
 
 
 @pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "dp-slam"])
