@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from slam.ekf import EkfConfig, EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, state_rows, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
-from slam.gaussian.stacked_update import solve
+from slam.gaussian.stacked_update import NO_LIMITS, solve
 from slam.gaussian.tiles import add_combination, downdate, product, subtract
 from slam.settings import require
 from slam.types import LINE, Observations, Odometry, Scan
@@ -115,8 +115,8 @@ class CompressedEkfSlam(EkfSlam):
         self._choose_region(np.zeros(0, np.int64))
         super()._relocate(pose, cov, scan)
 
-    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
-        super()._correct(z, match)
+    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+        super()._correct(z, match, limits)
         if self.nis_dof and len(self._far):
             _postpone(
                 self._phi, self._minus_psi, self._theta, self._u, self._n, self._n0, match, self._h, self._w,

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from slam.backend import Backend
 from slam.belief import Belief
 from slam.ekf import EkfSlam
+from slam.gaussian.stacked_update import NO_LIMITS
 from slam.types import Odometry
 
 __all__ = ["OdometrySlam", "TruthSlam"]
@@ -43,7 +44,8 @@ class OdometrySlam(EkfSlam):
         self._p[:3, : self._n] = 0.0
         self._p[:3, :3] = np.eye(3) * 1e-18
 
-    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
+    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+        # Without limits: what is believed to be known of the pose is untrue, and scans will say so.
         self._pin()
         pose = self._x[:3].copy()
         super()._correct(z, match)

@@ -17,12 +17,12 @@ from slam.backend import BackendConfig, found_cov
 from slam.belief import Belief
 from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.lanes import aligned_zeros
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
 from slam.landmarks.innovations import Innovation, innovations
-from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
+from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
@@ -124,15 +124,16 @@ class EkfSlam(LandmarkBackend):
     def _take(self, z: Array, scan: Scan | None) -> None:
         """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
         match = self._associate(z)
-        # Old landmarks that one match alone does not make sure are left out at first.
-        sigma, book = self.config.loop_sigma_m, self._book
-        loop = sigma < math.inf and put_off(
-            self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match
-        )
+        loop = self._put_off(z, match)
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
         self._tell(z, match)
-        self._correct(z, match)
+        self._correct(z, match, JOINT_LIMITS)
+        if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
+            match = self._associate_jointly(z)
+            loop = self._put_off(z, match)
+            self._tell(z, match)
+            self._correct(z, match)
         if loop:
             self._close_loop(z, match)
         if scan is not None and self.nis_dof >= 2 * FEWEST_BACK:
@@ -205,6 +206,11 @@ class EkfSlam(LandmarkBackend):
         )  # fmt: skip
         return match
 
+    def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
+        """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are any."""
+        book, sigma = self._book, self.config.loop_sigma_m
+        return put_off(self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match) > 0
+
     def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""
         config, book = self.config, self._book
@@ -263,10 +269,10 @@ class EkfSlam(LandmarkBackend):
             offset = self.config.lidar_offset_m
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
 
-    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
-        """Make one stacked update of all matched observations."""
+    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+        """Make one stacked update of all matched observations, unless their NIS is above the limit of so many."""
         self.nis_dof, self.nis = stacked_update(
-            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s
+            self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, limits
         )
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.ekf import EkfLinesConfig, EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose
-from slam.gaussian.stacked_update import SPARE_ROWS, whiten
+from slam.gaussian.stacked_update import NO_LIMITS, SPARE_ROWS, whiten
 from slam.gaussian.tiles import add_combination, downdate
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
@@ -69,11 +69,11 @@ class InvariantEkfSlam(EkfSlam):
         super().predict(Odometry(twist, odometry.dt))
         wheels.predict(self._p, self._n, before, self._x, float(twist[2]), odometry.dt)
 
-    def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
+    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         n, w = self._n, self._w
         rows, self.nis = invariant_update(
             self._x, self._p, n, z, match, self.config.lidar_offset_m, self._book.marks, self._h, w, self._s,
-            self._delta,
+            self._delta, limits,
         )  # fmt: skip
         self.nis_dof = rows
         if self._wheels is not None and rows:
@@ -122,13 +122,14 @@ class InvariantEkfSlam(EkfSlam):
 @njit(cache=True, nogil=True, error_model="numpy")
 def invariant_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array,
-    w: Array, s: Array, delta: Array,
+    w: Array, s: Array, delta: Array, limits: Array = NO_LIMITS,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 
     The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
     + V Aᵀ (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
-    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space.
+    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space; ``limits`` are
+    the standard filter's.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     if rows == 0:
@@ -136,6 +137,8 @@ def invariant_update(
     nis = 0.0
     for k in range(rows):
         nis += s[k, rows] * s[k, rows]
+    if nis > limits[min(rows // 2, limits.shape[0] - 1)]:
+        return 0, nis
     delta[:n] = 0.0
     add_combination(delta, n, s[:rows, rows], w)
     a, minus_v = w[rows : rows + 6 : 2], w[rows + 1 : rows + 6 : 2]

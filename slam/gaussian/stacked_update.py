@@ -20,12 +20,15 @@ from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
 
-__all__ = ["SPARE_ROWS", "solve", "stacked_update", "whiten", "work_space"]
+__all__ = ["NO_LIMITS", "SPARE_ROWS", "solve", "stacked_update", "whiten", "work_space"]
 
 Array = NDArray[np.float64]
 
 SPARE_ROWS = 6
 """Rows of w beyond the observations', for what a filter may want to subtract beside Wᵀ W."""
+
+NO_LIMITS = np.array([math.inf])
+"""Limits of an update that is made however large its NIS."""
 
 
 def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
@@ -39,16 +42,21 @@ def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stacked_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
-) -> tuple[int, float]:
+    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
+    limits: Array = NO_LIMITS,
+) -> tuple[int, float]:  # fmt: skip
     """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
 
     ``p`` is an upper triangle; the lower one is undefined after. ``h``, ``w``, ``s`` are a :func:`work_space`.
+    ``limits[k]`` is how large the NIS of k observations may be, the last one holding for all that are more; where it
+    is larger, nothing is done and the degrees of freedom are 0.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     nis = 0.0
     for k in range(rows):
         nis += s[k, rows] * s[k, rows]
+    if nis > limits[min(rows // 2, limits.shape[0] - 1)]:
+        return 0, nis
     add_combination(x, n, s[:rows, rows], w)
     x[2] = wrap_scalar(x[2])
     if rows > 0:

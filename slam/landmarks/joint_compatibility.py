@@ -16,7 +16,7 @@ from slam.landmarks.association import IGNORED, UNMATCHED, alike, beside, gated_
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import LINE
 
-__all__ = ["JOINT_GATES", "MAX_OBSERVATIONS", "extend", "insert_nearest", "joint_compatibility"]
+__all__ = ["JOINT_GATES", "JOINT_LIMITS", "MAX_OBSERVATIONS", "extend", "insert_nearest", "joint_compatibility"]
 
 Array = NDArray[np.float64]
 
@@ -24,6 +24,8 @@ MAX_OBSERVATIONS = 64
 """Observations that are taken at once."""
 JOINT_GATES = np.array([0.0] + [chi2_quantile(0.99, 2 * k) for k in range(1, MAX_OBSERVATIONS + 1)])
 """Largest squared distance of k pairings together: 99 % of chi-square with 2k degrees of freedom."""
+JOINT_LIMITS = np.array([0.0] + [chi2_quantile(1.0 - 1e-6, 2 * k) for k in range(1, MAX_OBSERVATIONS + 1)])
+"""The same of pairings that were made one by one; beyond it, one at least of them is wrong."""
 
 _WALL_WINDOW_M = 1.0  # farther off, a piece of wall is not tested for being a known wall
 _CANDIDATES = 8  # landmarks considered for one observation, the nearest first
