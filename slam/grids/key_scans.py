@@ -29,7 +29,7 @@ _ANCHORS = 12  # landmarks that a key scan hangs on, at most
 # How well a key scan hangs on what: weights are σ⁻², σ in m and rad.
 _POINT = 0.02**-2  # a point, or how far off a wall is
 _TURN = 0.005**-2  # the direction of a wall
-_NEIGHBOUR_SHIFT, _NEIGHBOUR_TURN = 1.0**-2, 0.02**-2  # what moved the key scan before it
+_NEIGHBOUR_SHIFT, _NEIGHBOUR_TURN = 0.1**-2, 0.02**-2  # what moved the key scan before it
 
 
 @dataclass(frozen=True, kw_only=True)
