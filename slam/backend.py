@@ -108,6 +108,8 @@ class Backend(abc.ABC):
             place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())
             if place is not None:
                 self._relocate(place.pose, place.cov, scan)
+            elif not recovery.lost:
+                self._update(scan)
             return
         foreseen = self._foreseen(scan)
         if recovery.calm(self.grid, foreseen, scan):

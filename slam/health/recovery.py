@@ -3,8 +3,10 @@
 A scan that speaks against the predicted pose is *doubtful*. The estimator is copied before the first one of a row,
 and tries to correct itself by them; one that still contradicts the map from the corrected pose is not drawn. Where
 the monitor gives the belief up, the copy is put back, so that neither wrong matches nor wrong drawings stay, and
-nothing is written any more until a place is found that explains several scans in a row. Scans that agree with the
-map cost one look at them and nothing else.
+nothing is written any more until a place is found that explains several scans in a row, or until many scans in a row
+no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
+there is none. Buildings repeat themselves, so from there no other place is looked for on the whole map. Scans that
+agree with the map cost one look at them and nothing else.
 """
 
 from __future__ import annotations
@@ -83,14 +85,22 @@ class Recovery:
         self.lost = True
         self.times_lost += 1
         self.kept, self._relocaliser, self._trail = None, None, None
-        self._searched = 0
+        self._searched = self._unopposed = 0
 
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
         """Look for the place of a scan; return it once several scans agree on it, else None.
 
-        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost.
+        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost. Where scans have
+        not spoken against that for long enough, nothing is returned, and the belief is no longer lost.
         """
         self.scans_lost += 1
+        if np.count_nonzero(scan.ranges <= scan.range_max) >= self._relocalisation.fewest_beams:
+            x, y, theta = believed.tolist()
+            opposed = self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
+            self._unopposed = 0 if opposed else self._unopposed + 1
+        if self._unopposed >= self._relocalisation.unopposed:
+            self._end()
+            return None
         if self._relocaliser is None:
             self._relocaliser = Relocaliser(self._relocalisation, grid, self._offset_m)
         relocaliser, trail = self._relocaliser, self._trail
@@ -106,11 +116,15 @@ class Recovery:
             self._trail = None if place is None else _Trail(place, believed)
         if self._trail is None or self._trail.scans < self._relocalisation.confirm:
             return None
-        self.lost = False
         self.relocalisations += 1
+        self._end()
+        return self._trail.place
+
+    def _end(self) -> None:
+        """Be lost no longer."""
+        self.lost = False
         self._relocaliser = None
         self.monitor.restart(self.config.found)
-        return self._trail.place
 
     def _first(self, relocaliser: Relocaliser, scan: Scan, believed: Array) -> Place | None:
         """Search the radius that is due, where it is."""
@@ -122,6 +136,7 @@ class Recovery:
                 break
             count -= scans
             stage += 1
-        if count % config.every[stage]:
+        radius = config.radii_m[stage]
+        if count % config.every[stage] or (self._unopposed and math.isinf(radius)):
             return None
-        return relocaliser.find(scan, believed, config.radii_m[stage])
+        return relocaliser.find(scan, believed, radius)

@@ -52,6 +52,7 @@ class RelocalisationConfig:
     scans_each: tuple[int, ...] = (5, 15)  # … for so many scans, the last one until it is found
     every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
     confirm: int = 3  # scans that a place must explain, one after the other
+    unopposed: int = 30  # scans in a row that do not speak against where the wheels have it, to go on from there
     sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
     matching: MatchConfig = field(
         default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01)
@@ -65,7 +66,7 @@ class RelocalisationConfig:
             stages >= 1 and len(self.scans_each) == stages - 1 and len(self.every) == stages,
             "RelocalisationConfig needs one of every and, but for the last, of scans_each for each of radii_m",
         )
-        require(self.confirm >= 1, "RelocalisationConfig.confirm must be at least 1")
+        require(min(self.confirm, self.unopposed) >= 1, "RelocalisationConfig.confirm and unopposed must be ≥ 1")
 
 
 @dataclass(frozen=True, slots=True)

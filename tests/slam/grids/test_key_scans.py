@@ -42,7 +42,7 @@ def test_a_correction_of_the_landmarks_redraws_the_map_where_it_belongs() -> Non
     a = a[r : r + b.shape[0], c : c + b.shape[1]]
     assert np.mean((a == OCCUPIED)[b == OCCUPIED]) > 0.85
     assert np.mean((a == FREE)[b == FREE]) > 0.99
-    np.testing.assert_allclose(keys.poses[3], [2.5, 2.0, 0.3], atol=1e-4)
+    np.testing.assert_allclose(keys.poses[3], [2.5, 2.0, 0.3], atol=1e-3)
 
 
 def test_less_than_half_a_cell_is_left_alone() -> None:
@@ -58,7 +58,7 @@ def test_a_dropped_landmark_is_passed_over() -> None:
     row_of_id = np.array([0, 1, -1, 2])
     moved = wrong[[0, 1, 3]] + np.array([0.2, 0.0])
     assert keys.redraw_if_moved(grid, moved, row_of_id)
-    np.testing.assert_allclose(keys.poses[0], [1.2, 2.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose(keys.poses[0], [1.2, 2.0, 0.0], atol=5e-3)
 
 
 def test_a_wall_takes_a_scan_along_and_what_it_leaves_open_follows_the_scan_before() -> None:
@@ -71,11 +71,19 @@ def test_a_wall_takes_a_scan_along_and_what_it_leaves_open_follows_the_scan_befo
         keys.keep(np.array([x, 2.0, 0.2]), scan, surface, np.array([3]), np.array([[0.5 * np.pi, 5.0, 1.0]]))
     moved = np.vstack([CORNERS[:3] + [0.4, 0.0], [0.5 * np.pi + 0.02, 5.0]])
     assert keys.redraw_if_moved(grid, moved, np.arange(4))
-    np.testing.assert_allclose(keys.poses[0], [1.4, 2.0, 0.1], atol=1e-3)
+    np.testing.assert_allclose(keys.poses[0], [1.4, 2.0, 0.1], atol=1e-2)
     for k, x in ((1, 2.4), (2, 3.4)):
-        np.testing.assert_allclose(keys.poses[k, [0, 2]], [x, 0.22], atol=2e-3)
+        np.testing.assert_allclose(keys.poses[k, [0, 2]], [x, 0.22], atol=1e-2)
         normal = np.array([-np.sin(0.02), np.cos(0.02)])
-        assert abs(5.0 - normal @ keys.poses[k, :2] - 3.0) < 1e-3  # as far from the wall as it was seen
+        assert abs(5.0 - normal @ keys.poses[k, :2] - 3.0) < 2e-3  # as far from the wall as it was seen
+
+
+def test_walls_that_are_nearly_parallel_do_not_move_a_scan_along_them() -> None:
+    keys, scan = KeyScans(), room_scan(np.array([2.0, 2.0, 0.0]))
+    walls = np.array([[0.5 * np.pi, 5.0, 1.0], [0.5 * np.pi + 0.005, 5.0, 1.0]])
+    keys.keep(np.array([1.0, 2.0, 0.1]), scan, np.full(len(scan.ranges), -1, np.int16), IDS[:2], walls)
+    assert keys.redraw_if_moved(OccupancyGrid(), walls[:, :2] + [[0.0, 0.05], [0.0, 0.02]], IDS)
+    np.testing.assert_allclose(keys.poses[0], [1.0, 2.035, 0.1], atol=0.005)
 
 
 def test_the_normal_of_a_wall_may_turn_about() -> None:
@@ -86,7 +94,7 @@ def test_the_normal_of_a_wall_may_turn_about() -> None:
     keys.keep(np.array([-2.0, 0.0, 0.0]), scan, np.full(len(scan.ranges), -1, np.int16), np.zeros(1, np.int64), wall)
     keys.keep(np.array([-2.0, 0.5, 0.0]), scan, np.full(len(scan.ranges), -1, np.int16), np.zeros(1, np.int64), wall)
     assert keys.redraw_if_moved(grid, np.array([[np.pi, 0.05]]), np.zeros(1, np.int64))
-    np.testing.assert_allclose(keys.poses, [[-2.1, 0.0, 0.0], [-2.1, 0.5, 0.0]], atol=1e-3)
+    np.testing.assert_allclose(keys.poses, [[-2.1, 0.0, 0.0], [-2.1, 0.5, 0.0]], atol=5e-3)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -105,7 +113,7 @@ def test_least_squares_over_points_and_walls(seed: int) -> None:
     before = pose.copy()
 
     def residuals(q: np.ndarray) -> list[float]:
-        out = [*(q[:2] - before[:2]) / 1.0, (q[2] - before[2]) / 0.02]
+        out = [*(q[:2] - before[:2]) / 0.1, (q[2] - before[2]) / 0.02]
         for k in range(n):
             if walls[k]:
                 far = marks[k, 1] - pose[0] * np.cos(marks[k, 0]) - pose[1] * np.sin(marks[k, 0])
