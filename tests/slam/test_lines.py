@@ -207,6 +207,38 @@ def test_invariant_update_of_lines_is_gain_retraction_and_reset(seed: int) -> No
     np.testing.assert_allclose(got_p, gamma @ plain_p @ gamma.T, atol=1e-9)
 
 
+@pytest.mark.parametrize("update", [stacked_update, invariant_update])
+def test_an_update_beyond_its_limit_is_not_made(update) -> None:
+    """Each piece of a wall may well be it, but not both: their offsets differ by more than either's noise."""
+    x, p, z, marks = state_with_lines(0)
+    z = np.vstack([z[1], z[1]])
+    z[1, 0] += 0.3
+    match, extra = np.ones(2, np.int64), [marks, *work_space(2, 9), np.zeros(9)]
+    extra = extra if update is invariant_update else extra[1:4]
+    got_x, got_p = x.copy(), p.copy()
+    rows, nis = update(got_x, got_p, 9, z, match, OFFSET, *extra, np.array([0.0, 10.0, 28.0]))
+    assert (rows, nis > 28.0) == (0, True)
+    np.testing.assert_array_equal(got_x, x)
+    np.testing.assert_array_equal(np.triu(got_p), np.triu(p))
+    rows, same = update(got_x, got_p, 9, z, match, OFFSET, *extra, np.array([0.0, nis + 1e-9]))
+    assert (rows, same) == (4, nis)
+    assert not np.array_equal(got_x, x)
+
+
+def test_a_ledge_beside_a_wall_does_not_turn_the_robot() -> None:
+    """Two pieces, each of which the wall could be while the heading is unsure; one belongs to a ledge beside it."""
+    backend = slam.make("invariant-ekf")
+    backend.reset()
+    wall = np.array([5.89, -2.0, 1e-6, 0.0, 1e-6, LINE, -2.0, 0.0, -5.4, 3.4])
+    backend._add(wall, None)
+    backend._p[2, 2] = 0.0087**2
+    # The ledge's line has its foot 4.5 m from its middle, where it lies 6.4 cm nearer.
+    ledge = np.array([5.89 - 0.023, -2.0 + 0.009, 1.8e-3, 4.0e-4, 0.9e-4, LINE, -2.0 + 0.009, 0.0, 3.7, 5.3])
+    backend._take(np.array([wall, ledge]), None)
+    assert abs(backend.pose[2]) < 5e-4
+    assert backend.nis_dof == 2
+
+
 def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
     """The trap that invariant-ekf.md names: otherwise a line drifts by −½ t² nᵀ p each time."""
     x = np.array([30.0, -20.0, 0.1, 5.0, 5.0, 0.3, 25.0])

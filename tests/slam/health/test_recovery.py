@@ -11,6 +11,7 @@ import slam
 from mecanum_env.env import ExploreEnv
 from slam.ekf import EkfSlam
 from slam.geometry import compose, transform_points
+from slam.grids.occupancy import OccupancyGrid
 from training.studies.recovery.faults import make_fault
 
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
@@ -88,6 +89,22 @@ def test_the_landmarks_decide_where_a_found_robot_is() -> None:
     assert np.sqrt(after.pose_cov[0, 0]) < 0.02
     # What the pose was said to be known to, beforehand, has made no landmark surer than it can be.
     assert np.diag(after.whole_cov)[3:].min() > 0.2 * np.diag(before.whole_cov)[3:].min()
+
+
+def test_where_nothing_is_known_a_lost_robot_goes_on_from_where_the_wheels_have_it() -> None:
+    """It comes to where there is no map: nothing speaks against the wheels, and nowhere else is looked for."""
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    known, backend.grid = backend.grid, OccupancyGrid(backend.grid.resolution)
+    backend.recovery.give_up()
+    for k in range(backend.config.relocalisation.unopposed + 1):
+        assert backend.recovery.lost == (k < backend.config.relocalisation.unopposed)
+        env.step(np.zeros(3, np.float32))
+    assert not backend.recovery.lost
+    assert (backend.recovery.times_lost, backend.recovery.relocalisations) == (1, 0)
+    assert np.hypot(*(backend.pose - env.truth.pose)[:2]) < 0.05
+    assert backend.pose_nees(env.truth.pose) < 16.0
+    assert known.known_cells > backend.grid.known_cells > 0  # and it draws again
 
 
 def test_dead_reckoning_is_never_found_anew() -> None:
