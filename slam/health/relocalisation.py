@@ -173,8 +173,11 @@ class Relocaliser:
         found = refine(self._sharp_field, points, found.pose, self._sharp_matching)
         x, y, theta = found.pose.tolist()
         sensor = (x + self._offset_m * math.cos(theta), y + self._offset_m * math.sin(theta), theta)
-        seen = agreement(self._grid, sensor, scan, config.check_beams)
-        crossing, beams = through_walls(self._grid, sensor, scan, config.check_beams)
+        # In the open few beams return: all that there are.
+        few = np.count_nonzero(scan.ranges <= scan.range_max) < config.check_beams
+        looked_at = len(scan.ranges) if few else config.check_beams
+        seen = agreement(self._grid, sensor, scan, looked_at)
+        crossing, beams = through_walls(self._grid, sensor, scan, looked_at)
         against = seen.in_the_open + crossing
         quality = (seen.on_walls - against) / max(beams, 1)
         known = seen.on_walls + seen.in_the_open
