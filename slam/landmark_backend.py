@@ -92,8 +92,7 @@ class LandmarkBackend(Backend):
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        rows = self._book.just_seen()
-        return self._book.ids[rows], self._points[rows]
+        return self._book.just_seen(self._points)
 
 
 def far_better(fit: float, usual: float) -> bool:
