@@ -224,7 +224,7 @@ def _fill_local(
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # else it does not vectorise
 def find_row_cells(
-    x0: float, y0: float, along: NDArray[np.float32], offset: NDArray[np.float32], shape: tuple[int, int],
+    x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32], shape: tuple[int, int],
     first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Write which cells of a grid a row of pixels looks at; all numbers are in cells.
@@ -232,7 +232,7 @@ def find_row_cells(
     Parameters
     ----------
     x0, y0
-        float32: the middle of the first pixel.
+        The middle of the first pixel.
     along
         ``(2, n)``: how far to the right (x) and down (y) of it the others are; neither turns back.
     offset
