@@ -181,7 +181,7 @@ class LandmarkBook:
 def _points_seen_at(
     now: int, marks: Array, ids: NDArray[np.int64], points: Array
 ) -> tuple[NDArray[np.int64], Array]:  # fmt: skip
-    """Do what :meth:`LandmarkBook.just_seen` does: indexing with arrays took ten times as long."""
+    """Do what :meth:`LandmarkBook.just_seen` does, in two thirds of the time that indexing by arrays took."""
     n = points.shape[0]
     seen_ids, seen = np.empty(n, np.int64), np.empty((n, 2))
     count = 0
