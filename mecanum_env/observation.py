@@ -224,8 +224,8 @@ def _fill_local(
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # else it does not vectorise
 def find_row_cells(
-    x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32], shape: tuple[int, int],
-    first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
+    x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32],
+    shape: tuple[int, int], first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Write which cells of a grid a row of pixels looks at; all numbers are in cells.
 
