@@ -190,21 +190,16 @@ def _fill_local(
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
     c, s = np.float32(math.cos(theta) * step), np.float32(math.sin(theta) * step)
-    rows, cols = log_odds.shape
     half = 0.5 * size - 0.5
     quarter = np.float32(0.25)
     ax, ay = quarter * (c - s), quarter * (s + c)  # from the middle to the points, in cells
     bx, by = quarter * (c + s), quarter * (s - c)
-    low_x, low_y = max(abs(ax), abs(bx)), max(abs(ay), abs(by))
-    high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
-    width, nowhere = np.int32(cols), np.int32(rows * cols)  # what follows the last cell was never observed
-    along_x, along_y = np.empty(size, np.float32), np.empty(size, np.float32)
-    offset_x, offset_y = np.empty((2, size), np.float32), np.empty((2, size), np.float32)  # in even and odd rows
+    along, offset = np.empty((2, size), np.float32), np.empty((2, 2, size), np.float32)  # in even and odd rows
     for j in range(size):
-        along_x[j], along_y[j] = np.float32(j) * s, np.float32(j) * c
+        along[0, j], along[1, j] = np.float32(j) * s, np.float32(j) * c
         for odd in range(2):
             one_way = (odd + j) & 1 == 1
-            offset_x[odd, j], offset_y[odd, j] = ax if one_way else bx, ay if one_way else by
+            offset[odd, 0, j], offset[odd, 1, j] = ax if one_way else bx, ay if one_way else by
     cells, trail = log_odds.view(np.uint8).ravel(), visited.ravel()
     first, second, middle = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     probability_out, observed_out, trail_out = out[0].ravel(), out[1].ravel(), out[2].ravel()
@@ -212,14 +207,7 @@ def _fill_local(
         x0 = np.float32(x / resolution - col0 + c * (half - i) - s * half)
         y0 = np.float32(y / resolution - row0 + s * (half - i) + c * half)
         # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
-        to_x, to_y = offset_x[i & 1], offset_y[i & 1]
-        for j in range(size):
-            px, py = x0 + along_x[j], y0 - along_y[j]
-            dx, dy = to_x[j], to_y[j]
-            inside = (px >= low_x) & (py >= low_y) & (px < high_x) & (py < high_y)
-            first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else nowhere
-            second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else nowhere
-            middle[j] = np.int32(py) * width + np.int32(px) if inside else nowhere
+        find_row_cells(x0, y0, along, offset[i & 1], log_odds.shape, first, second, middle)
         # Unsigned indices: others are tested for being negative.
         for j in range(np.uint64(size)):
             pixel = np.uint64(i * size) + j
@@ -232,6 +220,49 @@ def _fill_local(
         trail_out[k] = observed_out[k] * (trail_out[k] != 0)
     for k in range(size * size):
         probability_out[k] |= UNKNOWN_BYTE * (probability_out[k] == 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # else it does not vectorise
+def find_row_cells(
+    x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32],
+    shape: tuple[int, int], first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
+) -> None:  # fmt: skip
+    """Write which cells of a grid a row of pixels looks at; all numbers are in cells.
+
+    Parameters
+    ----------
+    x0, y0
+        The middle of the first pixel.
+    along
+        ``(2, n)``: how far to the right (x) and down (y) of it the others are; neither turns back.
+    offset
+        ``(2, n)``: from each pixel's middle to the first of its two points; the second lies opposite.
+    shape
+        Rows and columns.
+    first, second, middle
+        ``(n,)``, filled: indices of the cells under either point and the middle, counted row by row; one beyond
+        the last cell for a pixel that may reach over an edge.
+    """
+    rows, cols = shape
+    right, down, to_x, to_y = along[0], along[1], offset[0], offset[1]
+    n = right.shape[0]
+    low_x, low_y = max(abs(to_x[0]), abs(to_x[1])), max(abs(to_y[0]), abs(to_y[1]))
+    high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
+    x1, y1 = x0 + right[n - 1], y0 - down[n - 1]
+    width, nowhere = np.int32(cols), np.int32(rows * cols)
+    if min(x0, x1) >= low_x and max(x0, x1) < high_x and min(y0, y1) >= low_y and max(y0, y1) < high_y:
+        for j in range(n):  # as most rows: no pixel reaches over, and none need be asked
+            px, py, dx, dy = x0 + right[j], y0 - down[j], to_x[j], to_y[j]
+            first[j] = np.int32(py + dy) * width + np.int32(px + dx)
+            second[j] = np.int32(py - dy) * width + np.int32(px - dx)
+            middle[j] = np.int32(py) * width + np.int32(px)
+        return
+    for j in range(n):
+        px, py, dx, dy = x0 + right[j], y0 - down[j], to_x[j], to_y[j]
+        inside = (px >= low_x) & (py >= low_y) & (px < high_x) & (py < high_y)
+        first[j] = np.int32(py + dy) * width + np.int32(px + dx) if inside else nowhere
+        second[j] = np.int32(py - dy) * width + np.int32(px - dx) if inside else nowhere
+        middle[j] = np.int32(py) * width + np.int32(px) if inside else nowhere
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -242,19 +242,19 @@ class EkfSlam(LandmarkBackend):
         n = self._n
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
         usual = usual.copy()
-        fit = self._fit(z, usual, scan)
-        self._x[:n], self._p[:n, :n] = x, p
         moved, turned = self._unseen_motion
         self._p[0, 0] += moved**2
         self._p[1, 1] += moved**2
         self._p[2, 2] += turned**2
         match = self._associate_jointly(z)
         found = np.count_nonzero(match >= 0)
-        back = found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0)
-        p_wide = self._p[:3, :3].copy()
-        if back and far_better(self._fit(z, match, scan), fit):
-            p[:3, :3] = p_wide
-            usual = match
+        if found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0):
+            p_wide = self._p[:3, :3].copy()
+            fit = self._fit(z, match, scan)
+            self._x[:n], self._p[:n, :n] = x, p
+            if far_better(fit, self._fit(z, usual, scan)):
+                p[:3, :3] = p_wide
+                usual = match
         self._x[:n], self._p[:n, :n] = x, p
         return usual
 

@@ -92,10 +92,7 @@ class LandmarkBackend(Backend):
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        rows = self._book.just_seen()
-        marks = np.empty((len(rows), 3))
-        marks[:, :2], marks[:, 2] = self._points[rows], self._book.marks[rows, 0] == LINE
-        return self._book.ids[rows], marks
+        return self._book.just_seen(self._points)
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""

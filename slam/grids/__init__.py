@@ -1,6 +1,6 @@
 """Occupancy grids, and scans held against them.
 
-``occupancy`` is the grid of every belief, ``scan_drawing`` draws a scan into it, ``key_scans`` redraw what a
-correction moved; ``scan_matching`` and its ``match_kernels`` say where a scan fits, ``scan_odometry`` makes
-odometry of that.
+``occupancy`` is the grid of every belief, ``free_space`` and ``scan_drawing`` draw a scan into it, ``key_scans``
+redraw what a correction moved; ``scan_matching`` and its ``match_kernels`` say where a scan fits,
+``scan_odometry`` makes odometry of that.
 """

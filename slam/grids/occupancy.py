@@ -3,7 +3,7 @@
 Cells are log-odds in an ``int8`` (one unit is 0.05 nat). The grid lies on a lattice through the origin of the
 belief's frame and grows as scans need it: neither its size nor its origin tells anything about the true plan.
 
-A scan is drawn as what it is, a star-shaped polygon of free space (OpenCV fills it) with surfaces on its rim:
+A scan is drawn as what it is, a star-shaped polygon of free space with surfaces on its rim:
 cells inside lose odds once per scan, however many beams pass through them, and cells that a beam ended in, or
 that lie on a straight surface between two beams, gain.
 """
@@ -14,15 +14,13 @@ import math
 from collections.abc import Iterable
 from typing import Any, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.grids.free_space import crossings_of, mark_free
 from slam.grids.scan_drawing import (
     CLASS_OF,
-    FIXED_POINT,
     FREE,
-    IN_FREE,
     MAX_LOG_ODDS,
     MIN_LOG_ODDS,
     NO_SURFACE,
@@ -35,7 +33,6 @@ from slam.grids.scan_drawing import (
     draw,
     ends_on,
     mark_disc,
-    outline,
     sum_blocks,
 )
 from slam.types import Scan
@@ -223,24 +220,19 @@ class OccupancyGrid:
             surface = NO_SURFACE
         self._prepare_for(scan)
         resolution, reach = self.resolution, self._reach
-        mask, polygon, beams = self._mask, self._polygon, self._beams
+        mask, beams = self._mask, self._beams
         x, y, theta = sensor_pose if isinstance(sensor_pose, tuple) else sensor_pose.tolist()
         # The sensor is near the mask's middle; its columns lie eight cells to a word of the grid's.
         mask_row = math.floor(y / resolution) - reach
         mask_col = (math.floor(x / resolution) - reach) & -WORD
-        count, r0, c0, r1, c1 = outline(
-            polygon, beams, scan.ranges, self._rays, surface, x, y, theta, resolution, scan.range_max, mask_row,
-            mask_col, self._full_circle,
+        count, r0, c0, r1, c1 = mark_free(
+            mask, self._polygon, self._crossings, beams, scan.ranges, self._rays, surface, x, y, theta, resolution,
+            scan.range_max, mask_row, mask_col, self._full_circle,
         )  # fmt: skip
         if count < 3:
             if body is not None:
                 self.mark_visited(*body)
             return
-        rim = [polygon[:count]]
-        cv2.fillPoly(mask, rim, IN_FREE, cv2.LINE_8, FIXED_POINT)
-        # The rim runs along surfaces: the cells under it are not known to be free. Without this, walls seen at a
-        # flat angle, where hits are sparse, would be erased between the hits.
-        cv2.polylines(mask, rim, True, 0, 1, cv2.LINE_8, FIXED_POINT)
         self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
         body_x, body_y, radius = (0.0, 0.0, -1.0) if body is None else self._make_room_for(*body)
         most = self._change_count + (r1 + 1 - r0) * (c1 + 1 - c0) + 1
@@ -271,6 +263,7 @@ class OccupancyGrid:
         self._reach = math.ceil(scan.range_max / self.resolution) + 3
         # As wide as that again and a window more, into which the kernel may look beyond the box of a scan.
         self._mask = np.zeros((2 * self._reach + 1, (2 * self._reach // WORD + 3) * WORD + WINDOW), np.uint8)
+        self._crossings = crossings_of(len(self._mask), n + 1)
 
     def _make_room_for(self, x: float, y: float, radius: float) -> tuple[float, float, float]:
         """Make room for a disc [m]; return it in cells of the lattice."""

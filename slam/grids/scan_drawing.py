@@ -1,6 +1,6 @@
 """How a scan is drawn into an occupancy grid: cell values, and the Numba kernels behind the grid.
 
-OpenCV fills the polygon between :func:`outline` and :func:`draw`.
+:mod:`slam.grids.free_space` has marked the free cells in the scan's mask before.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 
 WORD = 8  # cells that the kernel updates together
 WINDOW = 64  # cells that it looks at together: vectors of bytes
-FIXED_POINT = 4  # fractional bits of the polygon's vertices
 IN_FREE, IN_SURFACE = 1, 2  # marks in the scan's own mask
 
 
@@ -69,62 +68,6 @@ _NEXT, _GAIN = _steps()
 _SURELY_FREE, _SURELY_OCCUPIED = np.uint8(MIN_LOG_ODDS & 255), np.uint8(MAX_LOG_ODDS)
 
 NO_SURFACE = np.zeros(0, np.int16)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def outline(
-    polygon: NDArray[np.int32], beams: Array, ranges: Array, rays: Array, surface: NDArray[np.int16], x: float,
-    y: float, theta: float, resolution: float, range_max: float, mask_row: int, mask_col: int, full_circle: bool,
-) -> tuple[int, int, int, int, int]:  # fmt: skip
-    """Write the scan's free polygon in fixed-point mask cells; return its length and the box it needs.
-
-    ``beams`` ``(4, n)`` is for :func:`draw`: its last two rows become the cells that beams ended in, or ``nan``.
-    """
-    scale = float(1 << FIXED_POINT)
-    c, s = math.cos(theta), math.sin(theta)
-    x0, y0 = x / resolution - mask_col, y / resolution - mask_row
-    n = ranges.shape[0]
-    # What needs no branches first, in a loop that vectorises.
-    for i in range(n):
-        r = ranges[i]
-        along_x, along_y = c * rays[0, i] - s * rays[1, i], s * rays[0, i] + c * rays[1, i]
-        reach = (range_max if r > range_max else r) / resolution
-        beams[0, i], beams[1, i] = along_x * reach, along_y * reach
-        # What stopped the beam lies behind the point it returned from: a quarter of a cell deeper.
-        deeper = reach + 0.25 if r <= range_max else math.nan
-        beams[2, i], beams[3, i] = x0 + along_x * deeper, y0 + along_y * deeper
-    x0, y0 = x0 - 0.5, y0 - 0.5  # OpenCV's pixel (0, 0) is centred on (0, 0)
-    low_x = high_x = x0
-    low_y = high_y = y0
-    count = 0
-    lost = 0
-    joined = surface.shape[0] == n
-    for i in range(n):
-        if joined and 0 < i < n - 1 and surface[i] >= 0 and surface[i - 1] == surface[i] == surface[i + 1]:
-            continue  # within a straight surface: its two ends say it all
-        dx, dy = beams[0, i], beams[1, i]
-        if math.isnan(dx):
-            # One or two lost beams are bridged by their neighbours; a run of them is not known to be free.
-            lost += 1
-            if lost != 3:
-                continue
-            dx = dy = 0.0
-        else:
-            lost = 0
-        polygon[count, 0] = round((x0 + dx) * scale)
-        polygon[count, 1] = round((y0 + dy) * scale)
-        count += 1
-        low_x, high_x = min(low_x, x0 + dx), max(high_x, x0 + dx)
-        low_y, high_y = min(low_y, y0 + dy), max(high_y, y0 + dy)
-    if not full_circle:
-        polygon[count, 0] = round(x0 * scale)
-        polygon[count, 1] = round(y0 * scale)
-        count += 1
-    # Two cells of margin: half for the rounding, one and a half for the surfaces beyond the rim. Whole words.
-    return (
-        count, max(int(low_y) - 2, 0), max(int(low_x) - 2, 0) & -WORD, int(high_y) + 3,
-        (int(high_x) + 3) | (WORD - 1),
-    )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -262,7 +205,7 @@ def draw(
     lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
     x: float, radius: float,
 ) -> tuple[int, int, float]:  # fmt: skip
-    """Do all that follows OpenCV, in one call: surfaces into the mask, the mask into the grid, and the body.
+    """Do the rest in one call: surfaces into the mask, the mask into the grid, and the body.
 
     Arguments and return value are those of :func:`mark_surfaces`, :func:`fuse` and :func:`mark_disc`.
     """

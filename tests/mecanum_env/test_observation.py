@@ -6,7 +6,15 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, UNKNOWN_BYTE, _fill_global, _fill_local, map_frame
+from mecanum_env.observation import (
+    LOCAL_CELL_M,
+    MAP_SIZE,
+    UNKNOWN_BYTE,
+    _fill_global,
+    _fill_local,
+    find_row_cells,
+    map_frame,
+)
 from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from tests.slam.simulated import room_scan
 
@@ -122,3 +130,27 @@ def test_the_global_map_puts_the_robot_where_the_pose_says() -> None:
     i = MAP_SIZE - 1 - int(((1.0 - cy) / half + 1) / 2 * MAP_SIZE)
     j = int(((1.0 - cx) / half + 1) / 2 * MAP_SIZE)
     assert out[0, i, j] < 110
+
+
+def test_a_row_of_pixels_looks_at_the_cells_under_it_and_at_none_beyond_the_edges() -> None:
+    rng, n, shape = np.random.default_rng(0), MAP_SIZE, (220, 260)
+    within = 0
+    for _ in range(300):
+        theta = rng.uniform(-math.pi, math.pi)
+        c, s = np.float32(2.0 * math.cos(theta)), np.float32(2.0 * math.sin(theta))
+        x0, y0 = rng.uniform(-10, 270, 2).astype(np.float32)
+        steps = np.arange(n, dtype=np.float32)
+        along = np.stack([steps * s, steps * c])
+        sides = np.array([[c - s, c + s], [s + c, s - c]], np.float32) / 4
+        offset = np.ascontiguousarray(np.tile(sides, n // 2))
+        found = np.empty((3, n), np.int32)
+        find_row_cells(x0, y0, along, offset, shape, *found)
+        # One pixel after the other, each asked whether it may reach over an edge.
+        x, y = x0 + along[0], y0 - along[1]
+        low_x, low_y = np.abs(sides).max(axis=1)
+        inside = (x >= low_x) & (y >= low_y) & (x < shape[1] - low_x) & (y < shape[0] - low_y)
+        for sign, got in zip((1, -1, 0), found, strict=True):
+            row, col = (y + sign * offset[1]).astype(int), (x + sign * offset[0]).astype(int)
+            np.testing.assert_array_equal(got, np.where(inside, row * shape[1] + col, shape[0] * shape[1]))
+        within += bool(inside.all())
+    assert 20 < within < 280  # both ways were gone

@@ -123,3 +123,18 @@ def test_a_landmark_that_beams_pass_through_is_dropped_and_one_on_a_wall_is_not(
     assert book.row(0) == -1
     book.add(0.0, 0.0, None)
     assert book.ids.tolist() == [1, 2]  # ids are never used twice
+
+
+def test_the_landmarks_just_seen_are_those_of_the_last_update() -> None:
+    rng, book = np.random.default_rng(0), LandmarkBook(LandmarkPolicy())
+    for k in range(40):
+        book.add(LINE if k % 5 == 0 else 1.0, 0.0, 3 * k)
+    points = rng.uniform(-5, 5, (40, 2))
+    for _ in range(20):
+        match = rng.choice(50, 9, replace=False) - 10
+        book.count_sightings(match)
+        rows = np.array([r for r in sorted(match.tolist()) if r >= 0], np.int64)
+        ids, seen = book.just_seen(points)
+        np.testing.assert_array_equal(ids, 3 * rows)
+        np.testing.assert_array_equal(seen[:, :2], points[rows])
+        np.testing.assert_array_equal(seen[:, 2], rows % 5 == 0)
