@@ -21,6 +21,7 @@ from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
@@ -83,6 +84,7 @@ class EkfSlam(LandmarkBackend):
         # Told of every correction before it is made.
         self.witness: Callable[[list[Innovation]], object] | None = None
         self._max_turn = math.radians(c.max_turn_deg)
+        self._curved = curvature_model(c.features)
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
 
@@ -131,8 +133,7 @@ class EkfSlam(LandmarkBackend):
         )
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
-        self._tell(z, match)
-        self._correct(z, match)
+        self._accept(z, match)
         if loop:
             self._close_loop(z, match)
         if scan is not None and self.nis_dof >= 2 * FEWEST_BACK:
@@ -158,8 +159,7 @@ class EkfSlam(LandmarkBackend):
         match = self._rows(ids)
         if doubting:
             refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, z, self.config.known_gate, match)
-        self._tell(z, match)
-        self._correct(z, match)
+        self._accept(z, match)
         self._book.count_sightings(match)
         for k in np.flatnonzero(match == UNMATCHED):
             if self._book.row(ids[k]) < 0:  # not added by this very call
@@ -219,8 +219,7 @@ class EkfSlam(LandmarkBackend):
         nis, dof = self.nis, self.nis_dof
         closing = np.full(len(match), UNMATCHED)
         closing[rows] = more
-        self._tell(z, closing)
-        self._correct(z, closing)
+        self._accept(z, closing)
         self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
         match[closing >= 0] = closing[closing >= 0]
 
@@ -257,11 +256,13 @@ class EkfSlam(LandmarkBackend):
         self._correct(z, match)
         return self.grid.agreement(self.sensor_pose(), scan)
 
-    def _tell(self, z: Array, match: NDArray[np.int64]) -> None:
-        """Show the innovations to who has asked for them."""
+    def _accept(self, z: Array, match: NDArray[np.int64]) -> None:
+        """Correct by a match that stands, curved walls made straight; show the innovations to who has asked."""
+        offset = self.config.lidar_offset_m
+        straighten(self._x, offset, z, match, self._book.marks, self._curved)
         if self.witness is not None:
-            offset = self.config.lidar_offset_m
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
+        self._correct(z, match)
 
     def _correct(self, z: Array, match: NDArray[np.int64]) -> None:
         """Make one stacked update of all matched observations."""
@@ -285,14 +286,11 @@ class EkfSlam(LandmarkBackend):
             self._enlarge()
         joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
-        extent = (float(z[EDGE]), 0.0)
-        if z[KIND] == LINE:
-            # Where the sensor stands along the wall, from the wall's foot; its own foot is there.
-            sensor_x, sensor_y, _ = self.sensor_pose().tolist()
-            along = math.cos(direction) * sensor_y - math.sin(direction) * sensor_x
-            extent = (along + float(z[FROM]), along + float(z[TO]))
+        along = along_wall(self._x, self.config.lidar_offset_m, direction)
+        wall = (along + float(z[FROM]), along + float(z[TO]))
+        extent = wall if z[KIND] == LINE else (float(z[EDGE]), 0.0)
         self._n += 2
-        self._book.add(float(z[KIND]), direction, known_id, extent=extent)
+        self._book.add(float(z[KIND]), direction, known_id, extent=extent, bend=first_bend(along, z))
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""

@@ -77,7 +77,7 @@ class LandmarkBackend(Backend):
 
     @property
     def _marks(self) -> Array:
-        """Marks ``(n, 8)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
+        """Marks ``(n, 11)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
         return self._book.marks
 
     @property
@@ -102,7 +102,7 @@ def far_better(fit: float, usual: float) -> bool:
 
 
 def observation_rows(observations: Observations) -> Array:
-    """Return landmark observations as rows ``(m, 10)`` like the feature extractor's, of unknown kind.
+    """Return landmark observations as rows ``(m, 12)`` like the feature extractor's, of unknown kind.
 
     Raises ``ValueError`` where they are not finite, or shapes disagree.
     """
@@ -110,6 +110,6 @@ def observation_rows(observations: Observations) -> Array:
     cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
     if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
         raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-    z = np.zeros((len(rb), 10))
+    z = np.zeros((len(rb), 12))
     z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     return z
