@@ -31,7 +31,7 @@ class LandmarkBackend(Backend):
     def _begin(self, policy: LandmarkPolicy) -> None:
         self._book = LandmarkBook(policy)
         self._known = KnownIds(self.config.lidar_offset_m)
-        self._twist = (0.0, 0.0, 0.0)
+        self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
         self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
 
     def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
@@ -39,8 +39,8 @@ class LandmarkBackend(Backend):
         given = odometry.twist
         vx, vy, omega = given if isinstance(given, tuple) else np.asarray(given, np.float64).tolist()
         twist, dt, lever = (vx, vy, omega), odometry.dt, noise.lever_m
-        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
-        self._twist = twist
+        slip, self._body = noise.slip(self._body, twist, dt)
+        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         way = math.hypot(vx, vy, lever * omega) * dt
         moved, turned = self._unseen_motion
         self._unseen_motion = moved + way, turned + way / lever

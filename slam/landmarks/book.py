@@ -76,11 +76,12 @@ class LandmarkBook:
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to, 3 more ``(n, 11)``.
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 11)``.
 
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
         surface it is, as the observation does. The last three are of a wall's curvature: the information of its
-        measurements, the same times what they measured, and where along the wall it is tangent to its line. A view.
+        measurements, the same times what they measured, and where along the wall it is tangent to its line.
+        A view.
         """
         return self._marks[: self.count]
 

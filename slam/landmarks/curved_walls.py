@@ -1,13 +1,14 @@
 """Walls that are not straight: what a piece of one says about its landmark, the line that was seen first.
 
-A line fitted to a piece of a curved wall is its tangent about the middle of the piece. Which piece is seen depends on
-where the robot stands: the tangent turns as the robot moves, and while the view stays alike it is off by the same. As
-noise of each scan that averages out; the error does not. So the curvature κ of every wall is estimated over all its
-scans, from how its points bulge. What it makes of a piece is taken out; what is not known of it is noise that lasts.
+A line fitted to a piece of a curved wall is its tangent about the middle of the piece. Which piece is seen depends
+on where the robot stands: the tangent turns as the robot moves, and while the view stays alike it is off by the
+same. As noise of each scan that averages out; the error does not. So the curvature κ of every wall is estimated
+over all its scans, from how its points bulge. What it makes of a piece is taken out; what is not known of it is
+noise that lasts.
 
 Whether a wall is curved at all is one of the unknowns: κ is zero with one probability, else normally distributed
-("spike and slab", Mitchell and Beauchamp 1988). Without that the noise of κ would bend straight walls, the more the
-farther from the place where they were seen first.
+("spike and slab", Mitchell and Beauchamp 1988). Without that the noise of κ would bend straight walls, the more
+the farther from the place where they were seen first.
 """
 
 from __future__ import annotations
