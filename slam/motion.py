@@ -89,8 +89,8 @@ class OdometryNoise:
     ) -> tuple[float, tuple[float, float, float]]:
         """Return how much faster [m/s] wheels may turn than the body moves after ``dt`` [s], and its twist then.
 
-        ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``grip_m_s2`` at
-        most: where they stop too fast, the body slides on after they stand.
+        ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``grip_m_s2``
+        at most: where they stop too fast, the body slides on after they stand.
         """
         x, y, w = wheels[0] - body[0], wheels[1] - body[1], wheels[2] - body[2]
         change = math.sqrt(x * x + y * y + (self.lever_m * w) ** 2)

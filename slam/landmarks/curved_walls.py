@@ -78,7 +78,7 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
     Counts their curvature first. With Δ from where the wall is tangent to its line to the middle of the piece, t
     that middle from the sensor's foot and l the piece's length, its slope is κΔ and its offset κΔ²/2:
 
-        φ += κΔ,  d += tκΔ − κΔ²/2
+        φ ← φ + κΔ,  d ← d cos κΔ + t sin κΔ − κΔ²/2
 
     The slope's variance grows by N (σκ² Δ² + κ² q² (l² + Δ²)): along the wall κ changes by a share q, and none of
     this is noise of one scan, but lasts over N. The offset's grows by as much times l²/12 + Δ²/4. That κΔ changes
@@ -104,9 +104,13 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
         mark[_PULL] += row[_KAPPA] / row[_VAR_KAPPA]
         kappa, var, square = curvature(mark[_INFO], mark[_PULL], model)
         middle = row[3] / row[4]  # where offset and slope are uncorrelated
-        beyond = along_wall(x, offset, x[3 + 2 * match[k]]) + middle - mark[_AT]
-        row[0] += kappa * beyond * (middle - 0.5 * beyond)
-        row[1] += kappa * beyond
+        alpha = x[3 + 2 * match[k]]
+        lean = x[2] + row[1] - alpha  # of the piece against its landmark's line
+        along = row[0] * math.sin(lean) + middle * math.cos(lean)
+        beyond = along_wall(x, offset, alpha) + along - mark[_AT]
+        turn = kappa * beyond
+        row[0] = row[0] * math.cos(turn) + middle * math.sin(turn) - 0.5 * turn * beyond
+        row[1] += turn
         length2, beyond2 = (row[9] - row[8]) ** 2, beyond * beyond
         slope = model[3] * (var * beyond2 + square * model[2] ** 2 * (length2 + beyond2))
         row[2] += slope * (length2 / 12.0 + beyond2 / 4.0 + middle * middle)
