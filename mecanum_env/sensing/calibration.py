@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
-from mecanum_env.physics.robot import GRAVITY_M_S2
 from slam.motion import LastingErrors, OdometryNoise
 from slam.settings import to_mapping
 
@@ -28,8 +27,7 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
 
     Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
     within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
-    weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart. What the
-    floor passes on is what it does where it is slipperiest.
+    weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
     ``mecanum study calibration`` measures V on the simulated robot.
     """
     white = noise.encoder**2 + noise.slip**2 / 3.0
@@ -38,10 +36,8 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
     base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
     white_share = math.sqrt(white / 4.0)
-    least = min(noise.friction, noise.patch_friction[0]) if noise.patch_share > 0 else noise.friction
     return OdometryNoise(
         lever_m=robot.lever_m,
-        grip_m_s2=min(OdometryNoise.grip_m_s2, least * GRAVITY_M_S2 / math.sqrt(2.0)),  # rollers pull at 45°
         speed_floor_m_s=_FLOOR_M_S,
         turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
         speed_share=per_wheel,

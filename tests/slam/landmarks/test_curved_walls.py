@@ -27,7 +27,9 @@ def round_room(pose: np.ndarray, radius: float, rng: np.random.Generator, *, ins
     root = np.sqrt(np.where(b * b > q, b * b - q, np.nan))
     ranges = -b + root if inside else np.where(-b - root > 0, -b - root, np.nan)
     ranges = np.where(np.abs(ANGLES) < 0.5, ranges, np.nan) + 0.01 * rng.standard_normal(len(ANGLES))
-    return Scan(np.where(ranges < 8, ranges, np.inf), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=8.0)
+    return Scan(
+        np.where(ranges < 8, ranges, np.inf), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=8.0
+    )
 
 
 @pytest.mark.parametrize("inside", [True, False])
