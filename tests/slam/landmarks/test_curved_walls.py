@@ -117,7 +117,7 @@ def test_points_and_what_is_not_matched_stay_as_they_are() -> None:
 
 
 def bay(turns: np.ndarray) -> np.ndarray:
-    """Return points ``(n, 2)`` of a smooth wall round the origin with five flat stretches, bent more beside them."""
+    """Return points ``(n, 2)`` of a smooth wall round the origin with five flat stretches, bent beside them."""
     radius = 3.0 * (1.0 + 0.04 * np.cos(5 * turns))
     return np.column_stack([radius * np.cos(turns), radius * np.sin(turns)])
 
@@ -155,5 +155,4 @@ def nees_in_the_bay(config: dict[str, object], runs: int) -> float:
 def test_a_filter_over_curved_walls_knows_how_far_off_it_is() -> None:
     straight = {"features": {"wall_curved_share": 0.0}}
     with_bends, without = nees_in_the_bay({}, 8), nees_in_the_bay(straight, 8)
-    print(with_bends, without)
     assert with_bends < 1.5 < without
