@@ -286,7 +286,8 @@ class EkfSlam(LandmarkBackend):
             self._enlarge()
         joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
-        along = along_wall(self._x, self.config.lidar_offset_m, direction)
+        sensor_x, sensor_y, _ = self.sensor_pose().tolist()
+        along = along_wall(sensor_x, sensor_y, direction)
         wall = (along + float(z[FROM]), along + float(z[TO]))
         extent = wall if z[KIND] == LINE else (float(z[EDGE]), 0.0)
         self._n += 2

@@ -49,10 +49,9 @@ def first_bend(along: float, z: Array) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def along_wall(x: Array, offset: float, alpha: float) -> float:
+def along_wall(sensor_x: float, sensor_y: float, alpha: float) -> float:
     """Return where the sensor stands along a wall of normal ``alpha`` [rad], from the wall's foot [m]."""
-    c, s = math.cos(alpha), math.sin(alpha)
-    return c * (x[1] + offset * math.sin(x[2])) - s * (x[0] + offset * math.cos(x[2]))
+    return math.cos(alpha) * sensor_y - math.sin(alpha) * sensor_x
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -95,6 +94,7 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
     model
         :func:`curvature_model`.
     """
+    sensor_x, sensor_y = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
     for k in range(z.shape[0]):
         row = z[k]
         if match[k] < 0 or row[5] != LINE:
@@ -107,7 +107,7 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
         alpha = x[3 + 2 * match[k]]
         lean = x[2] + row[1] - alpha  # of the piece against its landmark's line
         along = row[0] * math.sin(lean) + middle * math.cos(lean)
-        beyond = along_wall(x, offset, alpha) + along - mark[_AT]
+        beyond = along_wall(sensor_x, sensor_y, alpha) + along - mark[_AT]
         turn = kappa * beyond
         row[0] = row[0] * math.cos(turn) + middle * math.sin(turn) - 0.5 * turn * beyond
         row[1] += turn

@@ -98,7 +98,7 @@ def test_what_is_not_known_of_a_wall_s_shape_goes_along_its_slope_and_offset() -
     z, x = np.zeros((1, 12)), np.array([0.3, -0.2, 0.4, 0.1, 4.0])
     z[0] = [3.0, -0.3, 1e-4, 2e-5, 1e-4, LINE, 0.0, 0.0, -0.6, 1.0, 0.08, 0.05**2]
     before, marks = z[0].copy(), np.zeros((1, 11))
-    along = along_wall(x, OFFSET, 0.1)
+    along = along_wall(0.3 + OFFSET * math.cos(0.4), -0.2 + OFFSET * math.sin(0.4), 0.1)
     marks[0, 8:] = first_bend(along - 0.5, z[0])
     straighten(x, OFFSET, z, np.zeros(1, np.int64), marks, curvature_model(config))
     _, var, square = curvature(2 / 0.05**2, 2 * 0.08 / 0.05**2, curvature_model(config))
