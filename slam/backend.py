@@ -211,7 +211,7 @@ class Backend(abc.ABC):
             self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, marks)
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        """Return ids ``(k,)`` of the landmarks that the last scan showed, and ``(k, 3)`` as key scans keep them."""
+        """Return ids ``(k,)`` of the landmarks that the last scan showed, and ``(k, 3)`` as key scans keep."""
         return np.zeros(0, np.int64), np.zeros((0, 3))
 
     # ---- health ------------------------------------------------------------------------------------------------

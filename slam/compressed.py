@@ -27,6 +27,7 @@ from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, state_row
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.stacked_update import NO_LIMITS, solve
 from slam.gaussian.tiles import add_combination, downdate, product, subtract
+from slam.landmarks.book import MARKS
 from slam.settings import require
 from slam.types import LINE, Observations, Odometry, Scan
 
@@ -65,7 +66,7 @@ class CompressedEkfSlam(EkfSlam):
         self._map_x = np.zeros(len(self._x))
         self._map_p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
         self._map_ids = np.zeros(len(self._x) // 2, np.int64)
-        self._map_marks = np.zeros((len(self._map_ids), 8))
+        self._map_marks = np.zeros((len(self._map_ids), MARKS))
         self._near = np.zeros(0, np.int64)  # the places of the region's landmarks, in its order
         self._far = np.zeros(0, np.int64)  # those of all the others
         self._free: list[int] = []  # those of landmarks that were dropped
@@ -215,7 +216,7 @@ class CompressedEkfSlam(EkfSlam):
         old = len(self._map_x)
         x, p, ids, marks = self._map_x, self._map_p, self._map_ids, self._map_marks
         self._map_x, self._map_p = np.zeros(size), aligned_zeros(size, size)
-        self._map_ids, self._map_marks = np.zeros(size // 2, np.int64), np.zeros((size // 2, 8))
+        self._map_ids, self._map_marks = np.zeros(size // 2, np.int64), np.zeros((size // 2, MARKS))
         self._map_x[:old], self._map_p[:old, :old] = x, p[:old, :old]
         self._map_ids[: len(ids)], self._map_marks[: len(ids)] = ids, marks
 

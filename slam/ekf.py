@@ -21,6 +21,7 @@ from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
@@ -80,9 +81,9 @@ class EkfSlam(LandmarkBackend):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
-        # Told of every correction before it is made.
-        self.witness: Callable[[list[Innovation]], object] | None = None
+        self.witness: Callable[[list[Innovation]], object] | None = None  # told of every correction before it
         self._max_turn = math.radians(c.max_turn_deg)
+        self._curved = curvature_model(c.features)
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
         self._start(np.zeros(3), np.eye(3) * 1e-8, 0)
 
@@ -99,8 +100,7 @@ class EkfSlam(LandmarkBackend):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
-        self.nis = 0.0
-        self.nis_dof = 0
+        self.nis, self.nis_dof = 0.0, 0
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -117,7 +117,7 @@ class EkfSlam(LandmarkBackend):
             self._redraw_if_moved()
 
     def _features(self, scan: Scan) -> Array:
-        """Return what a scan shows as observation rows ``(m, 10)``."""
+        """Return what a scan shows as observation rows ``(m, 12)``."""
         corners = self.extractor.extract(scan)
         return (self.extractor.with_walls() if self.config.lines else corners)[:MAX_OBSERVATIONS]
 
@@ -127,13 +127,13 @@ class EkfSlam(LandmarkBackend):
         loop = self._put_off(z, match)
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
-        self._tell(z, match)
-        self._correct(z, match, JOINT_LIMITS)
+        given = z.copy()  # what is matched with curved walls is made straight, in place
+        self._accept(z, match, JOINT_LIMITS)
         if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
+            z[:] = given
             match = self._associate_jointly(z)
             loop = self._put_off(z, match)
-            self._tell(z, match)
-            self._correct(z, match)
+            self._accept(z, match)
         if loop:
             self._close_loop(z, match)
         if scan is not None and self.nis_dof >= 2 * FEWEST_BACK:
@@ -159,8 +159,7 @@ class EkfSlam(LandmarkBackend):
         match = self._rows(ids)
         if doubting:
             refuse_unlikely(self._x, self._p, self.config.lidar_offset_m, z, self.config.known_gate, match)
-        self._tell(z, match)
-        self._correct(z, match)
+        self._accept(z, match)
         self._book.count_sightings(match)
         for k in np.flatnonzero(match == UNMATCHED):
             if self._book.row(ids[k]) < 0:  # not added by this very call
@@ -207,7 +206,7 @@ class EkfSlam(LandmarkBackend):
         return match
 
     def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
-        """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are any."""
+        """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are."""
         book, sigma = self._book, self.config.loop_sigma_m
         return put_off(self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match) > 0
 
@@ -225,8 +224,7 @@ class EkfSlam(LandmarkBackend):
         nis, dof = self.nis, self.nis_dof
         closing = np.full(len(match), UNMATCHED)
         closing[rows] = more
-        self._tell(z, closing)
-        self._correct(z, closing)
+        self._accept(z, closing)
         self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
         match[closing >= 0] = closing[closing >= 0]
 
@@ -263,11 +261,13 @@ class EkfSlam(LandmarkBackend):
         self._correct(z, match)
         return self.grid.agreement(self.sensor_pose(), scan)
 
-    def _tell(self, z: Array, match: NDArray[np.int64]) -> None:
-        """Show the innovations to who has asked for them."""
+    def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+        """Correct by a match that stands, curved walls made straight; show the innovations to who has asked."""
+        offset = self.config.lidar_offset_m
+        straighten(self._x, offset, z, match, self._book.marks, self._curved)
         if self.witness is not None:
-            offset = self.config.lidar_offset_m
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
+        self._correct(z, match, limits)
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         """Make one stacked update of all matched observations, unless their NIS is above the limit of so many."""
@@ -291,14 +291,12 @@ class EkfSlam(LandmarkBackend):
             self._enlarge()
         joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
         direction = float(z[DIRECTION]) + float(self._x[2])
-        extent = (float(z[EDGE]), 0.0)
-        if z[KIND] == LINE:
-            # Where the sensor stands along the wall, from the wall's foot; its own foot is there.
-            sensor_x, sensor_y, _ = self.sensor_pose().tolist()
-            along = math.cos(direction) * sensor_y - math.sin(direction) * sensor_x
-            extent = (along + float(z[FROM]), along + float(z[TO]))
+        sensor_x, sensor_y, _ = self.sensor_pose().tolist()
+        along = along_wall(sensor_x, sensor_y, direction)
+        wall = (along + float(z[FROM]), along + float(z[TO]))
+        extent = wall if z[KIND] == LINE else (float(z[EDGE]), 0.0)
         self._n += 2
-        self._book.add(float(z[KIND]), direction, known_id, extent=extent)
+        self._book.add(float(z[KIND]), direction, known_id, extent=extent, bend=first_bend(along, z))
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""

@@ -128,8 +128,8 @@ def invariant_update(
 
     The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
     + V Aᵀ (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
-    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space; ``limits`` are
-    the standard filter's.
+    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space;
+    ``limits`` are the standard filter's.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     if rows == 0:

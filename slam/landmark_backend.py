@@ -31,7 +31,7 @@ class LandmarkBackend(Backend):
     def _begin(self, policy: LandmarkPolicy) -> None:
         self._book = LandmarkBook(policy)
         self._known = KnownIds(self.config.lidar_offset_m)
-        self._twist = (0.0, 0.0, 0.0)
+        self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
         self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
 
     def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
@@ -39,8 +39,8 @@ class LandmarkBackend(Backend):
         given = odometry.twist
         vx, vy, omega = given if isinstance(given, tuple) else np.asarray(given, np.float64).tolist()
         twist, dt, lever = (vx, vy, omega), odometry.dt, noise.lever_m
-        var_v, var_w = noise.variances(vx, vy, omega, slip=noise.slip(self._twist, twist, dt))
-        self._twist = twist
+        slip, self._body = noise.slip(self._body, twist, dt)
+        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         way = math.hypot(vx, vy, lever * omega) * dt
         moved, turned = self._unseen_motion
         self._unseen_motion = moved + way, turned + way / lever
@@ -77,7 +77,7 @@ class LandmarkBackend(Backend):
 
     @property
     def _marks(self) -> Array:
-        """Marks ``(n, 8)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
+        """Marks ``(n, 11)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
         return self._book.marks
 
     @property
@@ -108,7 +108,7 @@ def far_better(fit: float, usual: float) -> bool:
 
 
 def observation_rows(observations: Observations) -> Array:
-    """Return landmark observations as rows ``(m, 10)`` like the feature extractor's, of unknown kind.
+    """Return landmark observations as rows ``(m, 12)`` like the feature extractor's, of unknown kind.
 
     Raises ``ValueError`` where they are not finite, or shapes disagree.
     """
@@ -116,6 +116,6 @@ def observation_rows(observations: Observations) -> Array:
     cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
     if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
         raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-    z = np.zeros((len(rb), 10))
+    z = np.zeros((len(rb), 12))
     z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     return z

@@ -63,7 +63,7 @@ class OdometryNoise:
     def variances(self, vx: float, vy: float, omega: float, *, slip: float = 0.0) -> tuple[float, float]:
         """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²].
 
-        ``slip`` [m/s] is what :meth:`slip` says of the change since the step before.
+        ``slip`` [m/s] is what :meth:`slip` says.
         """
         speed = math.sqrt(vx * vx + vy * vy + (self.lever_m * omega) ** 2)
         lost = self.slip_share * slip
@@ -84,12 +84,21 @@ class OdometryNoise:
             lasting=None,
         )
 
-    def slip(self, before: tuple[float, float, float], now: tuple[float, float, float], dt: float) -> float:
-        """Return by how much [m/s] the wheels' speed changed beyond what the floor passes on in ``dt`` [s]."""
-        change = math.sqrt(
-            (now[0] - before[0]) ** 2 + (now[1] - before[1]) ** 2 + (self.lever_m * (now[2] - before[2])) ** 2
-        )
-        return max(change - self.grip_m_s2 * dt, 0.0)
+    def slip(
+        self, body: tuple[float, float, float], wheels: tuple[float, float, float], dt: float
+    ) -> tuple[float, tuple[float, float, float]]:
+        """Return how much faster [m/s] wheels may turn than the body moves after ``dt`` [s], and its twist then.
+
+        ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``grip_m_s2``
+        at most: where they stop too fast, the body slides on after they stand.
+        """
+        x, y, w = wheels[0] - body[0], wheels[1] - body[1], wheels[2] - body[2]
+        change = math.sqrt(x * x + y * y + (self.lever_m * w) ** 2)
+        lag = change - self.grip_m_s2 * dt
+        if lag <= 0.0:
+            return 0.0, wheels
+        left = lag / change
+        return lag, (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:

@@ -198,11 +198,10 @@ def drift_ratios(drives: Drives, noise: OdometryNoise) -> tuple[float, float]:
     count, size = drives.windows()
     v, w = np.empty(drives.measured.shape[:2]), np.empty(drives.measured.shape[:2])
     for episode, twists in enumerate(drives.measured.tolist()):
-        before = (0.0, 0.0, 0.0)
+        body = (0.0, 0.0, 0.0)
         for k, (vx, vy, omega) in enumerate(twists):
-            now = (vx, vy, omega)
-            v[episode, k], w[episode, k] = noise.variances(vx, vy, omega, slip=noise.slip(before, now, drives.dt))
-            before = now
+            slip, body = noise.slip(body, (vx, vy, omega), drives.dt)
+            v[episode, k], w[episode, k] = noise.variances(vx, vy, omega, slip=slip)
     shape = (len(v), count, size)
     sums = drives.errors[:, : count * size].reshape(*shape, 3).sum(axis=2)
     var_v, var_w = (a[:, : count * size].reshape(shape).sum(axis=2) for a in (v, w))

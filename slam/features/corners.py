@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.features.surfaces import (
+    CURVATURE,
     EDGE_FACE,
     EDGE_JUMP,
     EDGE_LENGTH,
@@ -30,6 +31,7 @@ from slam.features.surfaces import (
     SPLIT_SIGMAS,
     T0,
     T1,
+    VAR_CURVATURE,
     VAR_OFFSET,
     VAR_SLOPE,
     R,
@@ -206,6 +208,7 @@ def walls_first(
         row[4] = line[VAR_SLOPE] + sigma_alpha**2
         row[5], row[6], row[7] = LINE, row[1], 0.0
         row[8], row[9] = middle + line[T0], middle + line[T1]
+        row[10], row[11] = line[CURVATURE], line[VAR_CURVATURE]
         count += 1
     for k in range(corners.shape[0]):
         row = out[count]

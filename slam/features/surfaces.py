@@ -25,10 +25,10 @@ MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost
 # A fitted line: its normal, away from the sensor, and distance; the points' weighted centroid; the variances of
 # offset (at the centroid) and slope, which are uncorrelated there; from where to where it reaches along (-ny, nx)
 # from the centroid; its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0
-# and 1).
+# and 1); its curvature, positive where it bends away from the sensor, and the variance of that.
 (
-    NX, NY, R, MX, MY, VAR_OFFSET, VAR_SLOPE, T0, T1, POINTS, FIRST, LAST, ENDS,
-) = range(13)  # fmt: skip
+    NX, NY, R, MX, MY, VAR_OFFSET, VAR_SLOPE, T0, T1, POINTS, FIRST, LAST, ENDS, CURVATURE, VAR_CURVATURE,
+) = range(15)  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -304,7 +304,7 @@ def _is_straight(xy: Array, a: int, b: int, limits: Array, line: Array) -> bool:
     """Tell whether the points ``a`` … ``b`` lie on their line, neither off it nor bulging away from it."""
     n, sigma = b - a + 1, limits[SIGMA]
     nx, ny, r, mx, my = line[NX], line[NY], line[R], line[MX], line[MY]
-    spread = residual = off = curve = fourth = largest = 0.0
+    spread = residual = off = curve = third = fourth = largest = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
         t = -ny * (x - mx) + nx * (y - my)
@@ -313,11 +313,18 @@ def _is_straight(xy: Array, a: int, b: int, limits: Array, line: Array) -> bool:
         residual += e * e
         off += e
         curve += tt * e
+        third += tt * t
         fourth += tt * tt
         largest = max(largest, tt)
     if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[SPLIT_FLOOR])) ** 2:
         return False
     mean = spread / n
+    # Of the part of t² that a line leaves: where points lie closer at one end it leans along with t.
+    lone = fourth - mean * spread - third * third / spread
+    if lone <= 0.0:
+        return False
+    square = r * r / (mx * mx + my * my)  # of the cosine of incidence, by which noise acts across
+    line[CURVATURE], line[VAR_CURVATURE] = 2.0 * (curve - mean * off) / lone, 4.0 * sigma * sigma * square / lone
     return not _is_curved(curve - mean * off, fourth - mean * spread, largest, sigma)
 
 

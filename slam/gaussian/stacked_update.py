@@ -48,8 +48,8 @@ def stacked_update(
     """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
 
     ``p`` is an upper triangle; the lower one is undefined after. ``h``, ``w``, ``s`` are a :func:`work_space`.
-    ``limits[k]`` is how large the NIS of k observations may be, the last one holding for all that are more; where it
-    is larger, nothing is done and the degrees of freedom are 0.
+    ``limits[k]`` is how large the NIS of k observations may be, the last one holding for all that are more. Where
+    it is larger, nothing is done and the degrees of freedom are 0.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     nis = 0.0

@@ -56,7 +56,7 @@ class GraphSlam(Backend):
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
         self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since the key scan
         self._blind = (0.0, 0.0)  # [m, rad] up to the key scan that nothing but the wheels told all about
-        self._twist = (0.0, 0.0, 0.0)
+        self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
         self._last = pose.copy()  # where the last scan was aligned
         self._mean, self._cov = pose.copy(), pose_cov.copy()
         self._at: list[int] = []  # the key scan before each update …
@@ -71,11 +71,10 @@ class GraphSlam(Backend):
         """Move on by what the wheels measured."""
         vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
         dt, noise = odometry.dt, self.config.odometry
-        slip = noise.slip(self._twist, twist, dt) if dt > 0 else 0.0
+        slip, self._body = noise.slip(self._body, twist, dt) if dt > 0 else (0.0, self._body)
         var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
-        self._twist = twist
         way, turn = self._claimed
         self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
         self._mean, rows = self.atlas.window.ahead(self._motion, self._motion_cov())

@@ -1,10 +1,10 @@
 """Key scans: what the map is redrawn from when the filter corrects the past.
 
 A grid is drawn from poses that the filter later corrects. Each key scan therefore hangs on the landmarks that
-were seen with it, points and walls: where those have moved, the scan's pose moves along (least squares over SE(2)),
-and once a key scan would be drawn more than half a cell from where it was, the map is redrawn from all of them. So a
-closed loop mends the map instead of doubling its walls. What the landmarks of a scan leave open, as the way along a
-single wall, follows the scan before it.
+were seen with it, points and walls: where those have moved, the scan's pose moves along (least squares over
+SE(2)), and once a key scan would be drawn more than half a cell from where it was, the map is redrawn from all of
+them. So a closed loop mends the map instead of doubling its walls. What the landmarks of a scan leave open, as the
+way along a single wall, follows the scan before it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class KeyScans:
         self._scans: list[tuple[Scan, NDArray[np.int16]]] = []
         self._poses = np.zeros((64, 3))  # of the sensor, as last drawn
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
-        self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in the frame of that pose: x, y, 0, or of a wall α, r, 1
+        self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
         self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
@@ -80,7 +80,7 @@ class KeyScans:
     ) -> None:
         """Keep a scan, and what was seen with it.
 
-        ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as estimated then, or α, r, 1 of a wall.
+        ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as it is now, or α, r, 1 of a wall.
         """
         n = len(self._scans)
         if n == len(self._poses):

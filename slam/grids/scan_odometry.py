@@ -63,7 +63,7 @@ class ScanOdometry:
         self.pose, self._upper = np.zeros(3), np.zeros((3, 3))
         self._scans: deque[tuple[Array, Array]] = deque(maxlen=config.scans)
         self._field: LikelihoodField | None = None
-        self._twist = (0.0, 0.0, 0.0)
+        self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
         self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since a scan was last believed
         self.settled = np.zeros(3)  # the pose at the last :meth:`settle`
 
@@ -76,10 +76,9 @@ class ScanOdometry:
         """Move on by what the wheels measured."""
         vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
         dt, noise = odometry.dt, self.noise
-        slip = noise.slip(self._twist, twist, dt) if dt > 0 else 0.0
+        slip, self._body = noise.slip(self._body, twist, dt) if dt > 0 else (0.0, self._body)
         var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
         predict_robot(self.pose, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
-        self._twist = twist
         way, turn = self._claimed
         self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
 

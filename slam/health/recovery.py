@@ -3,8 +3,8 @@
 A scan that speaks against the predicted pose is *doubtful*. The estimator is copied before the first one of a row,
 and tries to correct itself by them; one that still contradicts the map from the corrected pose is not drawn. Where
 the monitor gives the belief up, the copy is put back, so that neither wrong matches nor wrong drawings stay, and
-nothing is written any more until a place is found that explains several scans in a row, or until many scans in a row
-no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
+nothing is written any more until a place is found that explains several scans in a row, or until many scans in a
+row no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
 there is none. Buildings repeat themselves, so from there no other place is looked for on the whole map. Scans that
 agree with the map cost one look at them and nothing else.
 """
@@ -93,8 +93,8 @@ class Recovery:
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
         """Look for the place of a scan; return it once several scans agree on it, else None.
 
-        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost. Where scans have
-        not spoken against that for long enough, nothing is returned, and the belief is no longer lost.
+        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost. Where scans
+        have not spoken against that for long enough, nothing is returned, and the belief is no longer lost.
         """
         self.scans_lost += 1
         if np.count_nonzero(scan.ranges <= scan.range_max) >= self._relocalisation.fewest_beams:

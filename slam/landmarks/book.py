@@ -18,13 +18,13 @@ from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.settings import require
 from slam.types import LINE, Scan
 
-__all__ = ["KIND", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
+__all__ = ["KIND", "MARKS", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
 
 Array = NDArray[np.float64]
 
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 
-# Columns of ``marks``, one row a landmark.
+MARKS = 11  # columns of ``marks``, one row a landmark; the last three are those of slam.landmarks.curved_walls
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN, _FROM, _TO = range(8)
 _RECENT = 3  # updates
 _SAME_TURN = 0.6  # [rad] between two sightings of one landmark
@@ -65,7 +65,7 @@ class LandmarkBook:
         self._next_id = 0
         self._now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
-        self._marks = np.zeros((32, 8))
+        self._marks = np.zeros((32, MARKS))
         self._tentative = np.zeros((_TENTATIVE, 9))
         self._tentative_count = 0
         self._new = np.zeros(256, np.int64)
@@ -76,10 +76,12 @@ class LandmarkBook:
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to ``(n, 8)``.
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 11)``.
 
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
-        surface it is, as the observation does. A view.
+        surface it is, as the observation does. The last three are of a wall's curvature: the information of its
+        measurements, the same times what they measured, and where along the wall it is tangent to its line.
+        A view.
         """
         return self._marks[: self.count]
 
@@ -100,9 +102,18 @@ class LandmarkBook:
         return -1
 
     def add(
-        self, kind: float, direction: float, known_id: int | None, *, extent: tuple[float, float] = (0.0, 0.0)
+        self,
+        kind: float,
+        direction: float,
+        known_id: int | None,
+        *,
+        extent: tuple[float, float] = (0.0, 0.0),
+        bend: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Append a landmark; without a known id it gets the next one. ``extent`` is from and to, see ``marks``."""
+        """Append a landmark; without a known id it gets the next one.
+
+        ``extent`` is from and to, ``bend`` what is known of a wall's curvature, see ``marks``.
+        """
         new_id = self._next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
@@ -110,7 +121,7 @@ class LandmarkBook:
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now, *extent)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now, *extent, *bend)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -125,7 +136,7 @@ class LandmarkBook:
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
     def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
-        """Have these landmarks ``(n,)``, with these marks ``(n, 8)``, instead of those it has."""
+        """Have these landmarks ``(n,)``, with these marks ``(n, 11)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
         self._make_room(count)

@@ -258,8 +258,10 @@ def test_spinning_wheels_do_not_lose_the_filter() -> None:
 
 def test_a_hard_start_adds_to_the_noise_and_a_gentle_one_does_not() -> None:
     noise = slam.config_type("ekf")().odometry
-    assert noise.slip((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), 0.1) == 0.0
-    assert noise.slip((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), 0.1) == pytest.approx(0.65)
+    assert noise.slip((0.0, 0.0, 0.0), (0.1, 0.0, 0.0), 0.1) == (0.0, (0.1, 0.0, 0.0))
+    slip, body = noise.slip((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), 0.1)
+    assert slip == pytest.approx(0.65)
+    assert body == pytest.approx((0.15, 0.0, 0.0))
     calm, hard = noise.variances(0.5, 0.0, 0.0), noise.variances(0.5, 0.0, 0.0, slip=0.5)
     assert hard[0] - calm[0] == pytest.approx((0.6 * 0.5) ** 2)
     assert hard[1] - calm[1] == pytest.approx((0.6 * 0.5 / noise.lever_m) ** 2)

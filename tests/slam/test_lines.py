@@ -39,10 +39,10 @@ def predicted(v: np.ndarray, i: int = 0) -> np.ndarray:
 
 
 def observation(rng: np.random.Generator, distance: float, bearing: float) -> np.ndarray:
-    z = np.zeros(10)
+    z = np.zeros(12)
     noise = 1e-3 * random_covariance(2, rng)
     z[:5] = distance, bearing, noise[0, 0], noise[0, 1], noise[1, 1]
-    z[5], z[6], z[8], z[9] = LINE, bearing, -1.0, 1.0
+    z[5], z[6], z[8], z[9], z[11] = LINE, bearing, -1.0, 1.0, 1e-12
     return z
 
 
@@ -226,14 +226,14 @@ def test_an_update_beyond_its_limit_is_not_made(update) -> None:
 
 
 def test_a_ledge_beside_a_wall_does_not_turn_the_robot() -> None:
-    """Two pieces, each of which the wall could be while the heading is unsure; one belongs to a ledge beside it."""
+    """Two pieces, either of which the wall could be while the heading is unsure; one is a ledge's beside it."""
     backend = slam.make("invariant-ekf")
     backend.reset()
-    wall = np.array([5.89, -2.0, 1e-6, 0.0, 1e-6, LINE, -2.0, 0.0, -5.4, 3.4])
+    wall = np.array([5.89, -2.0, 1e-6, 0.0, 1e-6, LINE, -2.0, 0.0, -5.4, 3.4, 0.0, 1e-8])
     backend._add(wall, None)
     backend._p[2, 2] = 0.0087**2
     # The ledge's line has its foot 4.5 m from its middle, where it lies 6.4 cm nearer.
-    ledge = np.array([5.89 - 0.023, -2.0 + 0.009, 1.8e-3, 4.0e-4, 0.9e-4, LINE, -2.0 + 0.009, 0.0, 3.7, 5.3])
+    ledge = np.array([5.89 - 0.023, -2.0 + 0.009, 1.8e-3, 4.0e-4, 0.9e-4, LINE, -1.991, 0.0, 3.7, 5.3, 0.0, 1e9])
     backend._take(np.array([wall, ledge]), None)
     assert abs(backend.pose[2]) < 5e-4
     assert backend.nis_dof == 2
@@ -270,10 +270,11 @@ def test_filters_over_walls_agree_with_batch_least_squares(name: str) -> None:
         twist = circle_twist(5 * k)
         var_v, var_w = backend.config.odometry.variances(*twist)
         pose, odo = drive(pose, twist, (math.sqrt(var_v), math.sqrt(var_w)), rng)
-        z = np.zeros((3, 10))
+        z = np.zeros((3, 12))
+        z[:, 11] = 1e-12  # they are straight
         for i in range(3):
             z[i, :2] = predicted(np.concatenate([pose, walls.ravel()]), i) + rng.multivariate_normal([0, 0], r)
-            z[i, 2], z[i, 4], z[i, 5], z[i, 6], z[i, 8:] = r[0, 0], r[1, 1], LINE, z[i, 1], (-1.0, 1.0)
+            z[i, 2], z[i, 4], z[i, 5], z[i, 6], z[i, 8:10] = r[0, 0], r[1, 1], LINE, z[i, 1], (-1.0, 1.0)
         backend.predict(odo)
         backend._correct(z, np.arange(3) if k else np.full(3, -1))
         for row in z if k == 0 else ():

@@ -95,13 +95,13 @@ def test_equals_one_dense_filter_of_everything() -> None:
         wheels.mean[:] = errors
         return wheels.corrected(twist)
 
-    known, last = np.zeros((0, 2)), (0.0, 0.0, 0.0)
+    known, body = np.zeros((0, 2)), (0.0, 0.0, 0.0)
     for twist in drives(rng, 30):
         truth = move(truth, claimed(twist, np.array([0.02, -0.01, 0.03, 0.0, -0.02])), 0.1)
         filter_.predict(Odometry(twist, 0.1))
         u = claimed(twist, e)
-        v, w = white.variances(*u, slip=white.slip(last, tuple(u), 0.1))
-        last = tuple(u)
+        slip, body = white.slip(body, tuple(u), 0.1)
+        v, w = white.variances(*u, slip=slip)
         fx, fu = jacobians(x, u, 0.1)
         f = np.eye(len(p))
         f[:3, :3], f[:3, 3:8] = (

@@ -69,7 +69,7 @@ def test_a_wall_takes_a_scan_along_and_what_it_leaves_open_follows_the_scan_befo
     keys.keep(np.array([1.0, 2.0, 0.1]), scan, surface, IDS[:3], points(CORNERS[:3]))
     for x in (2.0, 3.0):
         keys.keep(np.array([x, 2.0, 0.2]), scan, surface, np.array([3]), np.array([[0.5 * np.pi, 5.0, 1.0]]))
-    moved = np.vstack([CORNERS[:3] + [0.4, 0.0], [0.5 * np.pi + 0.02, 5.0]])
+    moved = np.vstack([CORNERS[:3] + np.array([0.4, 0.0]), [0.5 * np.pi + 0.02, 5.0]])
     assert keys.redraw_if_moved(grid, moved, np.arange(4))
     np.testing.assert_allclose(keys.poses[0], [1.4, 2.0, 0.1], atol=1e-2)
     for k, x in ((1, 2.4), (2, 3.4)):
@@ -90,9 +90,9 @@ def test_the_normal_of_a_wall_may_turn_about() -> None:
     """A wall whose map passes the origin has the opposite normal afterwards, and is the same wall."""
     keys, grid = KeyScans(), OccupancyGrid()
     scan = room_scan(np.array([2.0, 2.0, 0.0]))
-    wall = np.array([[0.0, 0.05, 1.0]])
-    keys.keep(np.array([-2.0, 0.0, 0.0]), scan, np.full(len(scan.ranges), -1, np.int16), np.zeros(1, np.int64), wall)
-    keys.keep(np.array([-2.0, 0.5, 0.0]), scan, np.full(len(scan.ranges), -1, np.int16), np.zeros(1, np.int64), wall)
+    wall, surface = np.array([[0.0, 0.05, 1.0]]), np.full(len(scan.ranges), -1, np.int16)
+    for y in (0.0, 0.5):
+        keys.keep(np.array([-2.0, y, 0.0]), scan, surface, np.zeros(1, np.int64), wall)
     assert keys.redraw_if_moved(grid, np.array([[np.pi, 0.05]]), np.zeros(1, np.int64))
     np.testing.assert_allclose(keys.poses, [[-2.1, 0.0, 0.0], [-2.1, 0.5, 0.0]], atol=5e-3)
 
