@@ -51,13 +51,14 @@ class OdometryNoise:
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: float = 0.6  # of the change beyond that
+    slide_m_s2: float = 1.5  # by which the floor lets the body follow wheels that slip
     lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
 
     def __post_init__(self) -> None:
         for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
             require(getattr(self, name) >= 0, f"OdometryNoise.{name} must be ≥ 0")
         require(self.lever_m > 0, "OdometryNoise.lever_m must be > 0")
-        require(self.grip_m_s2 > 0, "OdometryNoise.grip_m_s2 must be > 0")
+        require(self.grip_m_s2 > 0 and self.slide_m_s2 > 0, "OdometryNoise.grip_m_s2, slide_m_s2 must be > 0")
         require(self.slip_share >= 0, "OdometryNoise.slip_share must be ≥ 0")
 
     def variances(self, vx: float, vy: float, omega: float, *, slip: float = 0.0) -> tuple[float, float]:
@@ -89,16 +90,15 @@ class OdometryNoise:
     ) -> tuple[float, tuple[float, float, float]]:
         """Return how much faster [m/s] wheels may turn than the body moves after ``dt`` [s], and its twist then.
 
-        ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``grip_m_s2``
-        at most: where they stop too fast, the body slides on after they stand.
+        ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``slide_m_s2``
+        at most: on a slippery floor, where they stop too fast, it slides on after they stand. Wheels that jerk
+        within a step may slip on any floor.
         """
         x, y, w = wheels[0] - body[0], wheels[1] - body[1], wheels[2] - body[2]
         change = math.sqrt(x * x + y * y + (self.lever_m * w) ** 2)
-        lag = change - self.grip_m_s2 * dt
-        if lag <= 0.0:
-            return 0.0, wheels
-        left = lag / change
-        return lag, (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
+        slip = max(change - self.grip_m_s2 * dt, 0.0)
+        left = max(1.0 - self.slide_m_s2 * dt / change, 0.0) if change > 0.0 else 0.0
+        return slip, (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:

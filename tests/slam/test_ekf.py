@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -262,6 +263,11 @@ def test_a_hard_start_adds_to_the_noise_and_a_gentle_one_does_not() -> None:
     slip, body = noise.slip((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), 0.1)
     assert slip == pytest.approx(0.65)
     assert body == pytest.approx((0.15, 0.0, 0.0))
+    slip, body = noise.slip(body, (0.0, 0.0, 0.0), 0.1)  # the wheels stand, and the body slides by what is left
+    assert (slip, body) == (0.0, pytest.approx((0.0, 0.0, 0.0)))
+    rough = dataclasses.replace(noise, slide_m_s2=4.0)
+    slip, body = rough.slip((0.0, 0.0, 0.0), (0.8, 0.0, 0.0), 0.1)
+    assert (slip, body) == (pytest.approx(0.65), pytest.approx((0.4, 0.0, 0.0)))
     calm, hard = noise.variances(0.5, 0.0, 0.0), noise.variances(0.5, 0.0, 0.0, slip=0.5)
     assert hard[0] - calm[0] == pytest.approx((0.6 * 0.5) ** 2)
     assert hard[1] - calm[1] == pytest.approx((0.6 * 0.5 / noise.lever_m) ** 2)
