@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from slam.backend import Backend, BackendConfig, found_cov
 from slam.belief import Belief
 from slam.geometry import about_z, compose, inverse, wrap
+from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
 from slam.health.monitor import HealthConfig
@@ -279,10 +280,7 @@ class DpSlam(Backend):
         drawn = self._shown
         bodies = self._paths.of(self._lead)[: len(drawn)]
         path = np.array([self.sensor_pose(body) for body in bodies]).reshape(-1, 3)
-        off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
-            self.config.key_scans.lever_m
-        )
-        if not len(off) or float(off.max()) <= 0.5 * self.grid.resolution:
+        if largest_shift(path, drawn, self.config.key_scans.lever_m) <= 0.5 * self.grid.resolution:
             return False
         self.grid.redraw(path, self._key)
         self._shown = path

@@ -19,6 +19,7 @@ from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, links
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
+from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
 from slam.motion import predict_robot
 from slam.types import Observations, Odometry, Scan
@@ -230,11 +231,8 @@ class GraphSlam(Backend):
         if not self._drawn:
             return False
         path = np.array([self.sensor_pose(body) for body in self._poses_of(self._drawn_at)])
-        drawn = np.array(self._shown)
-        off = np.hypot(*(path - drawn)[:, :2].T) + np.abs(wrap(path[:, 2] - drawn[:, 2])) * (
-            self.config.key_scans.lever_m
-        )
-        if float(off.max()) <= 0.5 * self.grid.resolution:
+        shift = largest_shift(path, np.array(self._shown), self.config.key_scans.lever_m)
+        if shift <= 0.5 * self.grid.resolution:
             return False
         self.grid.redraw(path, self._drawn)
         self._shown = list(path)

@@ -16,11 +16,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.geometry import wrap_scalar
+from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import Scan
 
-__all__ = ["KeyScanConfig", "KeyScans"]
+__all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
 
 Array = NDArray[np.float64]
 
@@ -128,6 +128,12 @@ class KeyScans:
         self._anchor_ids[n:] = -1
         self._last = tuple(poses[-1].tolist()) if n else (0.0, 0.0, 0.0)
         grid.redraw(poses, self._scans)
+
+
+def largest_shift(poses: Array, drawn: Array, lever_m: float) -> float:
+    """Return how far [m] the farthest of poses ``(n, 3)`` is from where it was drawn; 0 where there are none."""
+    off = np.hypot(*(poses - drawn)[:, :2].T) + np.abs(wrap(poses[:, 2] - drawn[:, 2])) * lever_m
+    return float(off.max(initial=0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
