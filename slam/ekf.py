@@ -21,7 +21,7 @@ from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
-from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, straighten
+from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
@@ -90,8 +90,7 @@ class EkfSlam(LandmarkBackend):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         del seed  # nothing here is drawn
         self._noise = self.config.odometry
-        self._n = 3
-        self._x = np.zeros(3 + 2 * 32)
+        self._n, self._x = 3, np.zeros(3 + 2 * 32)
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
         self._x[:3] = pose
         self._p[:3, :3] = np.triu(pose_cov)
@@ -131,6 +130,7 @@ class EkfSlam(LandmarkBackend):
         self._accept(z, match, JOINT_LIMITS)
         if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
             z[:] = given
+            forget(z, match, self._book.marks)
             match = self._associate_jointly(z)
             loop = self._put_off(z, match)
             self._accept(z, match)

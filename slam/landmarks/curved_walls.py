@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from slam.features.extraction import FeatureConfig
 from slam.types import LINE
 
-__all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "straighten"]
+__all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "forget", "straighten"]
 
 Array = NDArray[np.float64]
 
@@ -116,3 +116,12 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
         row[2] += slope * (length2 / 12.0 + beyond2 / 4.0 + middle * middle)
         row[3] += slope * middle
         row[4] += slope
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def forget(z: Array, match: NDArray[np.int64], marks: Array) -> None:
+    """Take back what :func:`straighten` has counted of a match that did not stand; ``z`` as before it."""
+    for k in range(z.shape[0]):
+        if match[k] >= 0 and z[k, 5] == LINE:
+            marks[match[k], _INFO] -= 1.0 / z[k, _VAR_KAPPA]
+            marks[match[k], _PULL] -= z[k, _KAPPA] / z[k, _VAR_KAPPA]

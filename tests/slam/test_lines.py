@@ -235,6 +235,8 @@ def test_a_ledge_beside_a_wall_does_not_turn_the_robot() -> None:
     # The ledge's line has its foot 4.5 m from its middle, where it lies 6.4 cm nearer.
     ledge = np.array([5.89 - 0.023, -2.0 + 0.009, 1.8e-3, 4.0e-4, 0.9e-4, LINE, -1.991, 0.0, 3.7, 5.3, 0.0, 1e9])
     backend._take(np.array([wall, ledge]), None)
+    seen_twice = 2e8  # the refused match does not count
+    assert backend._book.marks[0, 8] == pytest.approx(seen_twice, rel=1e-6)
     assert abs(backend.pose[2]) < 5e-4
     assert backend.nis_dof == 2
 

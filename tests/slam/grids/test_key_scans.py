@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 
@@ -109,7 +109,7 @@ def test_least_squares_over_points_and_walls(seed: int) -> None:
     keys, scan = KeyScans(), room_scan(np.array([2.0, 2.0, 0.0]))
     for _ in range(2):
         keys.keep(pose, scan, np.full(len(scan.ranges), -1, np.int16), np.arange(n), marks)
-    now = marks[:, :2] + rng.normal(0, 0.02, (n, 2))
+    now = marks[:, :2] + rng.normal(0, 0.03, (n, 2))
     before = pose.copy()
 
     def residuals(q: np.ndarray) -> list[float]:
@@ -127,10 +127,10 @@ def test_least_squares_over_points_and_walls(seed: int) -> None:
     first = before = least_squares(residuals, pose, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     second = least_squares(residuals, first, xtol=1e-14, ftol=1e-14, gtol=1e-14).x
     shift = np.array([first, second]) - pose
-    if np.max(np.hypot(*shift[:, :2].T) + 4.0 * np.abs(shift[:, 2])) > 0.026:
-        assert keys.redraw_if_moved(OccupancyGrid(), now, np.arange(n))
-        np.testing.assert_allclose(keys.poses[0], first, atol=1e-4)
-        np.testing.assert_allclose(keys.poses[1], second, atol=1e-4)
+    assume(np.max(np.hypot(*shift[:, :2].T) + 4.0 * np.abs(shift[:, 2])) > 0.026)
+    assert keys.redraw_if_moved(OccupancyGrid(), now, np.arange(n))
+    np.testing.assert_allclose(keys.poses[0], first, atol=3e-4)
+    np.testing.assert_allclose(keys.poses[1], second, atol=3e-4)
 
 
 def test_only_scans_from_new_places_are_kept() -> None:
