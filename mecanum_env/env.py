@@ -147,7 +147,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         world, ground, plan = truth.world, truth.ground, truth.ground.plan
         collisions = world.collisions
         world.step(self._to_wheels(action), config.step_s, config.physics_step_s)
-        odometry = self._odometer.odometry(world.wheel_increments, config.step_s, self._sensor_rng)
+        odometry = self._odometer.odometry(world.wheel_readings, config.step_s, self._sensor_rng)
         world_pose = world.pose
         scan = self.lidar.scan(plan.segments, plan.circles, world_pose, self._sensor_rng)
         self._odometry, self.scan, truth.scan = odometry, scan, scan

@@ -66,7 +66,7 @@ class InvariantEkfSlam(EkfSlam):
             super().predict(odometry)
             return
         twist, before = wheels.corrected(np.asarray(odometry.twist, dtype=np.float64)), self._x[:3].copy()
-        super().predict(Odometry(twist, odometry.dt))
+        super().predict(odometry._replace(twist=twist))
         wheels.predict(self._p, self._n, before, self._x, float(twist[2]), odometry.dt)
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:

@@ -36,14 +36,10 @@ class LandmarkBackend(Backend):
 
     def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
         """Count a step by the wheels; return its vx, vy, ω and V's variances of speed and turn rate."""
-        given = odometry.twist
-        vx, vy, omega = given if isinstance(given, tuple) else np.asarray(given, np.float64).tolist()
-        twist, dt, lever = (vx, vy, omega), odometry.dt, noise.lever_m
-        slip, self._body = noise.slip(self._body, twist, dt)
-        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
-        way = math.hypot(vx, vy, lever * omega) * dt
+        (vx, vy, omega), var_v, var_w, self._body = noise.of_step(odometry, self._body)
+        way = math.hypot(vx, vy, noise.lever_m * omega) * odometry.dt
         moved, turned = self._unseen_motion
-        self._unseen_motion = moved + way, turned + way / lever
+        self._unseen_motion = moved + way, turned + way / noise.lever_m
         return vx, vy, omega, var_v, var_w
 
     def _out_of_sight(self, recent: int, still: int) -> bool:

@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.settings import require
+from slam.types import Odometry
 
 __all__ = ["LastingErrors", "OdometryNoise", "jacobians", "move", "predict_robot", "twist_between"]
 
 Array = NDArray[np.float64]
+Twist = tuple[float, float, float]
+
+NO_SLIP = (0.0, 0.0)
+
+_UNEVEN = 0.25  # share of what slips along that turns the body: found on the simulated robot, on patches of ice
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +56,7 @@ class OdometryNoise:
     turn_floor_rad_s: float = 0.003
     turn_share_rad_m: float = 0.03
     grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
-    slip_share: float = 0.6  # of the change beyond that
+    slip_share: float = 0.55  # σ, of what may have slipped
     slide_m_s2: float = 1.5  # by which the floor lets the body follow wheels that slip
     lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
 
@@ -61,17 +67,33 @@ class OdometryNoise:
         require(self.grip_m_s2 > 0 and self.slide_m_s2 > 0, "OdometryNoise.grip_m_s2, slide_m_s2 must be > 0")
         require(self.slip_share >= 0, "OdometryNoise.slip_share must be ≥ 0")
 
-    def variances(self, vx: float, vy: float, omega: float, *, slip: float = 0.0) -> tuple[float, float]:
+    def variances(
+        self, vx: float, vy: float, omega: float, *, slip: tuple[float, float] = NO_SLIP
+    ) -> tuple[float, float]:
         """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²].
 
-        ``slip`` [m/s] is what :meth:`slip` says.
+        ``slip`` [m/s, rad/s] is by how much the wheels may outrun the body. Wheels that slip along do not do so
+        all alike, which turns the body.
         """
         speed = math.sqrt(vx * vx + vy * vy + (self.lever_m * omega) ** 2)
-        lost = self.slip_share * slip
+        along, turning = self.slip_share * slip[0], self.slip_share * slip[1]
         return (
-            (self.speed_floor_m_s + self.speed_share * speed) ** 2 + lost**2,
-            (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2 + (lost / self.lever_m) ** 2,
-        )
+            (self.speed_floor_m_s + self.speed_share * speed) ** 2 + along**2,
+            (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2
+            + turning**2 + (_UNEVEN * along / self.lever_m) ** 2,
+        )  # fmt: skip
+
+    def of_step(self, odometry: Odometry, body: Twist) -> tuple[Twist, float, float, Twist]:
+        """Return the twist of a step, its variances as :meth:`variances`, and the body's twist after it.
+
+        Where the odometry does not tell what slipped, :meth:`slip` does, from the twist ``body`` before the step.
+        """
+        given = odometry.twist
+        twist = given if isinstance(given, tuple) else tuple(np.asarray(given, np.float64).tolist())
+        slip = odometry.slip
+        if slip is None:
+            slip, body = self.slip(body, twist, odometry.dt) if odometry.dt > 0.0 else (NO_SLIP, body)
+        return twist, *self.variances(*twist, slip=slip), body
 
     def white(self) -> OdometryNoise:
         """Return V of a filter that has the lasting errors as states."""
@@ -85,10 +107,8 @@ class OdometryNoise:
             lasting=None,
         )
 
-    def slip(
-        self, body: tuple[float, float, float], wheels: tuple[float, float, float], dt: float
-    ) -> tuple[float, tuple[float, float, float]]:
-        """Return how much faster [m/s] wheels may turn than the body moves after ``dt`` [s], and its twist then.
+    def slip(self, body: Twist, wheels: Twist, dt: float) -> tuple[tuple[float, float], Twist]:
+        """Return how much faster [m/s, rad/s] wheels may turn than the body moves after ``dt`` [s], and its twist.
 
         ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``slide_m_s2``
         at most: on a slippery floor, where they stop too fast, it slides on after they stand. Wheels that jerk
@@ -96,9 +116,9 @@ class OdometryNoise:
         """
         x, y, w = wheels[0] - body[0], wheels[1] - body[1], wheels[2] - body[2]
         change = math.sqrt(x * x + y * y + (self.lever_m * w) ** 2)
-        slip = max(change - self.grip_m_s2 * dt, 0.0)
+        slip = max(change - self.grip_m_s2 * dt, 0.0)  # which may all be along, or all in turning
         left = max(1.0 - self.slide_m_s2 * dt / change, 0.0) if change > 0.0 else 0.0
-        return slip, (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
+        return (slip, slip / self.lever_m), (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:

@@ -26,6 +26,7 @@ class Odometry(NamedTuple):
 
     twist: Array | tuple[float, float, float]  # (3,) vx [m/s], vy [m/s], ω [rad/s] in the body frame
     dt: float  # [s]
+    slip: tuple[float, float] | None = None  # [m/s, rad/s] by which the wheels may outrun the body; None: not told
 
 
 class Scan(NamedTuple):

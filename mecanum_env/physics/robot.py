@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mecanum_env.config import RobotConfig
 
 __all__ = [
+    "GRAVITY_M_S2",
     "INCREMENTS",
     "POSE",
     "REFERENCES",
@@ -30,6 +31,7 @@ __all__ = [
     "forward_matrix",
     "inverse_kinematics",
     "motor_constants",
+    "solve_traction",
     "turn_wheels",
     "wheel_positions",
 ]
@@ -221,7 +223,7 @@ def motor_constants(constants: Array, h: float, m: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _solve(
+def solve_traction(
     a: float, b: float, d: float, e: float, f: float, x: float, y: float, z: float
 ) -> tuple[float, float, float]:
     """Solve [[a, b, e], [b, a, f], [e, f, d]] · result = (x, y, z) for a positive definite matrix."""
@@ -301,7 +303,7 @@ def turn_wheels(
         g3 = grip3 / (math.sqrt(0.5 * q3 * q3 + s0_squared) + give3)
         f0, f1, f2, f3 = -0.5 * g0 * q0, -0.5 * g1 * q1, -0.5 * g2 * q2, -0.5 * g3 * q3
         total = 0.5 * ((g0 + g1) + (g2 + g3))
-        dvx, dvy, dvl = _solve(
+        dvx, dvy, dvl = solve_traction(
             mass + total,
             0.5 * ((g1 - g0) + (g2 - g3)),
             lever_inertia + total,

@@ -119,7 +119,7 @@ def _box_is_clear(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _drive_clear(
     work: Array, fixed: Array, friction: NDArray[np.float32], clearance: NDArray[np.float32], segments: Array,
-    circles: Array, dt: float, substeps: int, steps: int,
+    circles: Array, dt: float, substeps: int, steps: int, readings: Array,
 ) -> int:  # fmt: skip
     """Run up to ``steps`` physics steps for as long as nothing can be touched in them.
 
@@ -152,6 +152,7 @@ def _drive_clear(
             steps = step
             break
         state[0], state[1], state[2] = x, y, theta
+        readings[step] = state[INCREMENTS]
     wrapped[0], wrapped[1], wrapped[2] = state[0], state[1], wrap_scalar(state[2])
     return steps
 
@@ -217,6 +218,7 @@ class World:
         self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
         self._work = np.zeros(_WORK_SIZE)
+        self._readings = np.zeros((1, 4))
         self._work[POSE] = plan.start
         self._wrap_pose()
         self._contacts = Contacts()
@@ -276,13 +278,16 @@ class World:
         self._work[_LOST] = self._slips[-self._slips_left]
         self._slips_left -= 1
         clear = self._shortcut and self._forgotten >= _PERSISTENCE
+        if len(self._readings) != steps:
+            self._readings = np.zeros((steps, 4))
         done = self._drive_clear(dt, substeps, steps if clear else 0)
         if done:
             self._body_is_behind = True
             self._contacts.pass_clear(done * dt)
         if done < steps:
-            for _ in range(steps - done):
+            for step in range(done, steps):
                 self._drive_near(dt, substeps)
+                self._readings[step] = self._work[INCREMENTS]
             self._wrap_pose()
 
     def _wrap_pose(self) -> None:
@@ -293,7 +298,7 @@ class World:
         floor = self.floor
         return _drive_clear(
             self._work, self._fixed, floor.friction, floor.clearance, self._segments, self._circles, dt, substeps,
-            steps,
+            steps, self._readings,
         )  # fmt: skip
 
     def _drive_near(self, dt: float, substeps: int) -> None:
@@ -347,9 +352,12 @@ class World:
         return self._work[WHEELS].copy()
 
     @property
-    def wheel_increments(self) -> Array:
-        """How far each wheel turned in the last control step ``(4,)`` [rad], with whatever slipped."""
-        return self._work[INCREMENTS].copy()
+    def wheel_readings(self) -> Array:
+        """How far each wheel had turned ``(steps, 4)`` [rad], with whatever slipped, in the last control step.
+
+        A row for the end of each physics step; the last one is the whole step's.
+        """
+        return self._readings.copy()
 
     @property
     def collisions(self) -> int:

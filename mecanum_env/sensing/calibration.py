@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
+from mecanum_env.sensing.slip import grip_m_s2
 from slam.motion import LastingErrors, OdometryNoise
 from slam.settings import to_mapping
 
@@ -20,8 +21,6 @@ _PERSISTENCE = 8.0
 # What is left of the wheels' creep when its mean is taken out (mecanum_env.sensing.sensors.creep), and some more:
 # a robot that stands must not become certain of where it is.
 _FLOOR_M_S = 0.0001
-
-_GRAVITY_M_S2 = 9.81
 
 
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
@@ -38,15 +37,13 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
     base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
     white_share = math.sqrt(white / 4.0)
-    # Rollers at 45° pass on 1/√2 of what the floor holds. Where there are patches, any step may be on one.
-    friction = sum(noise.patch_friction) / 2.0 if noise.patch_share > 0.0 else noise.friction
     return OdometryNoise(
         lever_m=robot.lever_m,
         speed_floor_m_s=_FLOOR_M_S,
         turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
         speed_share=per_wheel,
         turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
-        slide_m_s2=friction * _GRAVITY_M_S2 / math.sqrt(2.0),
+        slide_m_s2=grip_m_s2(noise),
         lasting=LastingErrors(
             radius_sigma=noise.radius_error / math.sqrt(3.0),
             lever_sigma=noise.base_error / math.sqrt(3.0),

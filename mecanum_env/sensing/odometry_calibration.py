@@ -42,6 +42,7 @@ class Drives:
 
     measured: Array  # (episodes, steps, 3) body twist by the wheels: m/s, m/s, rad/s
     true: Array  # (episodes, steps, 3) the twist that leads from each true pose to the next
+    slips: Array  # (episodes, steps, 2) by which the wheels may have outrun the body: m/s, rad/s
     dt: float  # [s]
 
     @property
@@ -89,7 +90,7 @@ def drive(
         Of the first episode; the others follow.
     """
     step_s, physics_step_s = 0.1, 0.02  # as the environments have them
-    measured, true = np.empty((episodes, steps, 3)), np.empty((episodes, steps, 3))
+    measured, true, slips = (np.empty((episodes, steps, n)) for n in (3, 3, 2))
     plan = open_floor()
     for episode in range(episodes):
         world_rng, sensor_rng, drive_rng = (
@@ -103,10 +104,10 @@ def drive(
         for k in range(steps):
             before = world.pose
             world.step(targets.of_twist(driver.action(before)), step_s, physics_step_s)
-            odometry = encoders.odometry(world.wheel_increments, step_s, sensor_rng)
-            measured[episode, k] = odometry.twist
+            odometry = encoders.odometry(world.wheel_readings, step_s, sensor_rng)
+            measured[episode, k], slips[episode, k] = odometry.twist, odometry.slip
             true[episode, k] = twist_between(before, world.pose, step_s)
-    return Drives(measured, true, step_s)
+    return Drives(measured, true, slips, step_s)
 
 
 def open_floor() -> FloorPlan:
@@ -192,16 +193,14 @@ def fit(drives: Drives, lever_m: float) -> Calibration:
 def drift_ratios(drives: Drives, noise: OdometryNoise) -> tuple[float, float]:
     """Return how much larger than declared the drift over a window is: of vx and vy, and of ω.
 
-    The mean of (Σ e)² / Σ V over the windows in which the robot moves, slip as declared: ideal 1, above it V is
+    The mean of (Σ e)² / Σ V over the windows in which the robot moves: ideal 1, above it V is
     too small.
     """
     count, size = drives.windows()
     v, w = np.empty(drives.measured.shape[:2]), np.empty(drives.measured.shape[:2])
-    for episode, twists in enumerate(drives.measured.tolist()):
-        body = (0.0, 0.0, 0.0)
-        for k, (vx, vy, omega) in enumerate(twists):
-            slip, body = noise.slip(body, (vx, vy, omega), drives.dt)
-            v[episode, k], w[episode, k] = noise.variances(vx, vy, omega, slip=slip)
+    for step in np.ndindex(v.shape):
+        along, turning = drives.slips[step]
+        v[step], w[step] = noise.variances(*drives.measured[step], slip=(along, turning))
     shape = (len(v), count, size)
     sums = drives.errors[:, : count * size].reshape(*shape, 3).sum(axis=2)
     var_v, var_w = (a[:, : count * size].reshape(shape).sum(axis=2) for a in (v, w))

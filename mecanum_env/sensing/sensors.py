@@ -16,12 +16,19 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
 from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
+from mecanum_env.sensing.slip import follow, traction_constants
 from slam.odometry.filters import OdometryFilter
 from slam.types import Odometry, Scan
 
 __all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
 
 Array = NDArray[np.float64]
+
+# What encoders remember of the step before, and what stays the same: one array each, since arguments take time.
+_LAST_TWIST, _BODY, _SPEEDS = slice(0, 3), slice(3, 6), slice(6, 10)
+_CREEP_ERROR = 0.6  # share of the creep that may be slip, for all that is taken out of it: measured
+
+_SIGMA, _ROLLING, _RADIUS, _CREEP, _TRACTION, _FORWARD = 0, 1, 2, slice(3, 6), slice(6, 10), slice(10, 22)
 
 
 @njit(cache=True, nogil=True)
@@ -153,39 +160,34 @@ class WheelEncoders:
     def __init__(self, robot: RobotConfig, noise: NoiseConfig, rng: np.random.Generator) -> None:
         self.robot = robot
         self.noise = noise
-        self._forward = forward_matrix(robot)  # (3, 4)
-        self._sigma, self._rolling = noise.encoder, 1.0 - noise.slip
-        self._creep = creep(robot, noise)
-        self._last = np.zeros(3)  # what the wheels said in the step before
+        self._fixed = np.concatenate([
+            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m], creep(robot, noise),
+            traction_constants(robot, noise), forward_matrix(robot).ravel(),
+        ])  # fmt: skip
+        self._last = np.zeros(10)  # see _LAST_TWIST and those after it
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
 
-    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
-        """Return the body twist that the wheels' measured rotation stands for.
+    def odometry(self, readings: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
+        """Return the body twist that the wheels' measured rotation stands for, and what of it may be slip.
 
         Parameters
         ----------
-        wheel_increments
-            How far each wheel turned ``(4,)`` [rad].
+        readings
+            How far each wheel had turned at some moments, as far apart as each other ``(k, 4)`` [rad].
         dt
-            In what time [s].
+            From nought to the last of them [s].
         rng
             Yields four normal numbers: a measured increment is the true one times 1 + ``encoder`` · N(0, 1).
         """
-        increments = np.asarray(wheel_increments, dtype=np.float64)
+        turned = np.asarray(readings, dtype=np.float64)
         twist = np.empty(3)
         if isinstance(rng, NoiseStream):
-            _read_noisy_encoders(
-                self._forward, increments, rng.words, self._sigma, self._rolling, self._creep, dt, self._last,
-                twist,
-            )  # fmt: skip
+            slip = _read_noisy_encoders(turned, rng.words, dt, self._fixed, self._last, twist)
         else:
-            _read_encoders(
-                self._forward, increments, rng.standard_normal(4), self._sigma, self._rolling, self._creep, dt,
-                self._last, twist,
-            )  # fmt: skip
-        return Odometry(twist, dt)
+            slip = _read_encoders(turned, rng.standard_normal(4), dt, self._fixed, self._last, twist)
+        return Odometry(twist, dt, slip)
 
 
 class FilteredEncoders:
@@ -195,39 +197,54 @@ class FilteredEncoders:
         self._encoders, self._filter = encoders, behind
         behind.reset()
 
-    def odometry(self, wheel_increments: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
+    def odometry(self, readings: ArrayLike, dt: float, rng: RandomNumbers) -> Odometry:
         """Return the filtered twist; see :meth:`WheelEncoders.odometry`."""
-        return self._filter.filter(self._encoders.odometry(wheel_increments, dt, rng))
+        return self._filter.filter(self._encoders.odometry(readings, dt, rng))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _read_encoders(
-    forward: Array, increments: Array, normals: Array, sigma: float, rolling: float, creep: Array, dt: float,
-    last: Array, twist: Array,
-) -> None:  # fmt: skip
-    """Write the body's twist: forward · increments (1 + σ normals), less what is lost to slip and to creep.
+    readings: Array, normals: Array, dt: float, fixed: Array, memory: Array, twist: Array
+) -> tuple[float, float]:
+    """Write the body's twist, by what is left of the wheels' when slip's mean and creep are taken out.
 
-    ``last`` is what the wheels said a step ago, and becomes what they say now.
+    Each wheel's measured rotation is the true one times 1 + σ normal. Returned is by how much the wheels may have
+    outrun the body [m/s, rad/s].
     """
+    last, body, before = memory[_LAST_TWIST], memory[_BODY], memory[_SPEEDS]
+    creep, forward, count = fixed[_CREEP], fixed[_FORWARD], readings.shape[0]
+    scale, measured = np.empty(4), np.empty(4)
+    for k in range(4):
+        scale[k] = 1.0 + fixed[_SIGMA] * normals[k]
     for i in range(3):
         total = 0.0
         for k in range(4):
-            total += forward[i, k] * (increments[k] * (1.0 + sigma * normals[k]))
-        twist[i] = rolling / dt * total
+            total += forward[4 * i + k] * (readings[count - 1, k] * scale[k])
+        twist[i] = fixed[_ROLLING] / dt * total
+    lost, to_speed = np.zeros(3), fixed[_ROLLING] * fixed[_RADIUS] * count / dt
+    for step in range(count):
+        for k in range(4):
+            turned = readings[step, k] - (readings[step - 1, k] if step else 0.0)
+            measured[k] = to_speed * scale[k] * turned
+        follow(body, before, measured, dt / count, fixed[_TRACTION], lost)
+        before[:] = measured
     vx, vy, omega = twist[0], twist[1], twist[2]
     # The acceleration of a body whose axes turn with it.
-    twist[0] -= creep[0] * ((vx - last[0]) / dt - omega * vy)
-    twist[1] -= creep[1] * ((vy - last[1]) / dt + omega * vx)
-    twist[2] -= creep[2] * ((omega - last[2]) / dt)
+    ahead = creep[0] * ((vx - last[0]) / dt - omega * vy)
+    aside = creep[1] * ((vy - last[1]) / dt + omega * vx)
+    turning = creep[2] * ((omega - last[2]) / dt)
+    twist[0], twist[1], twist[2] = vx - ahead, vy - aside, omega - turning
     last[0], last[1], last[2] = vx, vy, omega
+    along, turned = math.hypot(lost[0], lost[1]) / dt, abs(lost[2]) / (dt * fixed[_TRACTION][3])
+    # Wheels creep or slip, and what a body is pulled by while they slip holds the creep.
+    return max(along, _CREEP_ERROR * math.hypot(ahead, aside)), max(turned, _CREEP_ERROR * abs(turning))
 
 
 @njit(cache=True, nogil=True)
 def _read_noisy_encoders(
-    forward: Array, increments: Array, words: NDArray[np.uint64], sigma: float, rolling: float, creep: Array,
-    dt: float, last: Array, twist: Array,
-) -> None:  # fmt: skip
+    readings: Array, words: NDArray[np.uint64], dt: float, fixed: Array, memory: Array, twist: Array
+) -> tuple[float, float]:
     """Draw the normals from the words of a :class:`NoiseStream`, and do :func:`_read_encoders`."""
     normals = np.empty(4)
     fill_normal(words, normals)
-    _read_encoders(forward, increments, normals, sigma, rolling, creep, dt, last, twist)
+    return _read_encoders(readings, normals, dt, fixed, memory, twist)

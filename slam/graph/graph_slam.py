@@ -70,10 +70,8 @@ class GraphSlam(Backend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
-        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
-        dt, noise = odometry.dt, self.config.odometry
-        slip, self._body = noise.slip(self._body, twist, dt) if dt > 0 else (0.0, self._body)
-        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
+        (vx, vy, omega), var_v, var_w, self._body = self.config.odometry.of_step(odometry, self._body)
+        dt = odometry.dt
         predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
         way, turn = self._claimed

@@ -74,10 +74,8 @@ class ScanOdometry:
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
-        vx, vy, omega = twist = tuple(np.asarray(odometry.twist, dtype=np.float64).tolist())
-        dt, noise = odometry.dt, self.noise
-        slip, self._body = noise.slip(self._body, twist, dt) if dt > 0 else (0.0, self._body)
-        var_v, var_w = noise.variances(vx, vy, omega, slip=slip)
+        (vx, vy, omega), var_v, var_w, self._body = self.noise.of_step(odometry, self._body)
+        dt = odometry.dt
         predict_robot(self.pose, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         way, turn = self._claimed
         self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)

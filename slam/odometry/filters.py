@@ -96,11 +96,11 @@ class OdometryFilter:
         """
         vx, vy, omega = np.asarray(odometry.twist, np.float64).tolist()
         if odometry.dt == 0.0 and math.isfinite(vx + vy + omega):
-            return Odometry(np.array([vx, vy, omega]), odometry.dt)
+            return odometry._replace(twist=np.array([vx, vy, omega]))
         out = np.empty(3)
         if not _filter(vx, vy, omega, odometry.dt, *self._fixed, out):
             raise ValueError(f"odometry must be finite, got {odometry}")
-        return Odometry(out, odometry.dt)
+        return odometry._replace(twist=out)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

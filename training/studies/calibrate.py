@@ -38,7 +38,7 @@ def compare(preset: str, *, episodes: int, steps: int, seed: int) -> dict[str, A
     found = fit(drives, robot.lever_m)
     # One gain for all three: that of the wheels.
     gain = float(np.mean(found.gain))
-    corrected = Drives(drives.measured * (1.0 - gain), drives.true, drives.dt)
+    corrected = Drives(drives.measured * (1.0 - gain), drives.true, drives.slips, drives.dt)
     declared = odometry_noise(robot, noise)
     return {
         "white": _terms(found.white),

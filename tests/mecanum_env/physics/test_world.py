@@ -97,7 +97,7 @@ def random_drive(w: World, steps: int, *, seed: int = 3, scale: float = 1.0, hol
         if step % hold == 0:
             wheels = WheelTargets(w.robot).of_twist(scale * rng.uniform(-1, 1, 3))
         w.step(wheels, STEP, 0.02)
-        path.append(np.concatenate([w.pose, w.twist, w.wheel_speeds, w.wheel_increments]))
+        path.append(np.concatenate([w.pose, w.twist, w.wheel_speeds, w.wheel_readings[-1]]))
     return np.array(path)
 
 
@@ -128,7 +128,7 @@ def test_with_exact_encoders_and_gentle_driving_odometry_is_nearly_the_path() ->
     total = np.zeros(3)
     for k in range(60):
         w.step(WheelTargets(ROBOT).of_twist((0.3 * math.sin(0.1 * k), 0.0, 0.0)), STEP, 0.02)
-        total += STEP * np.asarray(encoders.odometry(w.wheel_increments, STEP, rng).twist)
+        total += STEP * np.asarray(encoders.odometry(w.wheel_readings, STEP, rng).twist)
     np.testing.assert_allclose(w.pose, np.array([3.0, 3.0, 0.0]) + total, atol=5e-3)
 
 
@@ -230,7 +230,7 @@ def test_slip_loses_its_mean_share_and_odometry_does_not_see_it() -> None:
     wheels = WheelTargets(ROBOT).of_twist((0.8, 0, 0))
     for _ in range(400):
         w.step(wheels, STEP, 0.02)
-        rolled += ROBOT.wheel_radius_m * float(np.mean(w.wheel_increments))
+        rolled += ROBOT.wheel_radius_m * float(np.mean(w.wheel_readings[-1]))
     moved = float(np.hypot(*(w.pose - before)[:2]))
     # Slip is drawn apart for each wheel, so the path bends, too: compare lengths only roughly.
     assert moved / rolled == pytest.approx(0.9, abs=0.015)
@@ -246,7 +246,7 @@ def test_accelerating_on_ice_makes_odometry_read_too_much() -> None:
         read = 0.0
         for _ in range(4):
             w.step(WheelTargets(ROBOT).of_twist((1, 0, 0)), STEP, 0.02)
-            odometry = encoders.odometry(w.wheel_increments, STEP, np.random.default_rng(0))
+            odometry = encoders.odometry(w.wheel_readings, STEP, np.random.default_rng(0))
             read += STEP * float(odometry.twist[0])
         excess.append(read - (w.pose[0] - 3.0))
     assert 0 < excess[0] < 0.03
@@ -395,7 +395,7 @@ def test_the_generator_yields_the_same_numbers_whatever_is_done() -> None:
 def test_what_is_handed_out_is_not_overwritten() -> None:
     w = world(room())
     drive(w, (0.5, 0, 0), 0.5)
-    held = [w.pose, w.twist, w.wheel_speeds, w.wheel_increments]
+    held = [w.pose, w.twist, w.wheel_speeds, w.wheel_readings[-1]]
     copies = [v.copy() for v in held]
     drive(w, (0, 0.5, 0.5), 0.5)
     for value, copy in zip(held, copies, strict=True):

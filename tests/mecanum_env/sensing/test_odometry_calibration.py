@@ -74,7 +74,8 @@ def test_synthetic_errors_come_back() -> None:
     told = OdometryNoise(speed_floor_m_s=0.01, speed_share=0.05, turn_floor_rad_s=0.02, turn_share_rad_m=0.1)
     speed = np.sqrt(true[..., 0] ** 2 + true[..., 1] ** 2 + (told.lever_m * true[..., 2]) ** 2)
     sigmas = np.stack([0.01 + 0.05 * speed, 0.01 + 0.05 * speed, 0.02 + 0.1 * speed], axis=-1)
-    drives = Drives(true + sigmas * rng.standard_normal(true.shape), true, 0.1)
+    measured = true + sigmas * rng.standard_normal(true.shape)
+    drives = Drives(measured, true, np.zeros((40, 200, 2)), 0.1)
     found = fit(drives, told.lever_m)
     for noise in (found.white, found.lasting):
         assert sigma(noise, 0.4) == pytest.approx(sigma(told, 0.4), rel=0.1)

@@ -17,7 +17,7 @@ from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.noise import noise_stream
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
-from mecanum_env.sensing.sensors import Lidar, WheelEncoders
+from mecanum_env.sensing.sensors import _CREEP, Lidar, WheelEncoders
 
 Array = NDArray[np.float64]
 
@@ -300,14 +300,14 @@ def test_pressed_against_a_wall_the_lidar_reads_the_robots_half_width(name: str)
 def test_encoder_noise_has_its_declared_covariance() -> None:
     robot, noise = ROBOT_PRESETS["youbot"], NoiseConfig(encoder=0.05)
     encoders = WheelEncoders(robot, noise, np.random.default_rng(0))
-    increments = np.array([1.2, 0.7, -0.4, 1.0])
+    increments = np.array([[1.2, 0.7, -0.4, 1.0]])
     rng, n = np.random.default_rng(1), 20_000
     # On a floor that does not give, or the creep would be reckoned from the noise, too.
-    encoders._creep[:] = 0.0
+    encoders._fixed[_CREEP] = 0.0
     twists = np.array([encoders.odometry(increments, 0.1, rng).twist for _ in range(n)])
     forward = forward_matrix(robot)
-    declared = forward @ np.diag((0.05 * increments / 0.1) ** 2) @ forward.T
-    mean = forward_kinematics(robot, increments / 0.1)
+    declared = forward @ np.diag((0.05 * increments[0] / 0.1) ** 2) @ forward.T
+    mean = forward_kinematics(robot, increments[0] / 0.1)
     sigma = np.sqrt(np.diag(declared))
     assert np.all(np.abs(twists.mean(axis=0) - mean) < 4 * sigma / math.sqrt(n))
     np.testing.assert_allclose(np.cov(twists.T), declared, atol=4 * np.max(sigma) ** 2 * math.sqrt(2 / n))
@@ -318,8 +318,8 @@ def test_perfect_encoders_read_the_kinematics() -> None:
     robot = ROBOT_PRESETS["cavity"]
     encoders = WheelEncoders(robot, EXACT, np.random.default_rng(0))
     wheels, rng = np.array([1.0, -1.0, -1.0, 1.0]), np.random.default_rng(0)
-    encoders.odometry(wheels, 0.2, rng)
-    odometry = encoders.odometry(wheels, 0.2, rng)  # as fast as before: nothing creeps
+    encoders.odometry(wheels[None], 0.2, rng)
+    odometry = encoders.odometry(wheels[None], 0.2, rng)  # as fast as before: nothing creeps
     np.testing.assert_allclose(odometry.twist, forward_kinematics(robot, 5.0 * wheels), atol=1e-12)
     assert odometry.dt == 0.2
     np.testing.assert_array_equal(encoders.true_radii, robot.wheel_radius_m)
@@ -344,7 +344,7 @@ def test_odometry_always_draws_four_numbers() -> None:
     for noise in (EXACT, NOISE_PRESETS["slippery"]):
         encoders = WheelEncoders(robot, noise, np.random.default_rng(0))
         rng, expected = np.random.default_rng(3), np.random.default_rng(3)
-        encoders.odometry(np.zeros(4), 0.1, rng)
+        encoders.odometry(np.zeros((1, 4)), 0.1, rng)
         expected.standard_normal(4)
         assert rng.random() == expected.random()
 
@@ -358,7 +358,7 @@ def test_a_noise_stream_gives_the_readings_of_its_generator() -> None:
     for k in range(20):
         (odometry, scan), (expected_odometry, expected_scan) = (
             (
-                wheels.odometry(np.full(4, 0.1 * k), 0.1, rng),
+                wheels.odometry(np.full((1, 4), 0.1 * k), 0.1, rng),
                 lidar.scan(SQUARE, NO_CIRCLES, (1.0 + 0.1 * k, 2.0, 0.3 * k), rng),
             )
             for wheels, rng in zip(encoders, streams, strict=True)
