@@ -27,7 +27,7 @@ from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, j
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
-from slam.motion import predict_robot
+from slam.motion import Twist, predict_robot
 from slam.settings import require, unknown_name
 from slam.types import LINE, Observations, Odometry, Scan
 
@@ -92,8 +92,7 @@ class EkfSlam(LandmarkBackend):
         self._noise = self.config.odometry
         self._n, self._x = 3, np.zeros(3 + 2 * 32)
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
-        self._x[:3] = pose
-        self._p[:3, :3] = np.triu(pose_cov)
+        self._x[:3], self._p[:3, :3] = pose, np.triu(pose_cov)
         self._begin(self.config.landmarks)
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, len(self._x))
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
@@ -105,8 +104,11 @@ class EkfSlam(LandmarkBackend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega, var_v, var_w = self._measured(odometry, self._noise)
-        predict_robot(self._x, self._p, self._n, vx, vy, omega, odometry.dt, var_v, var_w)
+        self._move(odometry.dt, *self._measured(odometry, self._noise))
+
+    def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
+        """Predict by a twist of the body."""
+        predict_robot(self._x, self._p, self._n, *twist, dt, var_v, var_w)
 
     def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
@@ -207,8 +209,8 @@ class EkfSlam(LandmarkBackend):
 
     def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
         """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are."""
-        book, sigma = self._book, self.config.loop_sigma_m
-        return put_off(self._x, self._p, self.config.lidar_offset_m, z, book.marks, book.now, sigma, match) > 0
+        book, sigma, offset = self._book, self.config.loop_sigma_m, self.config.lidar_offset_m
+        return sigma < math.inf and put_off(self._x, self._p, offset, z, book.marks, book.now, sigma, match) > 0
 
     def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""
@@ -241,9 +243,7 @@ class EkfSlam(LandmarkBackend):
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
         usual = usual.copy()
         moved, turned = self._unseen_motion
-        self._p[0, 0] += moved**2
-        self._p[1, 1] += moved**2
-        self._p[2, 2] += turned**2
+        self._p[[0, 1, 2], [0, 1, 2]] += moved**2, moved**2, turned**2
         match = self._associate_jointly(z)
         found = np.count_nonzero(match >= 0)
         if found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0):
@@ -264,7 +264,8 @@ class EkfSlam(LandmarkBackend):
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         """Correct by a match that stands, curved walls made straight; show the innovations to who has asked."""
         offset = self.config.lidar_offset_m
-        straighten(self._x, offset, z, match, self._book.marks, self._curved)
+        if self.config.lines:
+            straighten(self._x, offset, z, match, self._book.marks, self._curved)
         if self.witness is not None:
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
         self._correct(z, match, limits)
@@ -305,10 +306,9 @@ class EkfSlam(LandmarkBackend):
         self._book.drop(row)
 
     def _enlarge(self) -> None:
-        size = 2 * len(self._x)
+        n, size = self._n, 2 * len(self._x)
         x, p = np.zeros(size), aligned_zeros(size, size)
-        x[: self._n] = self._x[: self._n]
-        p[: self._n, : self._n] = self._p[: self._n, : self._n]
+        x[:n], p[:n, :n] = self._x[:n], self._p[:n, :n]
         self._x, self._p = x, p
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
 

@@ -102,7 +102,7 @@ class FastSlam(LandmarkBackend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move every particle on by what the wheels measured (theory.md A, predict)."""
-        vx, vy, omega, var_v, var_w = self._measured(odometry, self.config.odometry)
+        (vx, vy, omega), var_v, var_w = self._measured(odometry, self.config.odometry)
         twist = np.array([vx, vy, omega])
         self._inherited.predict(self._mean, twist, odometry.dt, var_v, var_w)
         self._move(twist, odometry.dt, var_v, var_w)

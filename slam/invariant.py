@@ -22,6 +22,7 @@ from slam.gaussian.tiles import add_combination, downdate
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
+from slam.motion import Twist
 from slam.types import LINE, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
@@ -61,13 +62,15 @@ class InvariantEkfSlam(EkfSlam):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured, less what they are known to be off by."""
-        wheels = self._wheels
-        if wheels is None:
-            super().predict(odometry)
-            return
-        twist, before = wheels.corrected(np.asarray(odometry.twist, dtype=np.float64)), self._x[:3].copy()
-        super().predict(odometry._replace(twist=twist))
-        wheels.predict(self._p, self._n, before, self._x, float(twist[2]), odometry.dt)
+        if self._wheels is not None:
+            odometry = odometry._replace(twist=self._wheels.corrected(np.asarray(odometry.twist, np.float64)))
+        super().predict(odometry)
+
+    def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
+        if self._wheels is None:
+            super()._move(dt, twist, var_v, var_w)
+        else:
+            self._wheels.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         n, w = self._n, self._w

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.backend import Backend
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
-from slam.motion import OdometryNoise
+from slam.motion import OdometryNoise, Twist
 from slam.types import LINE, Observations, Odometry
 
 __all__ = ["FEWEST_BACK", "LandmarkBackend", "far_better", "observation_rows"]
@@ -34,13 +34,13 @@ class LandmarkBackend(Backend):
         self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
         self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
 
-    def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[float, float, float, float, float]:
-        """Count a step by the wheels; return its vx, vy, ω and V's variances of speed and turn rate."""
-        (vx, vy, omega), var_v, var_w, self._body = noise.of_step(odometry, self._body)
-        way = math.hypot(vx, vy, noise.lever_m * omega) * odometry.dt
+    def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[Twist, float, float]:
+        """Count a step by the wheels; return its twist and V's variances of speed and turn rate."""
+        twist, var_v, var_w, self._body = noise.of_step(odometry, self._body)
+        way = math.hypot(twist[0], twist[1], noise.lever_m * twist[2]) * odometry.dt
         moved, turned = self._unseen_motion
         self._unseen_motion = moved + way, turned + way / noise.lever_m
-        return vx, vy, omega, var_v, var_w
+        return twist, var_v, var_w
 
     def _out_of_sight(self, recent: int, still: int) -> bool:
         """Tell whether many of the landmarks that the last scans showed are missing all at once."""

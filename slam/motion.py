@@ -13,7 +13,7 @@ from slam.geometry import wrap_scalar
 from slam.settings import require
 from slam.types import Odometry
 
-__all__ = ["LastingErrors", "OdometryNoise", "jacobians", "move", "predict_robot", "twist_between"]
+__all__ = ["LastingErrors", "OdometryNoise", "Twist", "jacobians", "move", "predict_robot", "twist_between"]
 
 Array = NDArray[np.float64]
 Twist = tuple[float, float, float]

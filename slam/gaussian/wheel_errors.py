@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from slam.gaussian.lanes import LANES, aligned_zeros
 from slam.gaussian.stacked_update import solve
 from slam.gaussian.tiles import add_combination, subtract
-from slam.motion import LastingErrors
+from slam.motion import LastingErrors, Twist, predict_robot
 
 __all__ = ["WheelErrors"]
 
@@ -61,12 +61,11 @@ class WheelErrors:
 
     def corrected(self, twist: Array) -> Array:
         """Return the twist ``(3,)`` of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""
-        _twist_by_errors(twist, self._lever_m, self._b)
-        return np.asarray(twist + self._b @ self.mean)
+        return np.array(_corrected(twist[0], twist[1], twist[2], self._lever_m, self.mean, self._b))
 
-    def predict(self, p: Array, n: int, before: Array, after: Array, omega: float, dt: float) -> None:
-        """Carry on a step's errors, after :func:`slam.motion.predict_robot` and :meth:`corrected` of its twist."""
-        _predict(p, n, self.cross, self.cov, self._b, before, after, omega, dt)
+    def predict(self, x: Array, p: Array, n: int, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
+        """Do :func:`slam.motion.predict_robot` with a twist that was :meth:`corrected` last, errors included."""
+        _predict(x, p, n, self.cross, self.cov, self._b, *twist, dt, var_v, var_w)
 
     def correct(self, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array, rows: int) -> None:
         """Correct by a stacked update that :func:`slam.gaussian.stacked_update.whiten` has prepared."""
@@ -96,22 +95,27 @@ class WheelErrors:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _twist_by_errors(twist: Array, lever: float, b: Array) -> None:
-    """Write B, the Jacobian ``(3, 5)`` of the twist by the errors."""
+def _corrected(vx: float, vy: float, omega: float, lever: float, mean: Array, b: Array) -> Twist:
+    """Write B, the Jacobian ``(3, 5)`` of the twist by the errors; return the twist less what these make of it."""
     for i in range(4):
-        quarter = 0.25 * (twist[0] + _SIDE[i] * twist[1] + _TURN[i] * lever * twist[2])
+        quarter = 0.25 * (vx + _SIDE[i] * vy + _TURN[i] * lever * omega)
         b[0, i], b[1, i], b[2, i] = quarter, _SIDE[i] * quarter, _TURN[i] * quarter / lever
-    b[2, 4] = twist[2]
+    b[2, 4] = omega
+    for i in range(_STATES):
+        vx, vy, omega = vx + b[0, i] * mean[i], vy + b[1, i] * mean[i], omega + b[2, i] * mean[i]
+    return vx, vy, omega
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _predict(
-    p: Array, n: int, cross: Array, cov: Array, b: Array, before: Array, after: Array, omega: float, dt: float
-) -> None:
-    """C_r ← C_r Fxᵀ + E Dᵀ, and what the errors add to the robot's rows of P."""
+    x: Array, p: Array, n: int, cross: Array, cov: Array, b: Array, vx: float, vy: float, omega: float, dt: float,
+    var_v: float, var_w: float,
+) -> None:  # fmt: skip
+    """Predict the robot; C_r ← C_r Fxᵀ + E Dᵀ, and what the errors add to the robot's rows of P."""
+    before_x, before_y, middle = x[0], x[1], x[2] + 0.5 * omega * dt
+    predict_robot(x, p, n, vx, vy, omega, dt, var_v, var_w)
     # Fx's entries by θ are J times the step, Fu's a rotation by the heading half way and half of Fx's.
-    fx, fy = -(after[1] - before[1]), after[0] - before[0]
-    middle = before[2] + 0.5 * omega * dt
+    fx, fy = -(x[1] - before_y), x[0] - before_x
     c, s = math.cos(middle) * dt, math.sin(middle) * dt
     d = np.empty((3, _STATES))
     for i in range(_STATES):
