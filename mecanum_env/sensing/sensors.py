@@ -212,7 +212,7 @@ def _read_encoders(
     outrun the body [m/s, rad/s].
     """
     last, body, before = memory[_LAST_TWIST], memory[_BODY], memory[_SPEEDS]
-    creep, forward, count = fixed[_CREEP], fixed[_FORWARD], readings.shape[0]
+    creep, forward, traction, count = fixed[_CREEP], fixed[_FORWARD], fixed[_TRACTION], readings.shape[0]
     scale, measured = np.empty(4), np.empty(4)
     for k in range(4):
         scale[k] = 1.0 + fixed[_SIGMA] * normals[k]
@@ -226,7 +226,7 @@ def _read_encoders(
         for k in range(4):
             turned = readings[step, k] - (readings[step - 1, k] if step else 0.0)
             measured[k] = to_speed * scale[k] * turned
-        follow(body, before, measured, dt / count, fixed[_TRACTION], lost)
+        follow(body, before, measured, dt / count, traction, lost)
         before[:] = measured
     vx, vy, omega = twist[0], twist[1], twist[2]
     # The acceleration of a body whose axes turn with it.
@@ -235,7 +235,7 @@ def _read_encoders(
     turning = creep[2] * ((omega - last[2]) / dt)
     twist[0], twist[1], twist[2] = vx - ahead, vy - aside, omega - turning
     last[0], last[1], last[2] = vx, vy, omega
-    along, turned = math.hypot(lost[0], lost[1]) / dt, abs(lost[2]) / (dt * fixed[_TRACTION][3])
+    along, turned = math.hypot(lost[0], lost[1]) / dt, abs(lost[2]) / (dt * traction[3])
     # Wheels creep or slip, and what a body is pulled by while they slip holds the creep.
     return max(along, _CREEP_ERROR * math.hypot(ahead, aside)), max(turned, _CREEP_ERROR * abs(turning))
 

@@ -38,7 +38,7 @@ def traction_constants(robot: RobotConfig, noise: NoiseConfig) -> Array:
     return np.array([grip_m_s2(noise), lever_inertia, robot.slip_speed_m_s, robot.lever_m])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def follow(body: Array, last: Array, now: Array, dt: float, constants: Array, lost: Array) -> None:
     """Let the body follow its wheels from one reading to the next.
 
