@@ -162,46 +162,52 @@ def _corrected_poses(
     lever: float, out: Array,
 ) -> float:  # fmt: skip
     """Write each key scan's pose as its landmarks now have it; return the largest shift [m]."""
+    normals = np.empty((landmarks.shape[0], 2))  # of those that are walls
+    for i in range(landmarks.shape[0]):
+        normals[i, 0], normals[i, 1] = math.cos(landmarks[i, 0]), math.sin(landmarks[i, 0])
     largest = 0.0
-    shift = np.zeros(3)  # of the scan before
+    shift_x = shift_y = turn = 0.0  # of the scan before
     for k in range(poses.shape[0]):
-        pose = poses[k] + shift
+        expected = poses[k, 0] + shift_x, poses[k, 1] + shift_y, poses[k, 2] + turn
+        x, y, theta = expected
         for _ in range(2):  # Gauss-Newton; turns are small
-            pose += _step(pose, poses[k] + shift, ids[k], local[k], landmarks, row_of_id)
-        shift = pose - poses[k]
-        out[k, 0], out[k, 1], out[k, 2] = pose[0], pose[1], wrap_scalar(pose[2])
-        largest = max(largest, math.hypot(shift[0], shift[1]) + abs(shift[2]) * lever)
+            dx, dy, dt = _step(x, y, theta, expected, k, ids, local, landmarks, normals, row_of_id)
+            x, y, theta = x + dx, y + dy, theta + dt
+        shift_x, shift_y, turn = x - poses[k, 0], y - poses[k, 1], theta - poses[k, 2]
+        out[k, 0], out[k, 1], out[k, 2] = x, y, wrap_scalar(theta)
+        largest = max(largest, math.hypot(shift_x, shift_y) + abs(turn) * lever)
     return largest
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def _step(
-    pose: Array, expected: Array, ids: NDArray[np.int64], local: Array, landmarks: Array,
-    row_of_id: NDArray[np.int64],
-) -> Array:  # fmt: skip
-    """Return the step from a key scan's pose to where its landmarks, and the scan before it, want it."""
-    x, y, theta = pose
+    x: float, y: float, theta: float, expected: tuple[float, float, float], k: int, ids: NDArray[np.int64],
+    local: Array, landmarks: Array, normals: Array, row_of_id: NDArray[np.int64],
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return the step from the k-th key scan's pose to where its landmarks, and the scan before it, want it."""
     c, s = math.cos(theta), math.sin(theta)
     # The normal equations' upper triangle and right-hand side, at first of the scan before it alone.
     xx = yy = _NEIGHBOUR_SHIFT
     tt = _NEIGHBOUR_TURN
     xy = xt = yt = 0.0
     bx, by, bt = xx * (expected[0] - x), yy * (expected[1] - y), tt * (expected[2] - theta)
-    for a in range(ids.shape[0]):
-        if ids[a] < 0 or row_of_id[ids[a]] < 0:
+    for a in range(ids.shape[1]):
+        row = row_of_id[ids[k, a]] if ids[k, a] >= 0 else -1
+        if row < 0:
             continue
-        u, v = landmarks[row_of_id[ids[a]]]
-        if local[a, 2]:
-            turn = wrap_scalar(u - theta - local[a, 0])
+        u, v, local_u, local_v = landmarks[row, 0], landmarks[row, 1], local[k, a, 0], local[k, a, 1]
+        if local[k, a, 2]:
+            nx, ny = normals[row, 0], normals[row, 1]
+            turn = wrap_scalar(u - theta - local_u)
             if abs(turn) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
                 u, v, turn = u + math.pi, -v, wrap_scalar(turn + math.pi)
-            nx, ny = math.cos(u), math.sin(u)
-            off = v - nx * x - ny * y - local[a, 1]
+                nx, ny = math.cos(u), math.sin(u)
+            off = v - nx * x - ny * y - local_v
             xx, xy, yy = xx + _POINT * nx * nx, xy + _POINT * nx * ny, yy + _POINT * ny * ny
             bx, by = bx + _POINT * nx * off, by + _POINT * ny * off
             tt, bt = tt + _TURN, bt + _TURN * turn
         else:
-            px, py = c * local[a, 0] - s * local[a, 1], s * local[a, 0] + c * local[a, 1]
+            px, py = c * local_u - s * local_v, s * local_u + c * local_v
             ex, ey = u - x - px, v - y - py
             xx, yy, tt = xx + _POINT, yy + _POINT, tt + _POINT * (px * px + py * py)
             xt, yt = xt - _POINT * py, yt + _POINT * px
@@ -213,4 +219,4 @@ def _step(
     h = yt / yy
     turn = (bt - h * by) / (tt - h * yt)
     dy = (by - yt * turn) / yy
-    return np.array([(bx - xy * dy - xt * turn) / xx, dy, turn])
+    return (bx - xy * dy - xt * turn) / xx, dy, turn
