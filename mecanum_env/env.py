@@ -237,8 +237,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         known, map_entropy, pose_entropy = self._before
         config = self.config
         cell = config.grid_resolution_m**2
-        twist = self._odometry.twist
-        vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
+        vx, vy, omega = self._odometry.numbers
         robot = config.robot
         speed = math.hypot(vx, vy) / robot.max_speed_m_s + abs(omega) / robot.max_turn_rate_rad_s
         # By position: names would take as long again.
@@ -282,7 +281,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self.scan,
             pose=self._pose,
             pose_cov=self._pose_cov,
-            twist=self._odometry.twist,
+            twist=self._odometry.numbers,
             time_used=self._steps / limit,
         )
 

@@ -79,7 +79,7 @@ def observe(
     *,
     pose: Array,
     pose_cov: Array,
-    twist: Array | tuple[float, float, float],
+    twist: tuple[float, float, float],
     time_used: float,
 ) -> Observation:
     """Return what the agent sees, all of it from sensors and belief.
@@ -88,14 +88,14 @@ def observe(
     ----------
     pose, pose_cov : Array
         The backend's mean ``(3,)`` and covariance ``(3, 3)``.
-    twist : Array
-        Odometry twist ``(3,)``: m/s, m/s, rad/s.
+    twist : tuple
+        Of the odometry: vx, vy [m/s], ω [rad/s].
     time_used : float
         Fraction of the episode's time used.
     """
     grid, robot = backend.grid, config.robot
     row0, col0 = grid.lattice_origin
-    vx, vy, omega = twist if isinstance(twist, tuple) else twist.tolist()
+    vx, vy, omega = twist
     maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
     ranges = np.empty(len(scan.ranges), np.float32)
     numbers = np.empty(16, np.float32)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.ekf import EkfLinesConfig, EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose
-from slam.gaussian.stacked_update import NO_LIMITS, SPARE_ROWS, whiten
+from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
@@ -63,7 +63,7 @@ class InvariantEkfSlam(EkfSlam):
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured, less what they are known to be off by."""
         if self._wheels is not None:
-            odometry = odometry._replace(twist=self._wheels.corrected(np.asarray(odometry.twist, np.float64)))
+            odometry = Odometry(self._wheels.corrected(odometry.numbers), odometry.dt, odometry.slip)
         super().predict(odometry)
 
     def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
@@ -81,7 +81,6 @@ class InvariantEkfSlam(EkfSlam):
         self.nis_dof = rows
         if self._wheels is not None and rows:
             self._wheels.correct(n, match, self._h, w, self._s, rows)
-            self._wheels.reset(n, w[rows : rows + SPARE_ROWS : 2])
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
         kept = None if self._wheels is None else self._wheels.snapshot()

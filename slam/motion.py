@@ -88,9 +88,7 @@ class OdometryNoise:
 
         Where the odometry does not tell what slipped, :meth:`slip` does, from the twist ``body`` before the step.
         """
-        given = odometry.twist
-        twist = given if isinstance(given, tuple) else tuple(np.asarray(given, np.float64).tolist())
-        slip = odometry.slip
+        twist, slip = odometry.numbers, odometry.slip
         if slip is None:
             slip, body = self.slip(body, twist, odometry.dt) if odometry.dt > 0.0 else (NO_SLIP, body)
         return twist, *self.variances(*twist, slip=slip), body

@@ -28,6 +28,15 @@ class Odometry(NamedTuple):
     dt: float  # [s]
     slip: tuple[float, float] | None = None  # [m/s, rad/s] by which the wheels may outrun the body; None: not told
 
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """The twist as three numbers."""
+        twist = self.twist
+        if isinstance(twist, tuple):
+            return twist
+        vx, vy, omega = np.asarray(twist, np.float64).tolist()
+        return vx, vy, omega
+
 
 class Scan(NamedTuple):
     """One sweep of a planar lidar, in the sensor frame (REP 117 values).

@@ -25,7 +25,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.gaussian.lanes import LANES, aligned_zeros
-from slam.gaussian.stacked_update import solve
+from slam.gaussian.stacked_update import SPARE_ROWS, solve
 from slam.gaussian.tiles import add_combination, subtract
 from slam.motion import LastingErrors, Twist, predict_robot
 
@@ -59,21 +59,18 @@ class WheelErrors:
         """Go back to what was kept."""
         self.mean[:], self.cov[:], self.cross[:] = kept
 
-    def corrected(self, twist: Array) -> Array:
-        """Return the twist ``(3,)`` of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""
-        return np.array(_corrected(twist[0], twist[1], twist[2], self._lever_m, self.mean, self._b))
+    def corrected(self, twist: Twist) -> Twist:
+        """Return the twist of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""
+        vx, vy, omega = twist
+        return _corrected(vx, vy, omega, self._lever_m, self.mean, self._b)
 
     def predict(self, x: Array, p: Array, n: int, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Do :func:`slam.motion.predict_robot` with a twist that was :meth:`corrected` last, errors included."""
         _predict(x, p, n, self.cross, self.cov, self._b, *twist, dt, var_v, var_w)
 
     def correct(self, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array, rows: int) -> None:
-        """Correct by a stacked update that :func:`slam.gaussian.stacked_update.whiten` has prepared."""
+        """Correct by an update of :func:`slam.invariant.invariant_update`, and go along with its reset."""
         _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows)
-
-    def reset(self, n: int, a: Array) -> None:
-        """Go along with the invariant filter's reset; ``a`` ``(3, ≥ n)`` is A's columns by θ, x and y."""
-        _reset(self.cross, n, a)
 
     def add(self, n: int, gr: Array) -> None:
         """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""
@@ -164,11 +161,12 @@ def _correct(
         for j in range(_STATES):
             for k in range(rows):
                 cov[i, j] -= we[k, i] * we[k, j]
+    _reset(cross, n, w[rows : rows + SPARE_ROWS : 2])
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reset(cross: Array, n: int, a: Array) -> None:
-    """C ← C (I + A S)ᵀ, S taking θ, x and y (invariant-ekf.md, Reset)."""
+    """C ← C (I + A S)ᵀ, S taking θ, x and y (invariant-ekf.md, Reset); the rows of ``a`` are A's columns by them."""
     for i in range(_STATES):
         theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
         for j in range(n):

@@ -94,7 +94,7 @@ class OdometryFilter:
 
         ``ValueError`` for a twist that is not finite.
         """
-        vx, vy, omega = np.asarray(odometry.twist, np.float64).tolist()
+        vx, vy, omega = odometry.numbers
         if odometry.dt == 0.0 and math.isfinite(vx + vy + omega):
             return odometry._replace(twist=np.array([vx, vy, omega]))
         out = np.empty(3)
