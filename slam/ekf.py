@@ -128,7 +128,7 @@ class EkfSlam(LandmarkBackend):
         loop = self._put_off(z, match)
         if scan is not None and self._out_of_sight(*self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
-        given = z.copy()  # what is matched with curved walls is made straight, in place
+        given = z.copy() if self.config.lines else z  # what is matched with curved walls is straightened in place
         self._accept(z, match, JOINT_LIMITS)
         if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
             z[:] = given

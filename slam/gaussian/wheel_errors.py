@@ -166,7 +166,7 @@ def _correct(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reset(cross: Array, n: int, a: Array) -> None:
-    """C ← C (I + A S)ᵀ, S taking θ, x and y (invariant-ekf.md, Reset); the rows of ``a`` are A's columns by them."""
+    """C ← C (I + A S)ᵀ, S taking θ, x and y, and ``a`` A's columns by these (invariant-ekf.md, Reset)."""
     for i in range(_STATES):
         theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
         for j in range(n):
