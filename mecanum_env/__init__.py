@@ -27,6 +27,7 @@ def register_envs() -> None:
             gymnasium.register(
                 env_id,
                 entry_point="mecanum_env.env:ExploreEnv",
+                vector_entry_point="mecanum_env.vector.vector_env:ExploreVectorEnv",
                 kwargs={"action": action},
                 max_episode_steps=MAX_EPISODE_STEPS,
             )

@@ -16,7 +16,7 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
 from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
-from mecanum_env.sensing.slip import follow, traction_constants
+from mecanum_env.sensing.slip import expected_share, follow, traction_constants
 from slam.odometry.filters import OdometryFilter
 from slam.types import Odometry, Scan
 
@@ -26,9 +26,11 @@ Array = NDArray[np.float64]
 
 # What encoders remember of the step before, and what stays the same: one array each, since arguments take time.
 _LAST_TWIST, _BODY, _SPEEDS = slice(0, 3), slice(3, 6), slice(6, 10)
+_ON_AND_OFF = 0.5  # share of what slips along that turns a body which may stand with one side on a patch
 _CREEP_ERROR = 0.6  # share of the creep that may be slip, for all that is taken out of it: measured
 
-_SIGMA, _ROLLING, _RADIUS, _CREEP, _TRACTION, _FORWARD = 0, 1, 2, slice(3, 6), slice(6, 10), slice(10, 22)
+_SIGMA, _ROLLING, _RADIUS, _SHARE = range(4)
+_CREEP, _TRACTION, _FORWARD = slice(4, 7), slice(7, 11), slice(11, 23)
 
 
 @njit(cache=True, nogil=True)
@@ -161,7 +163,7 @@ class WheelEncoders:
         self.robot = robot
         self.noise = noise
         self._fixed = np.concatenate([
-            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m], creep(robot, noise),
+            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m, expected_share(noise)], creep(robot, noise),
             traction_constants(robot, noise), forward_matrix(robot).ravel(),
         ])  # fmt: skip
         self._last = np.zeros(10)  # see _LAST_TWIST and those after it
@@ -235,7 +237,10 @@ def _read_encoders(
     turning = creep[2] * ((omega - last[2]) / dt)
     twist[0], twist[1], twist[2] = vx - ahead, vy - aside, omega - turning
     last[0], last[1], last[2] = vx, vy, omega
-    along, turned = math.hypot(lost[0], lost[1]) / dt, abs(lost[2]) / (dt * traction[3])
+    share = fixed[_SHARE]
+    along, turned = share * math.hypot(lost[0], lost[1]) / dt, share * abs(lost[2]) / (dt * traction[3])
+    if share < 1.0:  # some wheels on a patch, some beside it
+        turned = math.hypot(turned, _ON_AND_OFF * along / traction[3])
     # Wheels creep or slip, and what a body is pulled by while they slip holds the creep.
     return max(along, _CREEP_ERROR * math.hypot(ahead, aside)), max(turned, _CREEP_ERROR * abs(turning))
 

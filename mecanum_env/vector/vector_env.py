@@ -1,0 +1,229 @@
+"""A batch of exploration environments as one of Gymnasium's vector environments."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+from collections.abc import Sequence
+from copy import deepcopy
+from functools import partial
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, cast
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import TimeLimit
+from numpy.typing import NDArray
+
+from mecanum_env.env import ExploreEnv
+from mecanum_env.vector import workers as told
+from mecanum_env.vector.board import Board
+from mecanum_env.vector.workers import Share
+
+__all__ = ["ExploreVectorEnv"]
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Observations = dict[str, NDArray[Any]]
+
+_PATIENCE_S = 10.0  # for a worker to quit
+
+
+class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
+    """Many exploration environments, stepped by the caller and its worker processes over shared memory.
+
+    Each is what ``gym.make`` makes, and with the same seeds everything is as in Gymnasium's ``SyncVectorEnv``, bit
+    for bit, however many workers there are::
+
+        envs = gym.make_vec("mecanum_env/Explore-v0", num_envs=8, vectorization_mode="vector_entry_point")
+
+    Parameters
+    ----------
+    num_envs : int
+        How many environments.
+    workers : int, optional
+        Processes, each with its share of them, the caller's own among them; if left out, one a core.
+    autoreset_mode : AutoresetMode or str
+        As in Gymnasium: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``. With the first, other
+        processes begin the next episode while the caller is still busy with the end of the last.
+    copy : bool
+        Whether ``reset`` and ``step`` return copies of the observations; else views, until the next step.
+    max_episode_steps : int, optional
+        Steps after which an episode is truncated.
+    context : str, optional
+        How processes are started (``"fork"``, ``"forkserver"``, ``"spawn"``); the platform's way if left out.
+    **settings
+        Those of :class:`mecanum_env.env.ExploreEnv`.
+
+    Raises
+    ------
+    ValueError
+        For a number of environments or workers below one, and where ``ExploreEnv`` does.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        workers: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        max_episode_steps: int | None = None,
+        context: str | None = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__()
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        for name, value in (("num_envs", num_envs), ("workers", cores if workers is None else workers)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}")
+        like = ExploreEnv(**settings)  # tells what is wrong with the settings before any process is started
+        observation, action = cast("spaces.Dict", like.observation_space), cast("spaces.Box", like.action_space)
+        mode = AutoresetMode(autoreset_mode)
+        self.num_envs, self.copy = num_envs, copy
+        self.metadata = {**like.metadata, "autoreset_mode": mode}
+        self.render_mode = like.render_mode
+        self.single_observation_space, self.single_action_space = observation, action
+        self.observation_space = batch_space(observation, num_envs)
+        self.action_space = batch_space(action, num_envs)
+        processes = multiprocessing.get_context(context)
+        self._board = Board(processes, num_envs, observation, action)
+        make = partial(_make, max_episode_steps, settings)
+        shares = np.array_split(np.arange(num_envs), min(cores if workers is None else workers, num_envs))
+        self._rows = [share.tolist() for share in shares]
+        self._own: Share | None = Share(make, self._board, 0, len(self._rows[0]), mode)
+        self._pipes: list[Connection] = []
+        self._processes: list[BaseProcess] = []
+        for rows in self._rows[1:]:
+            ours, theirs = processes.Pipe()
+            process = processes.Process(  # type: ignore[attr-defined]
+                target=told.work, args=(theirs, make, self._board, rows[0], len(rows), mode), daemon=True
+            )
+            process.start()
+            theirs.close()
+            self._pipes.append(ours)
+            self._processes.append(process)
+
+    # ---- Gymnasium -----------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start an episode in every environment, or in those of ``options["reset_mask"]`` ``(num_envs,)``.
+
+        A single seed stands for it and those that follow, one an environment.
+        """
+        seeds = [seed + k for k in range(self.num_envs)] if isinstance(seed, int) else seed
+        seeds = [None] * self.num_envs if seeds is None else list(seeds)
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"{len(seeds)} seeds for {self.num_envs} environments")
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
+        if mask is not None and (np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype != np.bool_):
+            raise ValueError(f"reset_mask must be {self.num_envs} booleans, got {mask!r}")
+        chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
+        if not np.any(chosen):
+            raise ValueError("reset_mask chooses no environment")
+        parts = [({k: seeds[k] for k in rows if chosen[k]}, options or None) for rows in self._rows]
+        infos = self._infos(self._ask(told.RESET, parts))
+        return self._observations(), infos
+
+    def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
+        """Step every environment by its row of the actions ``(num_envs, a)``."""
+        board = self._board
+        if np.shape(actions) != board.actions.shape:
+            raise ValueError(f"actions must be {board.actions.shape}, got {np.shape(actions)}")
+        board.actions[:] = actions
+        infos = self._infos(self._ask(told.STEP, [()] * len(self._rows)))
+        return (
+            self._observations(), board.rewards.copy(), board.terminated.copy(), board.truncated.copy(), infos,
+        )  # fmt: skip
+
+    def render(self) -> tuple[Any, ...] | None:
+        """Return a frame of each environment."""
+        return self.call("render")
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Return an attribute of each environment, or what it returns where it is a method."""
+        answers = self._ask(told.CALL, [(name, args, kwargs)] * len(self._rows))
+        return tuple(value for answer in answers for value in answer)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """Return an attribute of each environment."""
+        return self.call(name)
+
+    def set_attr(self, name: str, values: Any) -> None:
+        """Set an attribute of each environment, to its own of a list or tuple, or to the same."""
+        each = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
+        if len(each) != self.num_envs:
+            raise ValueError(f"{len(each)} values for {self.num_envs} environments")
+        self._ask(told.SET, [(name, {k: each[k] for k in rows}) for rows in self._rows])
+
+    @property  # type: ignore[misc]
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The environments' random number generators, as copies."""
+        return self.get_attr("np_random")
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """What they were seeded with."""
+        return self.get_attr("np_random_seed")
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Have the workers quit; those that do not are ended."""
+        for pipe in getattr(self, "_pipes", []):
+            with contextlib.suppress(OSError):
+                pipe.send((told.QUIT,))
+            pipe.close()
+        for process in getattr(self, "_processes", []):
+            process.join(_PATIENCE_S)
+            if process.is_alive():
+                process.terminate()
+                process.join()
+        if (own := getattr(self, "_own", None)) is not None:
+            own.close()
+        self._pipes, self._processes, self._own = [], [], None
+
+    # ---- between caller and workers ------------------------------------------------------------------------
+
+    def _ask(self, command: str, parts: Sequence[tuple[Any, ...]]) -> list[Any]:
+        """Give every worker its part of a command; return their results, or raise what one of them raised."""
+        if self._own is None:
+            raise gymnasium.error.ClosedEnvironmentError("the environments are closed")
+        answers: list[tuple[Exception | None, Any]] = []
+        try:
+            for pipe, part in zip(self._pipes, parts[1:], strict=True):
+                pipe.send((command, *part))
+            try:
+                answers.append((None, getattr(self._own, command)(*parts[0])))
+            except Exception as error:  # the others' answers first
+                answers.append((error, None))
+            answers += [pipe.recv() for pipe in self._pipes]
+        except (EOFError, BrokenPipeError, ConnectionResetError) as error:
+            self.close()
+            raise RuntimeError("a worker process has ended; make the environments anew") from error
+        for raised, _ in answers:
+            if raised is not None:
+                raise raised
+        return [result for _, result in answers]
+
+    def _observations(self) -> Observations:
+        shared = self._board.observations
+        return {key: value.copy() for key, value in shared.items()} if self.copy else dict(shared)
+
+    def _infos(self, rests: list[dict[int, dict[str, Any]]]) -> dict[str, Any]:
+        infos = self._board.infos()
+        for rest in rests:
+            for row, more in rest.items():
+                infos = self._add_info(infos, more, row)
+        return infos
+
+
+def _make(max_episode_steps: int | None, settings: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    env: gymnasium.Env[Any, Any] = ExploreEnv(**deepcopy(settings))
+    return env if max_episode_steps is None else TimeLimit(env, max_episode_steps)

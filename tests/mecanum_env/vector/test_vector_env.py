@@ -1,0 +1,187 @@
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+import mecanum_env  # noqa: F401 - registers the environments
+from mecanum_env.rooms import FloorPlanError
+from mecanum_env.vector.vector_env import ExploreVectorEnv
+
+ID = "mecanum_env/Explore-v0"
+SETTINGS: dict[str, Any] = {"rooms": "rectangular", "slam": "ekf", "max_episode_steps": 12}
+
+
+def batch(count: int = 3, **more: Any) -> ExploreVectorEnv:
+    made = gym.make_vec(ID, num_envs=count, vectorization_mode="vector_entry_point", **SETTINGS, **more)
+    assert isinstance(made, ExploreVectorEnv)
+    return made
+
+
+def like(count: int = 3, mode: AutoresetMode = AutoresetMode.NEXT_STEP) -> VectorEnv[Any, Any, Any]:
+    return gym.make_vec(
+        ID, num_envs=count, vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **SETTINGS
+    )
+
+
+@pytest.fixture
+def envs() -> Iterator[ExploreVectorEnv]:
+    made = batch(workers=2)
+    yield made
+    made.close()
+
+
+def assert_same(got: Any, want: Any, at: str = "") -> None:
+    if isinstance(want, tuple):
+        assert_same(dict(enumerate(got)), dict(enumerate(want)), at)
+    elif isinstance(want, dict):
+        assert isinstance(got, dict) and got.keys() == want.keys(), (at, sorted(got), sorted(want))
+        for key, value in want.items():
+            assert_same(got[key], value, f"{at}.{key}")
+    elif isinstance(want, np.ndarray) and want.dtype == object:
+        assert got.dtype == object and len(got) == len(want), at
+        for k, value in enumerate(want):
+            assert_same(got[k], value, f"{at}[{k}]")
+    elif isinstance(want, np.ndarray):
+        assert got.dtype == want.dtype, (at, got.dtype, want.dtype)
+        np.testing.assert_array_equal(got, want, err_msg=at)
+    else:
+        assert got == want, at
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_every_bit_is_that_of_gymnasium_s_own(mode: AutoresetMode, workers: int) -> None:
+    ours, theirs = batch(workers=workers, autoreset_mode=mode), like(mode=mode)
+    assert ours.metadata["autoreset_mode"] is mode
+    assert ours.observation_space == theirs.observation_space
+    assert_same(ours.reset(seed=5), theirs.reset(seed=5))
+    ours.action_space.seed(1)
+    ended = 0
+    for _ in range(40):
+        actions = ours.action_space.sample()
+        got, want = ours.step(actions), theirs.step(actions)
+        assert_same(got, want)
+        over = got[2] | got[3]
+        ended += int(over.sum())
+        if mode is AutoresetMode.DISABLED and over.any():
+            mask = {"reset_mask": over}
+            assert_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)))
+    assert ended >= 6
+    ours.close()
+    theirs.close()
+
+
+def test_an_episode_begun_ahead_changes_nothing_for_who_resets(envs: ExploreVectorEnv) -> None:
+    """After the last step a worker has begun the next episode; a reset takes that, or another with options."""
+    theirs = like()
+    for options in (None, {"room_seed": 3}):
+        envs.reset(seed=7)
+        theirs.reset(seed=7)
+        for _ in range(12):
+            actions = np.zeros((3, 3), np.float32)
+            envs.step(actions)
+            theirs.step(actions)
+        assert_same(envs.reset(options=options), theirs.reset(options=options))
+        assert_same(envs.step(actions)[0], theirs.step(actions)[0])
+    theirs.close()
+
+
+def test_copies_last_and_views_do_not(envs: ExploreVectorEnv) -> None:
+    first, _ = envs.reset(seed=0)
+    kept = {key: value.copy() for key, value in first.items()}
+    envs.step(np.full((3, 3), 0.5, np.float32))
+    assert_same(first, kept)
+    views = batch(copy=False, workers=1)
+    first, _ = views.reset(seed=0)
+    after = views.step(np.full((3, 3), 0.5, np.float32))[0]
+    assert all(np.shares_memory(first[key], after[key]) for key in first)
+    views.close()
+
+
+def test_attributes_of_each(envs: ExploreVectorEnv) -> None:
+    envs.reset(seed=4)
+    assert envs.np_random_seed == (4, 5, 6)
+    assert [config.rooms for config in envs.get_attr("config")] == ["rectangular"] * 3
+    envs.set_attr("mark", [1, 2, 3])
+    assert envs.get_attr("mark") == (1, 2, 3)
+    assert [metrics["steps"] for metrics in envs.call("episode_metrics")] == [0, 0, 0]
+    with pytest.raises(ValueError, match="2 values for 3"):
+        envs.set_attr("mark", [1, 2])
+
+
+def test_what_one_raises_the_caller_raises_and_goes_on(envs: ExploreVectorEnv) -> None:
+    envs.reset(seed=0)
+    with pytest.raises(FloorPlanError, match="start"):
+        envs.reset(options={"start_pose": (99.0, 99.0, 0.0)})
+    with pytest.raises(ValueError, match="an action must be 3 finite numbers"):
+        envs.step(np.full((3, 3), np.nan, np.float32))
+    envs.reset(seed=0)
+    envs.step(np.zeros((3, 3), np.float32))
+
+
+def test_bad_arguments_are_told_before_any_process_starts() -> None:
+    with pytest.raises(ValueError, match="did you mean 'apartment'"):
+        ExploreVectorEnv(2, rooms="apartmnt")
+    with pytest.raises(ValueError, match="num_envs must be at least 1"):
+        ExploreVectorEnv(0)
+    with pytest.raises(ValueError, match="workers must be at least 1"):
+        ExploreVectorEnv(2, workers=0)
+
+
+def test_bad_calls(envs: ExploreVectorEnv) -> None:
+    with pytest.raises(ValueError, match=r"actions must be \(3, 3\)"):
+        envs.step(np.zeros((2, 3), np.float32))
+    with pytest.raises(ValueError, match="2 seeds for 3"):
+        envs.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match="reset_mask must be 3 booleans"):
+        envs.reset(options={"reset_mask": np.ones(2, np.bool_)})
+    with pytest.raises(ValueError, match="chooses no environment"):
+        envs.reset(options={"reset_mask": np.zeros(3, np.bool_)})
+
+
+def test_without_autoreset_a_step_after_the_end_is_an_error() -> None:
+    envs = batch(2, workers=2, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    for _ in range(12):
+        envs.step(np.zeros((2, 3), np.float32))
+    with pytest.raises(RuntimeError, match="has ended: reset it"):
+        envs.step(np.zeros((2, 3), np.float32))
+    envs.close()
+
+
+def test_closing_ends_the_processes_and_so_does_a_dead_one() -> None:
+    envs = batch(workers=3)
+    envs.reset(seed=0)
+    processes = list(envs._processes)
+    envs.close()
+    envs.close()
+    assert not any(process.is_alive() for process in processes)
+    with pytest.raises(gym.error.ClosedEnvironmentError):
+        envs.reset(seed=0)
+    envs = batch(workers=3)
+    envs.reset(seed=0)
+    processes = list(envs._processes)
+    os.kill(processes[0].pid or 0, signal.SIGKILL)
+    with pytest.raises(RuntimeError, match="worker process has ended"):
+        for _ in range(3):
+            envs.step(np.zeros((3, 3), np.float32))
+    assert not any(process.is_alive() for process in processes)
+
+
+def test_wheels_frames_and_spawned_processes() -> None:
+    envs = gym.make_vec(
+        "mecanum_env/ExploreWheels-v0", num_envs=2, vectorization_mode="vector_entry_point", rooms="rectangular",
+        slam="odometry", render_mode="rgb_array", workers=2, context="spawn",
+    )  # fmt: skip
+    envs.reset(seed=0)
+    envs.step(np.ones((2, 4), np.float32))
+    frames = envs.render()
+    assert frames is not None and len(frames) == 2 and frames[0].ndim == 3
+    envs.close()
