@@ -56,9 +56,7 @@ class GroundTruth:
         self.resolution = resolution
         seen = self._view_from_everywhere(robot, lidar)
         self.lattice_origin = seen.lattice_origin
-        rows, cols = np.indices(seen.shape)
-        centres = seen.to_points(np.column_stack([rows.ravel(), cols.ravel()]))
-        free = plan.is_free(transform_points(self.start, centres)).reshape(seen.shape)
+        free = plan.is_free(transform_points(self.start, seen.centres())).reshape(seen.shape)
         self.mappable = np.asarray((seen.classes() == FREE) & free)
         self.mappable_cells = max(int(np.count_nonzero(self.mappable)), 1)
         near = cv2.dilate(self.mappable.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0

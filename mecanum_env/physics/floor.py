@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig
@@ -69,14 +70,30 @@ def build_floor(plan: FloorPlan, noise: NoiseConfig, rng: np.random.Generator) -
 
 def _surface_samples(plan: FloorPlan, spacing: float) -> Array:
     """Return points on every surface ``(n, 2)``, no further than ``spacing`` from the next."""
-    parts = [np.zeros((0, 2))]
-    for x1, y1, x2, y2 in plan.segments:
-        count = max(2, math.ceil(math.hypot(x2 - x1, y2 - y1) / spacing) + 1)
-        parts.append(np.column_stack([np.linspace(x1, x2, count), np.linspace(y1, y2, count)]))
+    parts = [_segment_samples(plan.segments, spacing)]
     for x, y, radius in plan.circles:
         angles = np.linspace(0.0, 2.0 * math.pi, max(8, math.ceil(2.0 * math.pi * radius / spacing) + 1))
         parts.append(np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)]))
     return np.vstack(parts)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _segment_samples(segments: Array, spacing: float) -> Array:
+    """Return points on segments ``(s, 4)``, both ends of each among them."""
+    steps = np.empty(segments.shape[0], np.int64)
+    for k in range(segments.shape[0]):
+        x1, y1, x2, y2 = segments[k]
+        steps[k] = max(1, math.ceil(math.hypot(x2 - x1, y2 - y1) / spacing))
+    out = np.empty((steps.sum() + steps.shape[0], 2))
+    n = 0
+    for k in range(segments.shape[0]):
+        x1, y1, x2, y2 = segments[k]
+        for i in range(steps[k]):
+            out[n, 0], out[n, 1] = x1 + i * ((x2 - x1) / steps[k]), y1 + i * ((y2 - y1) / steps[k])
+            n += 1
+        out[n, 0], out[n, 1] = x2, y2
+        n += 1
+    return out
 
 
 def _draw_patches(

@@ -147,12 +147,12 @@ class FloorPlan:
 
     def is_free(self, points: Array) -> NDArray[np.bool_]:
         """Return for points ``(n, 2)`` [m] whether each lies in a free cell ``(n,)``; outside the raster: no."""
-        lattice = (np.asarray(points, np.float64).reshape(-1, 2) - self.origin) / self.resolution
+        x, y = ((np.asarray(points, np.float64).reshape(-1, 2) - self.origin) / self.resolution).T
         rows, cols = self.free.shape
         # Compared as floats: a far-away or NaN point must not wrap round in the conversion to integers.
-        inside = np.all((lattice >= 0) & (lattice < (cols, rows)), axis=1)
-        cells = np.floor(np.where(inside[:, None], lattice, 0.0)).astype(np.int64)
-        return np.asarray(inside & self.free[cells[:, 1], cells[:, 0]], np.bool_)
+        found: NDArray[np.bool_] = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
+        found[found] = self.free[y[found].astype(np.int64), x[found].astype(np.int64)]
+        return found
 
     def clearance(self) -> NDArray[np.float32]:
         """Return for each cell ``(rows, cols)`` the distance [m] to the nearest non-free cell (a fresh array).

@@ -137,6 +137,13 @@ class OccupancyGrid:
         lattice = np.asarray(cells)[..., ::-1] + np.array([self._col0, self._row0])
         return np.asarray((lattice + 0.5) * self.resolution, dtype=np.float64)
 
+    def centres(self) -> Array:
+        """Return the centres ``(rows · cols, 2)`` [m] of all cells, row by row."""
+        rows, cols = self.shape
+        x = (np.arange(self._col0, self._col0 + cols) + 0.5) * self.resolution
+        y = (np.arange(self._row0, self._row0 + rows) + 0.5) * self.resolution
+        return np.column_stack([np.tile(x, rows), np.repeat(y, cols)])
+
     # ---- reading -------------------------------------------------------------------------------------------
 
     def classes(self) -> NDArray[np.int8]:

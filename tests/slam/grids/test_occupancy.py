@@ -223,3 +223,10 @@ def test_agreement_is_greatest_where_the_scan_was_taken() -> None:
     nothing = Scan(np.full(BEAMS, np.inf), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=20.0)
     assert grid.agreement(pose, nothing) == 0.0
     assert OccupancyGrid(0.05).agreement(pose, scan) == 0.0
+
+
+def test_the_centres_of_all_cells_are_those_of_each() -> None:
+    grid = OccupancyGrid(0.1)
+    grid.mark_visited(7.0, -3.0, 0.3)  # it grows, to another shape
+    cells = np.column_stack([index.ravel() for index in np.indices(grid.shape)])
+    np.testing.assert_array_equal(grid.centres(), grid.to_points(cells))
