@@ -23,6 +23,10 @@ def speed(
     peer: Annotated[
         str | None, typer.Option(help="Another simulator to measure in turn, in the same rooms: navground.")
     ] = None,
+    envs: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Measure so many environments at once, by each way."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure the steps per second of one environment, and where the time goes.
@@ -32,15 +36,22 @@ def speed(
       mecanum speed
       mecanum speed --slam odometry --beams 180 --steps 3000 --json
       mecanum speed --peer navground
+      mecanum speed --envs 8
     """  # noqa: D301
     from mecanum_env.arguments import make_config
     from training.studies.peers import require
     from training.studies.speed import run
+    from training.studies.speed_batch import run as run_batch
 
     with bad_input():
         make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
         if peer is not None:
             require(peer)
+        if peer is not None and envs is not None:
+            raise ValueError("--envs and --peer are measured apart: leave one of them out")
+    if envs is not None:
+        run_batch(envs, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
+        return
     run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json, peer=peer)
 
 

@@ -55,6 +55,17 @@ def test_json_keys(capsys: pytest.CaptureFixture[str]) -> None:
     assert "90 beams" in printed.err
 
 
+def test_many_environments_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    settings = ["--rooms", "rectangular", "--slam", "odometry", "--steps", "100"]
+    assert main(["speed", "--envs", "2", *settings, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["steps_per_second"].keys() == {"one", "sync", "async", "vector_entry_point"}
+    assert result["steps"] == 10 and result["ratio_to_one"]["one"] == 1.0
+    assert main(["speed", "--envs", "2", *settings]) == 0
+    assert "vector_entry_point" in capsys.readouterr().out
+    assert main(["speed", "--envs", "0"]) == 2
+
+
 def test_unknown_peer_is_bad_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["speed", "--steps", "200", "--peer", "navgroud"]) == 2
     printed = capsys.readouterr()
