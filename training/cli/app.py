@@ -21,6 +21,7 @@ from training.cli.rooms import rooms
 from training.cli.study import study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
+from training.runs.signals import INTERRUPTED, TERMINATED, heed_sigterm
 
 __all__ = ["app", "main"]
 
@@ -63,7 +64,7 @@ def _root(
       mecanum speed
 
     \b
-    Exit codes: 0 done, 2 bad usage or bad input, 1 anything else, 130 interrupted.
+    Exit codes: 0 done, 2 bad usage or bad input, 1 anything else, 130 interrupted, 143 by SIGTERM.
     `mecanum COMMAND --help` shows a command's options and examples.
     """  # noqa: D301
 
@@ -81,7 +82,12 @@ app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; what goes wrong is one line on standard error."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    with heed_sigterm() as ended:
+        code = _run(list(sys.argv[1:] if argv is None else argv))
+    return TERMINATED if ended.is_set() and code == INTERRUPTED else code
+
+
+def _run(arguments: list[str]) -> int:
     command = typer.main.get_command(app)
     name = "mecanum"
     if arguments and arguments[0] in _commands():
@@ -89,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         code = command.main(args=arguments, prog_name="mecanum", standalone_mode=False)
         sys.stdout.flush()
-        if code == 130:  # newer versions of typer hand KeyboardInterrupt back so
+        if code == INTERRUPTED:  # newer versions of typer hand KeyboardInterrupt back so
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except _ClickException as error:
@@ -100,9 +106,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BadInput as error:
         return _fail(name, str(error), 2)
     except Interrupted as error:
-        return _fail(name, str(error), 130)
+        return _fail(name, str(error), INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail(name, "interrupted before the results were written", 130)
+        return _fail(name, "interrupted before the results were written", INTERRUPTED)
     except Exception as error:
         _drop_unwritable_output()
         if os.environ.get(TRACEBACK_VARIABLE) not in (None, "", "0"):

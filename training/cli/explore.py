@@ -67,8 +67,8 @@ def explore(
         raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
     from training.episodes import explore as task
     from training.episodes.recording import Recorder
-    from training.runs.running import interrupt_flag
-    from training.views.episode_files import check_extras, write_episode
+    from training.runs.signals import interrupt_flag
+    from training.views.episode_files import Saver, check_extras, write_episode
     from training.views.film import filmed
 
     asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
@@ -80,7 +80,7 @@ def explore(
     ), Recorder()  # fmt: skip
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
-        witnesses: list[task.Witness] = [recorder]
+        witnesses: list[task.Witness] = [recorder, Saver(episode, recorder)]
         film = stack.enter_context(filmed(out, episode.config, video_substeps)) if "video" in extras else None
         witnesses += [film] if film is not None else []
         with Progress("exploring", 1.0, eta=False) as shown:

@@ -25,7 +25,8 @@ from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
 from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input, check_writable
-from training.runs.running import interrupt_flag, plain
+from training.runs.running import plain
+from training.runs.signals import interrupt_flag
 
 __all__ = [
     "ENDINGS",
@@ -56,6 +57,7 @@ ENDINGS = {
     "time": "the step limit was reached first",
     "collision": "it touched a wall, and the configuration ends an episode there",
     "interrupted": "broken off by Ctrl-C",
+    "running": "it goes on: written on the way",
 }
 """Why an episode ended: the word in ``metrics.json``, and what it means."""
 

@@ -13,7 +13,7 @@ from training.play.controls import Command, Controls, Twist, stick_twist
 from training.play.picture import PICTURE_SHAPE, play_picture
 from training.play.session import Session
 from training.runs.errors import BadInput, Interrupted
-from training.runs.running import interrupt_flag
+from training.runs.signals import interrupt_flag
 
 __all__ = ["Game", "open_window"]
 

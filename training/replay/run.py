@@ -20,7 +20,7 @@ from slam.registry import config_type, make
 from slam.settings import from_mapping, require, to_mapping, unknown_name
 from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
-from training.runs.running import interrupt_flag
+from training.runs.signals import interrupt_flag
 
 __all__ = [
     "FILES",

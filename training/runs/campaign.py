@@ -172,7 +172,7 @@ def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             # Do not wait for what is half done: nobody will keep it.
             pool.shutdown(wait=False, cancel_futures=True)
             for child in set(multiprocessing.active_children()) - before:
-                child.terminate()
+                child.kill()
             raise
         pool.shutdown()
 
@@ -193,9 +193,11 @@ def one_thread_each() -> Iterator[None]:
 
 
 def start_worker() -> None:
-    """Set up a worker process: it leaves Ctrl-C to its parent, and ends with it."""
-    # Ctrl-C reaches every process of the terminal's group; the parent alone decides what it means.
+    """Set up a worker process: it leaves Ctrl-C and SIGTERM to its parent, and ends with it."""
+    # Ctrl-C reaches every process of the terminal's group, a scheduler's SIGTERM every one of its job; the parent
+    # alone decides what they mean.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     cv2.setNumThreads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -1,44 +1,23 @@
-"""What every long run needs: Ctrl-C between two steps, values as JSON has them, the versions it ran with."""
+"""What every long run needs: files that come together, values as JSON has them, the versions it ran with."""
 
 from __future__ import annotations
 
 import math
 import platform
-import signal
-import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import FrameType
 from typing import Any
 
 import numpy as np
 
-__all__ = ["interrupt_flag", "plain", "versions", "written_together"]
+from training.runs.signals import interrupt_flag
+
+__all__ = ["plain", "versions", "written_together"]
 
 _LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
-
-
-@contextmanager
-def interrupt_flag() -> Iterator[threading.Event]:
-    """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once."""
-    flag = threading.Event()
-
-    def note(signum: int, frame: FrameType | None) -> None:
-        if flag.is_set():
-            raise KeyboardInterrupt
-        flag.set()
-
-    if threading.current_thread() is not threading.main_thread():
-        yield flag  # only the main thread may handle signals
-        return
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield flag
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,21 @@ from typing import Any
 import cv2
 import tomli_w
 
+from agents.base import Goal
+from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
 from training.episodes.explore import ENDINGS, EXTRAS, Episode
-from training.episodes.recording import Recording
+from training.episodes.recording import Recorder, Recording
 from training.runs.running import versions, written_together
 from training.views.film import check_video
 from training.views.mcap_file import check_mcap, write_mcap
 from training.views.report_page import episode_page
 from training.views.rerun_file import check_rerun, write_rerun
 
-__all__ = ["check_extras", "config_text", "write_episode"]
+__all__ = ["Saver", "check_extras", "config_text", "write_episode"]
 
 
 def check_extras(extras: Collection[str]) -> None:
@@ -47,6 +50,36 @@ def write_episode(
         if film is not None:
             film.replace(folder / EXTRAS["video"])
     return metrics
+
+
+class Saver:
+    """A witness that writes what there is of an episode now and then: what kills the run takes little.
+
+    Parameters
+    ----------
+    episode, recorder
+        What is written: what the recorder has seen, so it comes first among the witnesses.
+    every_s
+        Time between two writings [s]; more where one takes long, for it to take no more than a twentieth.
+    """
+
+    def __init__(self, episode: Episode, recorder: Recorder, *, every_s: float = 60.0) -> None:
+        self._episode, self._recorder, self._every_s = episode, recorder, every_s
+        self._due = time.monotonic() + every_s
+
+    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+        """Write it if it is time."""
+        began = time.monotonic()
+        if began < self._due:
+            return
+        episode, end = self._episode, self._episode.end
+        episode.end = "running"
+        try:
+            write_episode(episode, self._recorder.recording())
+        finally:
+            episode.end = end
+        took = time.monotonic() - began
+        self._due = time.monotonic() + max(self._every_s, 20.0 * took)
 
 
 def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:

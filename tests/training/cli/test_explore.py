@@ -16,15 +16,20 @@ import cv2
 import numpy as np
 import pytest
 
+from agents.base import Goal
 from mecanum_env.arguments import make_config
 from mecanum_env.config import from_toml
+from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.landmarks.database import read_landmark_map
 from tests.slam.written_files import read_map_server, read_tum
 from tests.training.plans import write_room
 from training.cli import main
+from training.episodes import explore as task
 from training.episodes.explore import EXTRAS, FILES
+from training.episodes.recording import Recorder
 from training.runs.running import plain
+from training.views.episode_files import Saver
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -191,6 +196,37 @@ def test_ctrl_c_keeps_the_episode_so_far(tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(FILES)
     times, _ = read_tum(tmp_path / "out" / "trajectory_true.tum")
     assert len(times) == metrics["steps"] + 1
+
+
+def test_sigterm_is_ctrl_c_but_for_the_exit_code(tmp_path: Path) -> None:
+    process = run("explore", "--agent", "random", "--max-steps", "1000000", "--out", str(tmp_path / "out"))
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("exploring")
+    process.send_signal(signal.SIGTERM)
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 143
+    assert "interrupted after" in err and "Traceback" not in err
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text("utf-8"))["interrupted"] is True
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(FILES)
+
+
+def test_what_kills_a_run_takes_no_more_than_a_minute_of_it(tmp_path: Path) -> None:
+    """The files are there while it runs, whole, and each writing's are of one moment."""
+    episode, recorder = task.prepare(out=tmp_path, agent="random", rooms="rectangular", max_steps=60), Recorder()
+    saver = Saver(episode, recorder, every_s=0.0)
+    seen: list[int] = []
+
+    class Look:
+        def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+            if (tmp_path / "metrics.json").exists():
+                metrics = json.loads((tmp_path / "metrics.json").read_text("utf-8"))
+                times, _ = read_tum(tmp_path / "trajectory_true.tum")
+                assert metrics["end"] == "running" and len(times) == metrics["steps"] + 1
+                assert sorted(p.name for p in tmp_path.iterdir()) == sorted(FILES)
+                seen.append(metrics["steps"])
+
+    task.run(episode, lambda **_: None, [recorder, saver, Look()])
+    assert episode.end == "time" and seen and seen[0] <= 1
 
 
 def test_ctrl_c_before_the_episode_writes_nothing(tmp_path: Path) -> None:

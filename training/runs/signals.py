@@ -1,0 +1,64 @@
+"""Ctrl-C takes effect between two steps, and so does SIGTERM, by which schedulers and ``timeout`` end a run."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["INTERRUPTED", "TERMINATED", "heed_sigterm", "interrupt_flag"]
+
+INTERRUPTED, TERMINATED = 130, 143
+"""Exit codes after Ctrl-C and after SIGTERM: 128 and the signal's number."""
+
+
+class _Flag:
+    """Handles Ctrl-C by noting it."""
+
+    def __init__(self) -> None:
+        self.pressed = threading.Event()
+
+    def __call__(self, signum: int, frame: FrameType | None) -> None:
+        if self.pressed.is_set():
+            raise KeyboardInterrupt
+        self.pressed.set()
+
+
+@contextmanager
+def interrupt_flag() -> Iterator[threading.Event]:
+    """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once.
+
+    Within another such block, that one is told, too, when this one ends.
+    """
+    flag = _Flag()
+    if threading.current_thread() is not threading.main_thread():
+        yield flag.pressed  # only the main thread may handle signals
+        return
+    before = signal.signal(signal.SIGINT, flag)
+    try:
+        yield flag.pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+        if flag.pressed.is_set() and isinstance(before, _Flag):
+            before.pressed.set()
+
+
+@contextmanager
+def heed_sigterm() -> Iterator[threading.Event]:
+    """Take SIGTERM for Ctrl-C; give a flag that tells whether it came."""
+    came = threading.Event()
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        came.set()
+        signal.raise_signal(signal.SIGINT)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGTERM, before)
