@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3.common.env_util import make_vec_env
+
+from training.learning.vec_env import ExploreVecEnv
+
+ID = "mecanum_env:mecanum_env/Explore-v0"
+SETTINGS: dict[str, Any] = {"rooms": "rectangular", "slam": "ekf", "max_episode_steps": 8}
+
+
+def test_every_bit_is_that_of_stable_baselines_own() -> None:
+    ours, theirs = (
+        ExploreVecEnv(3, seed=5, workers=2, **SETTINGS),
+        make_vec_env(ID, 3, seed=5, env_kwargs=SETTINGS),
+    )
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    got, want = ours.reset(), theirs.reset()
+    assert isinstance(got, dict) and isinstance(want, dict)
+    assert got.keys() == want.keys() and all(np.array_equal(got[key], want[key]) for key in want)
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(20):
+        actions = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
+        (got, rewards, done, infos), (want, their_rewards, their_done, their_infos) = (
+            ours.step(actions), theirs.step(actions),
+        )  # fmt: skip
+        assert isinstance(got, dict) and isinstance(want, dict)
+        assert all(np.array_equal(got[key], want[key]) for key in want)
+        np.testing.assert_array_equal(rewards, their_rewards)
+        np.testing.assert_array_equal(done, their_done)
+        for info, other in zip(infos, their_infos, strict=True):
+            other.pop("episode", None)  # of the Monitor that make_vec_env puts around each
+            assert info.keys() == other.keys()
+            assert info["TimeLimit.truncated"] == other["TimeLimit.truncated"]
+            assert info["coverage"] == other["coverage"] and info["reward_terms"] == other["reward_terms"]
+            if "terminal_observation" in other:
+                ended += 1
+                last, their_last = info["terminal_observation"], other["terminal_observation"]
+                assert all(np.array_equal(last[key], their_last[key]) for key in their_last)
+                assert info["episode_metrics"] == other["episode_metrics"]
+    assert ended >= 6
+    ours.close()
+    theirs.close()
+
+
+def test_what_stable_baselines_asks_of_it() -> None:
+    envs = ExploreVecEnv(2, workers=1, **SETTINGS)
+    envs.reset()
+    assert [config.rooms for config in envs.get_attr("config", [1])] == ["rectangular"]
+    assert envs.env_method("episode_metrics", indices=0)[0]["steps"] == 0
+    assert envs.env_is_wrapped(object) == [False, False]
+    envs.set_attr("mark", 3)
+    assert envs.get_attr("mark") == [3, 3]
+    with pytest.raises(ValueError, match="leave out indices"):
+        envs.set_attr("mark", 3, indices=[0])
+    envs.set_options([{"room_seed": 1}, {"room_seed": 2}])
+    with pytest.raises(ValueError, match="must be the same"):
+        envs.reset()
+    envs.close()

@@ -1,0 +1,116 @@
+"""Many environments at once for stable-baselines3: ``mecanum_env.vector`` in its dress."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+
+import mecanum_env
+from mecanum_env.vector.vector_env import ExploreVectorEnv
+
+__all__ = ["ExploreVecEnv"]
+
+
+class ExploreVecEnv(VecEnv):
+    """:class:`mecanum_env.vector.vector_env.ExploreVectorEnv` as stable-baselines3 wants it.
+
+    An episode that ends is followed by the next in the same step; its last observation is
+    ``infos[k]["terminal_observation"]``, and ``infos[k]`` is its last info. The same bits as with ``DummyVecEnv``.
+
+    Parameters
+    ----------
+    n_envs : int
+        How many environments.
+    seed : int, optional
+        Of the first one's first episode; the others follow.
+    max_episode_steps : int
+        Steps after which an episode is truncated.
+    **settings
+        Those of ``ExploreVectorEnv``.
+    """
+
+    def __init__(
+        self, n_envs: int, *, seed: int | None = None, max_episode_steps: int = mecanum_env.MAX_EPISODE_STEPS,
+        **settings: Any,
+    ) -> None:  # fmt: skip
+        self.envs = ExploreVectorEnv(
+            n_envs, autoreset_mode=AutoresetMode.SAME_STEP, max_episode_steps=max_episode_steps, **settings
+        )
+        self._actions = np.zeros(self.envs.action_space.shape or (), np.float32)
+        super().__init__(n_envs, self.envs.single_observation_space, self.envs.single_action_space)
+        if seed is not None:
+            self.seed(seed)
+
+    def reset(self) -> VecEnvObs:
+        """Start an episode in every environment, with the seeds that :meth:`seed` was given, once."""
+        options = [given or None for given in self._options]
+        if any(given != options[0] for given in options):
+            raise ValueError("ExploreVecEnv: reset options must be the same for every environment")
+        observations, infos = self.envs.reset(seed=self._seeds, options=options[0])
+        self.reset_infos = self._of_each(infos)
+        self._reset_seeds()
+        self._reset_options()
+        return observations
+
+    def step_async(self, actions: NDArray[np.float32]) -> None:
+        """Take the actions ``(n_envs, a)`` of the next step."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step every environment."""
+        observations, rewards, terminated, truncated, infos = self.envs.step(self._actions)
+        final = self._of_each(infos.pop("final_info", {}))
+        last = infos.pop("final_obs", None)
+        each, done = self._of_each(infos), terminated | truncated
+        for k in np.flatnonzero(done).tolist():
+            each[k] = final[k] | {"terminal_observation": last[k]}
+        for info, over, cut in zip(each, terminated.tolist(), truncated.tolist(), strict=True):
+            info["TimeLimit.truncated"] = cut and not over
+        return observations, rewards.astype(np.float32), done, each
+
+    def _of_each(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return every environment's own info of those that Gymnasium keeps as arrays with masks."""
+        each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        for key, values in infos.items():
+            if key.startswith("_") or f"_{key}" not in infos:
+                continue
+            parts = self._of_each(values) if isinstance(values, dict) else values.tolist()
+            for k in np.flatnonzero(infos[f"_{key}"]).tolist():
+                each[k][key] = parts[k]
+        return each
+
+    def close(self) -> None:
+        """Have the workers quit."""
+        self.envs.close()
+
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """Return an attribute of some environments."""
+        values = self.envs.get_attr(attr_name)
+        return [values[k] for k in self._get_indices(indices)]
+
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        """Set an attribute of every environment."""
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError("ExploreVecEnv: set_attr sets an attribute of every environment: leave out indices")
+        self.envs.set_attr(attr_name, value)
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Call a method of every environment; return the results of some."""
+        values = self.envs.call(method_name, *method_args, **method_kwargs)
+        return [values[k] for k in self._get_indices(indices)]
+
+    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
+        """Return that none is in a wrapper."""
+        return [False for _ in self._get_indices(indices)]
+
+    def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
+        """Return a frame of each environment."""
+        return list(self.envs.render() or [])
