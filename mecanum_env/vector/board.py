@@ -41,19 +41,33 @@ class Board:
     """
 
     def __init__(self, context: BaseContext, count: int, observation: spaces.Dict, action: spaces.Box) -> None:
-        def shared(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-            size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-            return np.frombuffer(context.RawArray("b", size), dtype).reshape(shape)
+        self._memory: dict[str, tuple[Any, tuple[int, ...], DTypeLike]] = {}
 
-        self.actions = shared((count, *action.shape), action.dtype)
-        self.observations = {
-            key: shared((count, *box.shape), box.dtype)
-            for key, box in observation.spaces.items()
-            if box.shape is not None and box.dtype is not None
-        }
-        self.rewards = shared((count,), np.float64)
-        self.terminated, self.truncated, self.told, self.paid = (shared((count,), np.bool_) for _ in range(4))
-        self._numbers = shared((count, _COLUMNS), np.float64)
+        def share(name: str, shape: tuple[int, ...], dtype: DTypeLike | None) -> None:
+            size = count * int(np.prod(shape)) * np.dtype(dtype).itemsize
+            self._memory[name] = context.RawArray("b", size), (count, *shape), dtype
+
+        share("actions", action.shape, action.dtype)
+        for key, box in observation.spaces.items():
+            share(f"observation {key}", box.shape or (), box.dtype)
+        share("rewards", (), np.float64)
+        for name in ("terminated", "truncated", "told", "paid"):
+            share(name, (), np.bool_)
+        share("numbers", (_COLUMNS,), np.float64)
+        self.__setstate__(self.__getstate__())
+
+    def __getstate__(self) -> dict[str, tuple[Any, tuple[int, ...], DTypeLike]]:
+        """Return the memory alone: a process that is handed an array gets a copy of it."""
+        return self._memory
+
+    def __setstate__(self, memory: dict[str, tuple[Any, tuple[int, ...], DTypeLike]]) -> None:
+        self._memory = memory
+        arrays = {name: np.frombuffer(raw, dtype).reshape(shape) for name, (raw, shape, dtype) in memory.items()}
+        self.actions, self.rewards, self._numbers = arrays["actions"], arrays["rewards"], arrays["numbers"]
+        self.terminated, self.truncated = arrays["terminated"], arrays["truncated"]
+        self.told, self.paid = arrays["told"], arrays["paid"]
+        prefix = "observation "
+        self.observations = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
     def write(self, row: int, observation: Mapping[str, NDArray[Any]], info: dict[str, Any]) -> dict[str, Any]:
         """Write an environment's observation and info; return what of the info has no place here."""
@@ -64,9 +78,7 @@ class Board:
         x, y, theta = info[_POSE].tolist()
         paid = (0.0,) * len(_TERMS) if terms is None else terms.values()
         self._numbers[row] = (*[info[name] for name in _NUMBERS], info[_WHOLE], x, y, theta, *paid)
-        return (
-            {key: value for key, value in info.items() if key not in _SHARED} if len(info) > len(_SHARED) else {}
-        )
+        return {} if info.keys() <= _SHARED else {k: value for k, value in info.items() if k not in _SHARED}
 
     def infos(self) -> dict[str, Any]:
         """Return the infos of all environments that have one, as Gymnasium's vector environments do."""

@@ -55,6 +55,16 @@ def assert_same(got: Any, want: Any, at: str = "") -> None:
         assert got == want, at
 
 
+@pytest.mark.parametrize("context", ["fork", "forkserver", "spawn"])
+def test_memory_is_shared_however_processes_are_started(context: str) -> None:
+    ours, theirs = batch(2, workers=2, context=context), like(2)
+    assert_same(ours.reset(seed=3), theirs.reset(seed=3))
+    actions = np.full((2, 3), 0.5, np.float32)
+    assert_same(ours.step(actions), theirs.step(actions))
+    ours.close()
+    theirs.close()
+
+
 @pytest.mark.parametrize("workers", [1, 2, 3])
 @pytest.mark.parametrize("mode", list(AutoresetMode))
 def test_every_bit_is_that_of_gymnasium_s_own(mode: AutoresetMode, workers: int) -> None:
