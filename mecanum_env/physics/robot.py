@@ -31,7 +31,7 @@ __all__ = [
     "forward_matrix",
     "inverse_kinematics",
     "motor_constants",
-    "solve_traction",
+    "pull",
     "turn_wheels",
     "wheel_positions",
 ]
@@ -223,7 +223,7 @@ def motor_constants(constants: Array, h: float, m: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve_traction(
+def _solve(
     a: float, b: float, d: float, e: float, f: float, x: float, y: float, z: float
 ) -> tuple[float, float, float]:
     """Solve [[a, b, e], [b, a, f], [e, f, d]] · result = (x, y, z) for a positive definite matrix."""
@@ -233,6 +233,29 @@ def solve_traction(
         scale * (ca * x + cb * y + ce * z),
         scale * (cb * x + (a * d - e * e) * y + cf * z),
         scale * (ce * x + cf * y + (a * a - b * b) * z),
+    )
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def pull(
+    q0: float, q1: float, q2: float, q3: float, g0: float, g1: float, g2: float, g3: float, mass: float,
+    lever_inertia: float,
+) -> tuple[float, float, float]:  # fmt: skip
+    """Return by how much wheels change the body's vx, vy and l ω: (M + ½ Σ g A Aᵀ) Δv = −½ Σ g q A.
+
+    q_i is √2 times wheel i's slip, g_i its impulse per slip; A_i = (1, t_i, ± 1), and M has the inertia over l².
+    """
+    f0, f1, f2, f3 = -0.5 * g0 * q0, -0.5 * g1 * q1, -0.5 * g2 * q2, -0.5 * g3 * q3
+    total = 0.5 * ((g0 + g1) + (g2 + g3))
+    return _solve(
+        mass + total,
+        0.5 * ((g1 - g0) + (g2 - g3)),
+        lever_inertia + total,
+        0.5 * ((g1 - g0) + (g3 - g2)),
+        0.5 * ((g0 + g1) - (g2 + g3)),
+        (f0 + f1) + (f2 + f3),
+        (f1 - f0) + (f2 - f3),
+        (f1 - f0) + (f3 - f2),
     )
 
 
@@ -293,26 +316,14 @@ def turn_wheels(
         ref2, ref3 = ref2 + m[0] * (targets[2] - ref2), ref3 + m[0] * (targets[3] - ref3)
         w0, w1, w2, w3 = _motor(w0, ref0, m), _motor(w1, ref1, m), _motor(w2, ref2, m), _motor(w3, ref3, m)
 
-        # Traction: (M + ½ Σ g A Aᵀ) Δv = −½ Σ g q A, with A_i = (1, t_i, ± 1) and q_i = √2 s_i. Unrolled: the
-        # loop over the wheels ran 1.5 × slower.
+        # Traction, with q_i = √2 s_i. Unrolled: the loop over the wheels ran 1.5 × slower.
         q0, q1 = vx - vy - vl - r0 * w0, vx + vy + vl - r1 * w1
         q2, q3 = vx + vy - vl - r2 * w2, vx - vy + vl - r3 * w3
         g0 = grip0 / (math.sqrt(0.5 * q0 * q0 + s0_squared) + give0)
         g1 = grip1 / (math.sqrt(0.5 * q1 * q1 + s0_squared) + give1)
         g2 = grip2 / (math.sqrt(0.5 * q2 * q2 + s0_squared) + give2)
         g3 = grip3 / (math.sqrt(0.5 * q3 * q3 + s0_squared) + give3)
-        f0, f1, f2, f3 = -0.5 * g0 * q0, -0.5 * g1 * q1, -0.5 * g2 * q2, -0.5 * g3 * q3
-        total = 0.5 * ((g0 + g1) + (g2 + g3))
-        dvx, dvy, dvl = solve_traction(
-            mass + total,
-            0.5 * ((g1 - g0) + (g2 - g3)),
-            lever_inertia + total,
-            0.5 * ((g1 - g0) + (g3 - g2)),
-            0.5 * ((g0 + g1) - (g2 + g3)),
-            (f0 + f1) + (f2 + f3),
-            (f1 - f0) + (f2 - f3),
-            (f1 - f0) + (f3 - f2),
-        )
+        dvx, dvy, dvl = pull(q0, q1, q2, q3, g0, g1, g2, g3, mass, lever_inertia)
         # J (ω' − ω) = −R f h/√2 with f = −k s': the wheel gains what the ground took from the body.
         w0 += g0 * arm0 * (q0 + dvx - dvy - dvl)
         w1 += g1 * arm1 * (q1 + dvx + dvy + dvl)

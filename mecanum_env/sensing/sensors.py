@@ -26,11 +26,11 @@ Array = NDArray[np.float64]
 
 # What encoders remember of the step before, and what stays the same: one array each, since arguments take time.
 _LAST_TWIST, _BODY, _SPEEDS = slice(0, 3), slice(3, 6), slice(6, 10)
-_ON_AND_OFF = 0.5  # share of what slips along that turns a body which may stand with one side on a patch
-_CREEP_ERROR = 0.6  # share of the creep that may be slip, for all that is taken out of it: measured
-
 _SIGMA, _ROLLING, _RADIUS, _SHARE = range(4)
 _CREEP, _TRACTION, _FORWARD = slice(4, 7), slice(7, 11), slice(11, 23)
+
+_ON_AND_OFF = 0.5  # share of what slips along that turns a body which may stand with one side on a patch
+_CREEP_ERROR = 0.6  # share of the creep that may be slip, for all that is taken out of it: measured
 
 
 @njit(cache=True, nogil=True)
@@ -208,7 +208,7 @@ class FilteredEncoders:
 def _read_encoders(
     readings: Array, normals: Array, dt: float, fixed: Array, memory: Array, twist: Array
 ) -> tuple[float, float]:
-    """Write the body's twist, by what is left of the wheels' when slip's mean and creep are taken out.
+    """Write the body's twist: that of the wheels, less what is lost to slip in the mean and to creep.
 
     Each wheel's measured rotation is the true one times 1 + σ normal. Returned is by how much the wheels may have
     outrun the body [m/s, rad/s].

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
-from mecanum_env.physics.robot import GRAVITY_M_S2, solve_traction
+from mecanum_env.physics.robot import GRAVITY_M_S2, pull
 
 __all__ = ["expected_share", "follow", "grip_m_s2", "traction_constants"]
 
@@ -72,7 +72,7 @@ def follow(body: Array, last: Array, now: Array, dt: float, constants: Array, lo
     ahead, aside = abs(x - vx), abs(y - vy) + inertia * abs(turn - vl)
     if ahead + aside > grip * dt:
         h = dt / _PARTS
-        load, quarter_turn = math.sqrt(0.125) * grip * h, 0.5 * h / lever
+        load = math.sqrt(0.125) * grip * h
         for part in range(_PARTS):
             # Speeds of the wheels half way through the part, on the line through the two means.
             f = 0.5 + (part + 0.5) / _PARTS
@@ -82,23 +82,12 @@ def follow(body: Array, last: Array, now: Array, dt: float, constants: Array, lo
             q3 = vx - vy + vl - (last[3] + f * (now[3] - last[3]))
             g0, g1 = load / math.sqrt(0.5 * q0 * q0 + s0 * s0), load / math.sqrt(0.5 * q1 * q1 + s0 * s0)
             g2, g3 = load / math.sqrt(0.5 * q2 * q2 + s0 * s0), load / math.sqrt(0.5 * q3 * q3 + s0 * s0)
-            f0, f1, f2, f3 = -0.5 * g0 * q0, -0.5 * g1 * q1, -0.5 * g2 * q2, -0.5 * g3 * q3
-            total = 0.5 * ((g0 + g1) + (g2 + g3))
-            dvx, dvy, dvl = solve_traction(
-                1.0 + total,
-                0.5 * ((g1 - g0) + (g2 - g3)),
-                inertia + total,
-                0.5 * ((g1 - g0) + (g3 - g2)),
-                0.5 * ((g0 + g1) - (g2 + g3)),
-                (f0 + f1) + (f2 + f3),
-                (f1 - f0) + (f2 - f3),
-                (f1 - f0) + (f3 - f2),
-            )
+            dvx, dvy, dvl = pull(q0, q1, q2, q3, g0, g1, g2, g3, 1.0, inertia)
             lost[0] += h * (x - vx - 0.5 * dvx)
             lost[1] += h * (y - vy - 0.5 * dvy)
             lost[2] += h * (turn - vl - 0.5 * dvl)
             vx, vy, vl = vx + dvx, vy + dvy, vl + dvl
-            angle = 2.0 * quarter_turn * vl
+            angle = h / lever * vl  # by which the body's axes turn under its velocity
             vx, vy = vx + angle * vy, vy - angle * vx
         x, y, turn = vx, vy, vl
     body[0], body[1], body[2] = x, y, turn

@@ -22,6 +22,7 @@ _WHOLE = "collisions"
 _POSE = "true_pose"
 _TERMS = tuple(reward_terms(RewardConfig(), StepOutcome(0.0, 0.0, 0.0, 0, 0.0, 0.0)))
 _COLUMNS = len(_NUMBERS) + 1 + 3 + len(_TERMS)
+_Memory = tuple[Any, tuple[int, ...], DTypeLike | None]  # a RawArray, and how it is read
 _SHARED = {*_NUMBERS, _WHOLE, _POSE, "reward_terms"}
 
 
@@ -41,7 +42,7 @@ class Board:
     """
 
     def __init__(self, context: BaseContext, count: int, observation: spaces.Dict, action: spaces.Box) -> None:
-        self._memory: dict[str, tuple[Any, tuple[int, ...], DTypeLike]] = {}
+        self._memory: dict[str, _Memory] = {}
 
         def share(name: str, shape: tuple[int, ...], dtype: DTypeLike | None) -> None:
             size = count * int(np.prod(shape)) * np.dtype(dtype).itemsize
@@ -56,11 +57,11 @@ class Board:
         share("numbers", (_COLUMNS,), np.float64)
         self.__setstate__(self.__getstate__())
 
-    def __getstate__(self) -> dict[str, tuple[Any, tuple[int, ...], DTypeLike]]:
+    def __getstate__(self) -> dict[str, _Memory]:
         """Return the memory alone: a process that is handed an array gets a copy of it."""
         return self._memory
 
-    def __setstate__(self, memory: dict[str, tuple[Any, tuple[int, ...], DTypeLike]]) -> None:
+    def __setstate__(self, memory: dict[str, _Memory]) -> None:
         self._memory = memory
         arrays = {name: np.frombuffer(raw, dtype).reshape(shape) for name, (raw, shape, dtype) in memory.items()}
         self.actions, self.rewards, self._numbers = arrays["actions"], arrays["rewards"], arrays["numbers"]
