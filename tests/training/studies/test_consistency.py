@@ -81,7 +81,8 @@ def test_the_noise_is_what_the_filter_is_told(name: str) -> None:
     np.testing.assert_allclose(e.var(axis=0), [var_v, var_v, var_w], rtol=0.12)
     np.testing.assert_allclose(o.var(axis=0), np.diag(world.observation_cov), rtol=0.08)
     assert np.all(np.abs(e.mean(axis=0)) < 4 * np.sqrt([var_v, var_v, var_w]) / math.sqrt(len(e)))
-    assert noise.slip((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), world.dt)[0] * noise.slip_share == 0.0
+    slip, _ = noise.slip((0.0, 0.0, 0.0), (9.0, 0.0, 0.0), world.dt)
+    assert noise.variances(0.3, 0.0, 0.1, slip=slip) == (var_v, var_w)  # nothing slips there
 
 
 def true_twist(before: np.ndarray, after: np.ndarray, dt: float) -> np.ndarray:
