@@ -280,5 +280,5 @@ def found_cov() -> Array:
 
 
 _NOT_COPIED = {
-    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_doubtful", "_recovers",
+    "config", "extractor", "grid", "key_scans", "recovery", "witness", "_given", "_doubtful", "_recovers",
 }  # fmt: skip

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
 
-__all__ = ["Belief"]
+__all__ = ["Belief", "point_covs"]
 
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
+def point_covs(cov: Array) -> Array:
+    """Return the landmarks' own covariances ``(n, 2, 2)``, of a joint one ``(3 + 2n, 3 + 2n)``."""
+    rows = 3 + np.arange(len(cov) - 3).reshape(-1, 2)
+    return cov[rows[:, :, None], rows[:, None, :]]
+
+
+_COVARIANCES = ("landmark_cov", "joint_cov", "whole_cov")
+
+
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class Belief:
     """What a backend believes now, in the frame of its start. Arrays are copies; the grid is live."""
 
@@ -32,3 +43,34 @@ class Belief:
     line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]
     health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)
+    _read: Callable[[], Array] | None = field(default=None, repr=False, compare=False)  # see postponed
+
+    @classmethod
+    def postponed(cls, read: Callable[[], Array], **known: Any) -> Belief:
+        """Return a belief whose three covariances are read when first asked for.
+
+        Those of a large map take long to copy, and most who are given a belief never look at them. ``read``
+        returns ``whole_cov``; whoever gave the belief calls :meth:`settle` before that becomes another.
+        """
+        belief = cls(landmark_cov=np.zeros(0), _read=read, **known)
+        for name in _COVARIANCES:
+            object.__delattr__(belief, name)
+        return belief
+
+    def settle(self) -> None:
+        """Read what was postponed."""
+        if self._read is None:
+            return
+        whole, points = self._read(), 3 + 2 * len(self.landmarks)
+        joint = whole[:points, :points].copy() if len(whole) > points else whole
+        for name, value in zip((*_COVARIANCES, "_read"), (point_covs(joint), joint, whole, None), strict=True):
+            object.__setattr__(self, name, value)
+
+    if not TYPE_CHECKING:  # to a type checker it would say that there is any attribute
+
+        def __getattr__(self, name: str) -> Any:
+            """Read what was postponed: called where an attribute is not there."""
+            if name not in _COVARIANCES:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            self.settle()
+            return getattr(self, name)

@@ -22,9 +22,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfConfig, EkfSlam
+from slam.belief import Belief
+from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose, read_block, state_rows, symmetric_block
 from slam.gaussian.lanes import aligned_zeros
+from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, solve
 from slam.gaussian.tiles import add_combination, downdate, product, subtract
 from slam.landmarks.book import MARKS
@@ -221,6 +223,13 @@ class CompressedEkfSlam(EkfSlam):
         self._map_ids[: len(ids)], self._map_marks[: len(ids)] = ids, marks
 
     # ---- the belief ----------------------------------------------------------------------------------------
+
+    @property
+    def belief(self) -> Belief:
+        """Pose, landmarks, joint covariance and grid."""
+        self.flush()
+        self._write_back()
+        return super().belief
 
     def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         self.flush()

@@ -7,20 +7,21 @@ downdate of the triangle; a scan's own cost is linear in the landmarks but for t
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import BackendConfig, found_cov
+from slam.backend import found_cov
 from slam.belief import Belief
 from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.lanes import aligned_zeros
+from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
-from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, LandmarkPolicy, count_recent, match_and_recall
+from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
@@ -28,49 +29,13 @@ from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import Twist, predict_robot
-from slam.settings import require, unknown_name
 from slam.types import LINE, Observations, Odometry, Scan
 
-__all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig", "EkfSlam"]
+__all__ = ["EkfSlam"]
 
 Array = NDArray[np.float64]
 
 _WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
-
-ASSOCIATIONS = ("nearest", "individual", "joint")
-"""How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
-within the gate; or as many as one pose can explain together (JCBB)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EkfConfig(BackendConfig):
-    """EKF-SLAM: gating and landmark management."""
-
-    association: str = "nearest"  # or "individual", "joint": see ASSOCIATIONS
-    gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
-    known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
-    max_turn_deg: float = 35.0  # difference in a corner's direction
-    loop_sigma_m: float = math.inf  # old landmarks expected no better than to this count only together
-    lines: bool = False  # take straight walls for landmarks, too (theory.md A)
-    landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.gate > 0 and self.known_gate > 0, "EkfConfig.gate and known_gate must be > 0")
-        if self.association not in ASSOCIATIONS:
-            raise unknown_name("EkfConfig.association", self.association, ASSOCIATIONS)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EkfLinesConfig(EkfConfig):
-    """EKF-SLAM over walls and what corners say beside them."""
-
-    lines: bool = True
-    # What two landmarks could have made is left alone: a wall's corners lie close together, and one taken for
-    # another bends the map. Over apartments of the training seeds 100-149 at three times the noise, the average
-    # pose NEES/3 was 1.15 with the nearest and 1.00 so; at nominal noise the error was the same.
-    association: str = "individual"
-    loop_sigma_m: float = 0.02  # ledges at doors stand apart by a few times that
 
 
 class EkfSlam(LandmarkBackend):
@@ -81,6 +46,7 @@ class EkfSlam(LandmarkBackend):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
+        self._given: list[weakref.ref[Belief]] = []  # beliefs, since the state last changed
         self.witness: Callable[[list[Innovation]], object] | None = None  # told of every correction before it
         self._max_turn = math.radians(c.max_turn_deg)
         self._curved = curvature_model(c.features)
@@ -89,6 +55,7 @@ class EkfSlam(LandmarkBackend):
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         del seed  # nothing here is drawn
+        self._settle_beliefs()
         self._noise = self.config.odometry
         self._n, self._x = 3, np.zeros(3 + 2 * 32)
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
@@ -104,6 +71,7 @@ class EkfSlam(LandmarkBackend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
+        self._settle_beliefs()
         self._move(odometry.dt, *self._measured(odometry, self._noise))
 
     def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
@@ -124,6 +92,7 @@ class EkfSlam(LandmarkBackend):
 
     def _take(self, z: Array, scan: Scan | None) -> None:
         """Match observations, of a scan or not, correct by them and keep the book of landmarks."""
+        self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
         if scan is not None and self._out_of_sight(*self._recall):
@@ -155,6 +124,7 @@ class EkfSlam(LandmarkBackend):
 
     def _take_known(self, z: Array, ids: list[int]) -> None:
         """Correct by observations of these landmarks, but those that cannot be theirs, and add new ones."""
+        self._settle_beliefs()
         doubting = self.config.known_gate < math.inf
         if doubting:
             self._drop_misplaced()
@@ -316,6 +286,7 @@ class EkfSlam(LandmarkBackend):
         return self._x
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
+        self._settle_beliefs()
         joint.place(self._x, self._p, self._n, pose, pose_cov)
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
@@ -381,20 +352,25 @@ class EkfSlam(LandmarkBackend):
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
         marks = self._marks
         rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
-        whole = self._covariance(np.concatenate([rows, lines]))
         points, _ = self._map_points()
-        points_cov = whole[: 3 + 2 * len(rows), : 3 + 2 * len(rows)].copy() if len(lines) else whole
-        return Belief(
+        belief = Belief.postponed(
+            lambda: self._covariance(np.concatenate([rows, lines])),
             pose=self.pose,
-            pose_cov=points_cov[:3, :3].copy(),
+            pose_cov=self.pose_cov,
             landmarks=points[rows],
-            landmark_cov=joint.point_covs(points_cov),
             landmark_ids=self._ids[rows],
             grid=self.grid,
             health=self.health,
-            joint_cov=points_cov,
             landmark_kinds=marks[rows, 0].astype(np.int8),
             lines=points[lines],
             line_ends=joint.line_ends(points[lines], marks[lines, 6:8]),
-            whole_cov=whole,
         )
+        self._given.append(weakref.ref(belief))
+        return belief
+
+    def _settle_beliefs(self) -> None:
+        """Have the beliefs that were given, and that someone still holds, read what changes now."""
+        for given in self._given:
+            if (belief := given()) is not None:
+                belief.settle()
+        self._given.clear()

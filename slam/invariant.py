@@ -15,8 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfLinesConfig, EkfSlam
+from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import landmark_by_pose
+from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate
 from slam.gaussian.wheel_errors import WheelErrors

@@ -9,8 +9,9 @@ from slam.backend import Backend, BackendConfig
 from slam.compressed import CompressedEkfConfig, CompressedEkfSlam
 from slam.dead_reckoning import OdometrySlam, TruthSlam
 from slam.dp_slam import DpSlam, DpSlamConfig
-from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
+from slam.ekf import EkfSlam
 from slam.fastslam import FastSlam1, FastSlam2, FastSlamConfig
+from slam.gaussian.settings import EkfConfig, EkfLinesConfig
 from slam.graph.graph_slam import GraphSlam
 from slam.graph.settings import GraphSlamConfig
 from slam.invariant import InvariantEkfConfig, InvariantEkfSlam

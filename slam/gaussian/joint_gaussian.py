@@ -26,7 +26,6 @@ __all__ = [
     "line_ends",
     "near_landmarks",
     "place",
-    "point_covs",
     "read_block",
     "state_rows",
     "symmetric_block",
@@ -174,12 +173,6 @@ def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64
     """Return the state's indices of landmarks, after the robot's three if wanted."""
     rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
     return np.concatenate([np.arange(3), rows]) if robot else rows
-
-
-def point_covs(cov: Array) -> Array:
-    """Return the landmarks' own covariances ``(n, 2, 2)``, of a joint one ``(3 + 2n, 3 + 2n)``."""
-    rows = 3 + np.arange(len(cov) - 3).reshape(-1, 2)
-    return cov[rows[:, :, None], rows[:, None, :]]
 
 
 def line_ends(lines: Array, extent: Array) -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.gaussian.joint_gaussian import point_covs
+from slam.belief import point_covs
 from slam.particles.maps import innovation
 
 __all__ = ["InheritedError", "beyond", "common_descent"]

@@ -370,7 +370,8 @@ def test_the_pose_nees_is_that_of_pose_and_covariance(name: str) -> None:
 
 def test_a_backend_of_ones_own_is_registered_once_under_its_name(monkeypatch):
     from slam import registry
-    from slam.ekf import EkfConfig, EkfLinesConfig, EkfSlam
+    from slam.ekf import EkfSlam
+    from slam.gaussian.settings import EkfConfig, EkfLinesConfig
 
     monkeypatch.setattr(registry, "_BACKENDS", dict(registry._BACKENDS))
     slam.register("mine", EkfSlam, EkfConfig)
