@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from slam.backend import found_cov
 from slam.belief import Belief
 from slam.gaussian import joint_gaussian as joint
+from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
@@ -28,7 +29,7 @@ from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, j
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
-from slam.motion import Twist, predict_robot
+from slam.motion import Twist
 from slam.types import LINE, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
@@ -64,8 +65,13 @@ class EkfSlam(LandmarkBackend):
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, len(self._x))
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
+        self._beside = self._companions()
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
+
+    def _companions(self) -> Companions:
+        """Return the states beside the map."""
+        return Companions(len(self._match), len(self._x))
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -76,7 +82,7 @@ class EkfSlam(LandmarkBackend):
 
     def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Predict by a twist of the body."""
-        predict_robot(self._x, self._p, self._n, *twist, dt, var_v, var_w)
+        self._beside.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
 
     def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
@@ -227,8 +233,10 @@ class EkfSlam(LandmarkBackend):
         return usual
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
-        """Correct by a match; return how well the scan fits the map from there."""
+        """Correct by a match; return how well the scan fits the map from there. It is only a trial."""
+        kept = self._beside.snapshot()
         self._correct(z, match)
+        self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
@@ -245,6 +253,7 @@ class EkfSlam(LandmarkBackend):
         self.nis_dof, self.nis = stacked_update(
             self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, limits
         )
+        self._beside.correct(self._n, match, self._h, self._w, self._s, self.nis_dof)
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
@@ -260,7 +269,9 @@ class EkfSlam(LandmarkBackend):
     def _add(self, z: Array, known_id: int | None) -> None:
         if self._n + 2 > len(self._x):
             self._enlarge()
-        joint.add_landmark(self._x, self._p, self._n, z, self.config.lidar_offset_m)
+        offset = self.config.lidar_offset_m
+        self._beside.add(self._n, joint.landmark_by_pose(self._x, z, offset))
+        joint.add_landmark(self._x, self._p, self._n, z, offset)
         direction = float(z[DIRECTION]) + float(self._x[2])
         sensor_x, sensor_y, _ = self.sensor_pose().tolist()
         along = along_wall(sensor_x, sensor_y, direction)
@@ -271,6 +282,7 @@ class EkfSlam(LandmarkBackend):
 
     def _drop(self, row: int) -> None:
         """Take a landmark out of the state: marginalisation is leaving out its rows and columns."""
+        self._beside.drop(self._n, 3 + 2 * row)
         joint.leave_out(self._x, self._p, self._n, 3 + 2 * row)
         self._n -= 2
         self._book.drop(row)
@@ -281,6 +293,7 @@ class EkfSlam(LandmarkBackend):
         x[:n], p[:n, :n] = self._x[:n], self._p[:n, :n]
         self._x, self._p = x, p
         self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
+        self._beside.enlarge(size)
 
     def _foreseen(self, scan: Scan) -> Array:
         return self._x
@@ -288,6 +301,7 @@ class EkfSlam(LandmarkBackend):
     def _place(self, pose: Array, pose_cov: Array) -> None:
         self._settle_beliefs()
         joint.place(self._x, self._p, self._n, pose, pose_cov)
+        self._beside.forget_pose()
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
         """Go on from a pose ``(3,)`` that a scan was found to be taken from.

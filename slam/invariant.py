@@ -16,15 +16,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.ekf import EkfSlam
-from slam.gaussian.joint_gaussian import landmark_by_pose
+from slam.gaussian.companions import Companions
 from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
-from slam.motion import Twist
-from slam.types import LINE, Odometry, Scan
+from slam.types import LINE, Odometry
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -55,67 +54,37 @@ class InvariantEkfSlam(EkfSlam):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
+
+    def _companions(self) -> Companions:
         noise = self.config.odometry
-        self._wheels: WheelErrors | None = None
-        if noise.lasting is not None and self.config.wheel_states:
-            self._noise = noise.white()
-            self._wheels = WheelErrors(noise.lasting, noise.lever_m, len(self._match), len(self._x))
+        if noise.lasting is None or not self.config.wheel_states:
+            return super()._companions()
+        self._noise = noise.white()
+        return WheelErrors(noise.lasting, noise.lever_m, len(self._match), len(self._x))
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured, less what they are known to be off by."""
-        if self._wheels is not None:
-            odometry = Odometry(self._wheels.corrected(odometry.numbers), odometry.dt, odometry.slip)
+        if isinstance(self._beside, WheelErrors):
+            odometry = Odometry(self._beside.corrected(odometry.numbers), odometry.dt, odometry.slip)
         super().predict(odometry)
-
-    def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
-        if self._wheels is None:
-            super()._move(dt, twist, var_v, var_w)
-        else:
-            self._wheels.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         n, w = self._n, self._w
-        rows, self.nis = invariant_update(
+        self.nis_dof, self.nis = invariant_update(
             self._x, self._p, n, z, match, self.config.lidar_offset_m, self._book.marks, self._h, w, self._s,
             self._delta, limits,
         )  # fmt: skip
-        self.nis_dof = rows
-        if self._wheels is not None and rows:
-            self._wheels.correct(n, match, self._h, w, self._s, rows)
-
-    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
-        kept = None if self._wheels is None else self._wheels.snapshot()
-        value = super()._fit(z, match, scan)
-        if self._wheels is not None and kept is not None:  # this correction is only a trial
-            self._wheels.restore(kept)
-        return value
-
-    def _add(self, z: Array, known_id: int | None) -> None:
-        n = self._n
-        super()._add(z, known_id)
-        if self._wheels is not None:
-            self._wheels.add(n, landmark_by_pose(self._x, z, self.config.lidar_offset_m))
-
-    def _drop(self, row: int) -> None:
-        if self._wheels is not None:
-            self._wheels.drop(self._n, 3 + 2 * row)
-        super()._drop(row)
-
-    def _place(self, pose: Array, pose_cov: Array) -> None:
-        super()._place(pose, pose_cov)
-        if self._wheels is not None:
-            self._wheels.forget_pose()
+        self._beside.correct(n, match, self._h, w, self._s, self.nis_dof, reset=True)
 
     def _enlarge(self) -> None:
         super()._enlarge()
         self._delta = np.zeros(len(self._x))
-        if self._wheels is not None:
-            self._wheels.enlarge(len(self._x))
 
     @property
     def wheel_errors(self) -> tuple[Array, Array] | None:
         """Relative errors of the four radii and the lever ``(5,)`` and their covariance; ``None`` if no states."""
-        return None if self._wheels is None else (self._wheels.mean.copy(), self._wheels.cov.copy())
+        own = self._beside.own
+        return (self._beside.mean[:own].copy(), self._beside.cov[:own, :own].copy()) if own else None
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""

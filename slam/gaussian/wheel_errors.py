@@ -6,14 +6,12 @@ as they are, the twist is
 
     u = ũ + B(ũ) e,   B's column of wheel i: uᵢ/4 (1, yᵢ, tᵢ/l),  of the lever: (0, 0, ω)
 
-ũ being the twist that the wheels claim and uᵢ = vx + yᵢ vy + tᵢ l ω how fast wheel i rolls. e is correlated with
-the robot and every landmark. Its own covariance E and the cross-covariance C stand beside P:
+ũ being the twist that the wheels claim and uᵢ = vx + yᵢ vy + tᵢ l ω how fast wheel i rolls. As states beside the
+map (:mod:`slam.gaussian.companions`) of covariance E and cross-covariance C they make prediction
 
-    predict   C_r ← C_r Fxᵀ + E Dᵀ,   P_rm += D C_m,   P_rr += D C_r Fxᵀ + (D C_r Fxᵀ)ᵀ + D E Dᵀ,   D = Fu B
-    update    W_e = L⁻¹ H Cᵀ,   e += W_eᵀ L⁻¹ ν,   C −= W_eᵀ W,   E −= W_eᵀ W_e
+    C_r ← C_r Fxᵀ + E Dᵀ,   P_rm += D C_m,   P_rr += D C_r Fxᵀ + (D C_r Fxᵀ)ᵀ + D E Dᵀ,   D = Fu B
 
-(theory.md A with the state enlarged; W and L are :mod:`slam.gaussian.stacked_update`'s). Driving one way
-shows one combination of the four radii; twists in all three components show all five errors.
+Driving one way shows one combination of the four radii; twists in all three components show all five errors.
 """
 
 from __future__ import annotations
@@ -24,9 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.gaussian.lanes import LANES, aligned_zeros
-from slam.gaussian.stacked_update import SPARE_ROWS, solve
-from slam.gaussian.tiles import add_combination, subtract
+from slam.gaussian.companions import Companions
 from slam.motion import LastingErrors, Twist, predict_robot
 
 __all__ = ["WheelErrors"]
@@ -39,25 +35,15 @@ _SIDE = np.array([-1.0, 1.0, 1.0, -1.0])
 _TURN = np.array([-1.0, 1.0, -1.0, 1.0])
 
 
-class WheelErrors:
+class WheelErrors(Companions):
     """Estimates of the five errors, and how they hang together with everything else."""
 
     def __init__(self, declared: LastingErrors, lever_m: float, observations: int, size: int) -> None:
+        cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
+        cov[:4, :4] += declared.difference_sigma**2 * np.outer(_TURN, _TURN)
+        super().__init__(observations, size, cov)
         self._lever_m = lever_m
-        self.mean = np.zeros(_STATES)
-        self.cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
-        self.cov[:4, :4] += declared.difference_sigma**2 * np.outer(_TURN, _TURN)
-        self.cross = aligned_zeros(_STATES, size)  # C: of each error with the robot and the landmarks
-        self._w = aligned_zeros(2 * observations, 2 * LANES)  # W_e; solve takes two vectors of a row at a time
         self._b = np.zeros((3, _STATES))
-
-    def snapshot(self) -> tuple[Array, Array, Array]:
-        """Return what :meth:`restore` takes."""
-        return self.mean.copy(), self.cov.copy(), self.cross.copy()
-
-    def restore(self, kept: tuple[Array, Array, Array]) -> None:
-        """Go back to what was kept."""
-        self.mean[:], self.cov[:], self.cross[:] = kept
 
     def corrected(self, twist: Twist) -> Twist:
         """Return the twist of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""
@@ -67,28 +53,6 @@ class WheelErrors:
     def predict(self, x: Array, p: Array, n: int, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Do :func:`slam.motion.predict_robot` with a twist that was :meth:`corrected` last, errors included."""
         _predict(x, p, n, self.cross, self.cov, self._b, *twist, dt, var_v, var_w)
-
-    def correct(self, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array, rows: int) -> None:
-        """Correct by an update of :func:`slam.invariant.invariant_update`, and go along with its reset."""
-        _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows)
-
-    def add(self, n: int, gr: Array) -> None:
-        """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""
-        self.cross[:, n : n + 2] = self.cross[:, :3] @ gr.T
-
-    def drop(self, n: int, i: int) -> None:
-        """Leave out the two states from ``i`` on."""
-        self.cross[:, i : n - 2] = self.cross[:, i + 2 : n].copy()
-
-    def forget_pose(self) -> None:
-        """Have the errors say nothing of the robot's pose, as when it is forgotten."""
-        self.cross[:, :3] = 0.0
-
-    def enlarge(self, size: int) -> None:
-        """Make room for a larger state."""
-        cross = aligned_zeros(_STATES, size)
-        cross[:, : self.cross.shape[1]] = self.cross
-        self.cross = cross
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -119,14 +83,15 @@ def _predict(
         d[0, i] = c * b[0, i] - s * b[1, i] + 0.5 * dt * fx * b[2, i]
         d[1, i] = s * b[0, i] + c * b[1, i] + 0.5 * dt * fy * b[2, i]
         d[2, i] = dt * b[2, i]
+    for i in range(cross.shape[0]):
         cross[i, 0] += fx * cross[i, 2]
         cross[i, 1] += fy * cross[i, 2]
     for q in range(3):
         for i in range(_STATES):
             for j in range(3, n):
                 p[q, j] += d[q, i] * cross[i, j]
-    ed = np.zeros((_STATES, 3))  # E Dᵀ
-    for i in range(_STATES):
+    ed = np.zeros((cross.shape[0], 3))  # E Dᵀ
+    for i in range(cross.shape[0]):
         for q in range(3):
             for j in range(_STATES):
                 ed[i, q] += cov[i, j] * d[q, j]
@@ -135,39 +100,3 @@ def _predict(
             for i in range(_STATES):
                 p[q, r] += d[q, i] * (cross[i, r] + ed[i, r]) + cross[i, q] * d[r, i]
     cross[:, :3] += ed
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _correct(
-    mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
-    we: Array, rows: int,
-) -> None:  # fmt: skip
-    """W_e = L⁻¹ H Cᵀ, e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
-    a = 0
-    for k in range(match.shape[0]):
-        if match[k] < 0:
-            continue
-        m = 3 + 2 * match[k]
-        for e in range(2):
-            g = h[a // 2, e]
-            for i in range(_STATES):
-                c = cross[i]
-                we[a + e, i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3] * c[m] + g[4] * c[m + 1]
-        a += 2
-    solve(s, we, _STATES, rows)
-    add_combination(mean, _STATES, s[:rows, rows], we)
-    subtract(cross, _STATES, n, we, w, rows)
-    for i in range(_STATES):
-        for j in range(_STATES):
-            for k in range(rows):
-                cov[i, j] -= we[k, i] * we[k, j]
-    _reset(cross, n, w[rows : rows + SPARE_ROWS : 2])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _reset(cross: Array, n: int, a: Array) -> None:
-    """C ← C (I + A S)ᵀ, S taking θ, x and y, and ``a`` A's columns by these (invariant-ekf.md, Reset)."""
-    for i in range(_STATES):
-        theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
-        for j in range(n):
-            cross[i, j] += theta * a[0, j] + x * a[1, j] + y * a[2, j]

@@ -82,11 +82,10 @@ def test_equals_one_dense_filter_of_everything() -> None:
     points = np.array([[2.0, 1.0], [-1.5, 2.0], [0.5, -2.5], [3.0, -1.0]])
     filter_ = backend()
     filter_.reset((0.3, -0.2, 0.4), pose_cov=np.diag([0.01, 0.02, 0.005]))
-    assert filter_._wheels is not None
     x, e = np.array([0.3, -0.2, 0.4]), np.zeros(5)
     p = np.zeros((8, 8))  # pose, errors, then landmarks
     p[:3, :3] = np.diag([0.01, 0.02, 0.005])
-    p[3:, 3:] = filter_._wheels.cov
+    p[3:, 3:] = filter_._beside.cov
     white = NOISE.white()
     truth = x + np.array([0.05, -0.05, 0.03])
     wheels = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8)
@@ -151,11 +150,11 @@ def test_equals_one_dense_filter_of_everything() -> None:
         p = reset @ p @ reset.T
         x, known, e = after[:3], after[3:].reshape(-1, 2), e + delta[3:8]
     np.testing.assert_allclose(filter_.pose, x, atol=1e-8)
-    np.testing.assert_allclose(filter_._wheels.mean, e, atol=1e-8)
-    np.testing.assert_allclose(filter_._wheels.cov, p[3:8, 3:8], atol=1e-9)
+    np.testing.assert_allclose(filter_._beside.mean, e, atol=1e-8)
+    np.testing.assert_allclose(filter_._beside.cov, p[3:8, 3:8], atol=1e-9)
     rows = np.r_[0:3, 8 : len(p)]
     np.testing.assert_allclose(filter_.joint_cov, p[np.ix_(rows, rows)], atol=1e-8)
-    np.testing.assert_allclose(filter_._wheels.cross[:, : len(rows)], p[3:8][:, rows], atol=1e-8)
+    np.testing.assert_allclose(filter_._beside.cross[:, : len(rows)], p[3:8][:, rows], atol=1e-8)
     assert np.sqrt(np.diag(p)[3:8]).max() < 0.02  # and something was learnt
 
 
@@ -167,7 +166,6 @@ def test_errors_are_found_and_their_covariance_is_right() -> None:
         points = rng.uniform(-6, 6, (12, 2))
         filter_ = backend()
         filter_.reset((0.0, 0.0, 0.0))
-        assert filter_._wheels is not None
         wheels = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8)
         wheels.mean[:] = errors
         truth, white = np.zeros(3), NOISE.white()
@@ -178,9 +176,9 @@ def test_errors_are_found_and_their_covariance_is_right() -> None:
             filter_.predict(Odometry(twist, 0.1))
             z = seen(truth, points) + rng.normal(0, [0.02, 0.01], (12, 2))
             filter_.observe(Observations(z, np.tile(R, (12, 1, 1)), np.arange(12)))
-        off = filter_._wheels.mean - errors
-        nees.append(off @ np.linalg.solve(filter_._wheels.cov, off) / 5)
-        learnt.append(np.sqrt(np.diag(filter_._wheels.cov)))
+        off = filter_._beside.mean - errors
+        nees.append(off @ np.linalg.solve(filter_._beside.cov, off) / 5)
+        learnt.append(np.sqrt(np.diag(filter_._beside.cov)))
     assert np.mean(learnt, axis=0).max() < 0.008
     assert np.mean(nees) == pytest.approx(1.0, abs=3 * math.sqrt(2 / 5 / 120))
 
@@ -198,7 +196,7 @@ def test_update_and_reset_with_walls_are_those_of_one_large_state() -> None:
         got, p = x.copy(), np.triu(joint[:9, :9])
         h, w, s = work_space(3, 9)
         rows, _ = invariant_update(got, p, 9, z, np.arange(3), OFFSET, marks, h, w, s, np.zeros(9))
-        wheels.correct(9, np.arange(3), h, w, s, rows)
+        wheels.correct(9, np.arange(3), h, w, s, rows, reset=True)
         gamma = transform(got) @ np.linalg.inv(transform(x))
         np.testing.assert_allclose(wheels.mean, plain_x[9:14], atol=1e-12)
         np.testing.assert_allclose(wheels.cov, plain_p[9:14, 9:14], atol=1e-12)
@@ -239,9 +237,9 @@ def test_a_trial_leaves_no_trace() -> None:
     z = filter_.extractor.with_walls()
     match = filter_._associate(z).copy()
     assert np.count_nonzero(match >= 0) >= 2 and np.abs(filter_.wheel_errors[0]).max() > 1e-4
-    before = filter_._wheels.snapshot()
+    before = filter_._beside.snapshot()
     filter_._fit(z, match, scan)
-    for kept, now in zip(before, filter_._wheels.snapshot(), strict=True):
+    for kept, now in zip(before, filter_._beside.snapshot(), strict=True):
         np.testing.assert_array_equal(kept, now)
 
 
@@ -252,18 +250,18 @@ def test_landmarks_come_and_go_with_their_correlations() -> None:
     filter_.observe(
         Observations(many, np.tile(R, (40, 1, 1)), np.arange(1000, 1040))
     )  # more than there was room for
-    n, pose_rows = filter_._n, filter_._wheels.cross[:, :3].copy()
+    n, pose_rows = filter_._n, filter_._beside.cross[:, :3].copy()
     theta = float(filter_.pose[2])
     last = many[-1, 1] + theta
     rx, ry = np.array([math.cos(theta), math.sin(theta)]) * OFFSET + many[-1, 0] * np.array(
         [math.cos(last), math.sin(last)]
     )
     gr = np.array([[1.0, 0.0, -ry], [0.0, 1.0, rx]])
-    np.testing.assert_allclose(filter_._wheels.cross[:, n - 2 : n], pose_rows @ gr.T, atol=1e-12)
-    before = filter_._wheels.cross[:, :n].copy()
+    np.testing.assert_allclose(filter_._beside.cross[:, n - 2 : n], pose_rows @ gr.T, atol=1e-12)
+    before = filter_._beside.cross[:, :n].copy()
     assert np.all(np.any(before != 0.0, axis=0))
     filter_._drop(5)
-    np.testing.assert_array_equal(filter_._wheels.cross[:, : n - 2], np.delete(before, [13, 14], axis=1))
+    np.testing.assert_array_equal(filter_._beside.cross[:, : n - 2], np.delete(before, [13, 14], axis=1))
 
 
 def test_wheels_of_two_sides_that_differ_bend_a_straight_way_and_do_nothing_else() -> None:
