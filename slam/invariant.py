@@ -15,15 +15,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.ekf import EkfSlam
+from slam.compressed import CompressedEkfConfig, CompressedEkfSlam, read_rows
 from slam.gaussian.companions import Companions
+from slam.gaussian.joint_gaussian import state_rows
+from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
-from slam.gaussian.tiles import add_combination, downdate
+from slam.gaussian.tiles import add_combination, downdate, product
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
-from slam.types import LINE, Odometry
+from slam.types import LINE, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -33,17 +35,22 @@ _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since wall
 
 
 @dataclass(frozen=True, kw_only=True)
-class InvariantEkfConfig(EkfLinesConfig):
-    """Right-invariant EKF-SLAM over walls and corners."""
+class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
+    """Right-invariant EKF-SLAM over walls and corners, in regions where the map is large."""
+
+    leave_share: float = 1.5  # larger regions than its parent's: another one takes as long as a hundred steps
+    whole_up_to: int = 300
+    rank_tolerance: float = 1e-6
 
     wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
 
 
-class InvariantEkfSlam(EkfSlam):
+class InvariantEkfSlam(CompressedEkfSlam):
     """The right-invariant EKF-SLAM backend, ``invariant-ekf``.
 
     Where the odometry's noise says what of it lasts, the wheels' errors are states, too
-    (slam.gaussian.wheel_errors).
+    (slam.gaussian.wheel_errors). What is far is moved, and its covariance reset, once a region: by the sum of what
+    was corrected meanwhile.
     """
 
     config: InvariantEkfConfig
@@ -54,6 +61,7 @@ class InvariantEkfSlam(EkfSlam):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
+        self._turned = 0.0  # [rad] the heading's corrections since the region was entered
 
     def _companions(self) -> Companions:
         noise = self.config.odometry
@@ -75,10 +83,53 @@ class InvariantEkfSlam(EkfSlam):
             self._delta, limits,
         )  # fmt: skip
         self._beside.correct(n, match, self._h, w, self._s, self.nis_dof, reset=True)
+        if self.nis_dof:
+            self._turned += float(self._delta[2])
+
+    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
+        turned = self._turned
+        value = super()._fit(z, match, scan)
+        self._turned = turned
+        return value
 
     def _enlarge(self) -> None:
         super()._enlarge()
         self._delta = np.zeros(len(self._x))
+
+    # ---- what is far ---------------------------------------------------------------------------------------
+
+    def _enter(self) -> None:
+        super()._enter()
+        self._turned = 0.0
+
+    def _far_states(self) -> Array:
+        return self._retracted()[0]
+
+    def _retracted(self) -> tuple[Array, Array]:
+        """Return the map's state after retraction by all that the region corrected, and A's columns ``(3, n)``."""
+        x, far = self._map_x.copy(), state_rows(self._far, robot=False)
+        delta, columns = super()._far_states() - x, np.zeros((3, len(x)))
+        x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
+        _retract(x, int(far.max()) + 1, delta, self._map_marks, columns)
+        a = np.zeros_like(columns)
+        a[:, far] = columns[:, far]
+        return x, a
+
+    def _merge(self, x: Array, p: Array, own: Array) -> None:
+        if not len(self._far):
+            super()._merge(x, p, own)
+            return
+        _, a = self._retracted()
+        super()._merge(x, p, own)
+        # The reset of what is far, as in invariant_update.
+        size, columns, robot = len(p), a.shape[1], [2, 0, 1]
+        rows, pairs = np.empty((3, size)), aligned_zeros(6, size)
+        read_rows(p, np.arange(3), rows)
+        pairs[::2, :columns] = a
+        pairs[1::2, :size] = -rows[robot]
+        pairs[1::2, :columns] -= product(0.5 * rows[np.ix_(robot, robot)], a, columns)[:, :columns]
+        downdate(p, size, pairs, pairs, 0, 3)
+        own += product(self._beside.cross[: len(own), robot], a, columns)[:, : own.shape[1]]
 
     @property
     def wheel_errors(self) -> tuple[Array, Array] | None:

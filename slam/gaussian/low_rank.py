@@ -33,7 +33,7 @@ def factor(cov: Array, row_sigma: Array, column_sigma: Array, tolerance: float) 
     basis, samples = np.eye(m), _SAMPLES
     while samples < m:
         sums = np.random.default_rng(0).standard_normal((n, samples)) / column_sigma[:, None]
-        found = _orthonormal(product(scaled, sums, samples)[:, :samples].T.copy(), tolerance)
+        found = _orthonormal(product(scaled[:, :n], sums, samples)[:, :samples].T.copy(), tolerance)
         if len(found) < samples:
             basis = found.T
             break
