@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,17 +25,25 @@ def grove(seed: int, count: int = 120) -> np.ndarray:
     return np.column_stack([rng.uniform(-4, 36, count), rng.uniform(-3, 3, count)])
 
 
-def compare(full: slam.Belief, compressed: slam.Belief) -> None:
-    """The two beliefs agree to 1e-9, whatever the order of their landmarks."""
+def compare(full: slam.Belief, compressed: slam.Belief, *, sigmas: float = 0.0) -> None:
+    """The two beliefs agree to 1e-9, or to so many of their own σ's, whatever the order of their landmarks."""
     assert sorted(compressed.landmark_ids) == sorted(full.landmark_ids)
-    np.testing.assert_allclose(compressed.pose, full.pose, atol=1e-9)
-    np.testing.assert_allclose(compressed.pose_cov, full.pose_cov, atol=1e-9)
+    if not sigmas:
+        np.testing.assert_allclose(compressed.pose, full.pose, atol=1e-9)
+        np.testing.assert_allclose(compressed.pose_cov, full.pose_cov, atol=1e-9)
     by_id = []
     for belief in (full, compressed):
         order = np.argsort(belief.landmark_ids)
         rows = np.concatenate([np.arange(3), np.column_stack([3 + 2 * order, 4 + 2 * order]).ravel()])
         assert belief.joint_cov is not None
         by_id.append((belief.landmarks[order], belief.landmark_cov[order], belief.joint_cov[np.ix_(rows, rows)]))
+    if sigmas:
+        (means, _, cov), (same_means, _, same_cov) = by_id
+        scale = np.sqrt(np.diag(cov))
+        off = np.concatenate([compressed.pose - full.pose, (same_means - means).ravel()])
+        assert np.abs(off / scale).max() < sigmas
+        assert np.abs((same_cov - cov) / np.outer(scale, scale)).max() < sigmas
+        return
     for one, two in zip(*by_id, strict=True):
         np.testing.assert_allclose(two, one, atol=1e-9)
 
@@ -70,14 +79,16 @@ def test_it_is_the_full_filter(look_every: int) -> None:
 
 
 def through_the_grove(
-    landmarks: np.ndarray, backends: tuple[Backend, ...], seed: int, steps: int
+    landmarks: np.ndarray, backends: tuple[Backend, ...], seed: int, steps: int, turn_at: int | None = None
 ) -> Iterator[np.ndarray]:
-    """Drive straight on, all backends told the same; yield the true pose after each step."""
+    """Drive straight on, and back where asked for, all told the same; yield the true pose after each step."""
     rng, pose = np.random.default_rng(seed), np.zeros(3)
     for backend in backends:
         backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
-    for _ in range(steps):
-        pose, odometry = drive(pose, np.array([0.8, 0.0, 0.0]), (0.02, 0.02), rng, dt=0.3)
+    for k in range(steps):
+        turning = turn_at is not None and turn_at <= k < turn_at + 3
+        twist = np.array([0.0, 0.0, math.pi / 0.9]) if turning else np.array([0.8, 0.0, 0.0])
+        pose, odometry = drive(pose, twist, (0.02, 0.02), rng, dt=0.3)
         seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
         for backend in backends:
             backend.predict(odometry)
@@ -112,6 +123,30 @@ def test_the_place_of_a_dropped_landmark_is_taken_again() -> None:
     assert len(np.unique(np.concatenate([compressed._near, compressed._far]))) == compressed.landmark_count
     assert len(compressed._far) > 20
     compare(full.belief, compressed.belief)
+
+
+LASTING = {
+    "odometry": {
+        "speed_share": 0.05,
+        "turn_share_rad_m": 0.05,
+        "lasting": {"radius_sigma": 0.02, "lever_sigma": 0.02},
+    }
+}
+WHOLE, REGIONS = {"whole_up_to": 10**6}, {"whole_up_to": 0, "leave_share": 0.5, "rank_tolerance": 1e-10}
+
+
+@pytest.mark.parametrize("wheels", [{}, LASTING])
+def test_the_invariant_filter_is_the_same_in_regions(wheels: dict[str, Any]) -> None:
+    """It moves what is far, and resets its covariance, once a region: to second order that is no difference."""
+    whole, regional = (slam.make("invariant-ekf", config={**wheels, **c}) for c in (WHOLE, REGIONS))
+    for k, _ in enumerate(through_the_grove(grove(6), (whole, regional), 6, 240, turn_at=120)):
+        if k % 60 == 59:
+            compare(whole.belief, regional.belief, sigmas=0.01)
+    assert regional._book.count < 0.6 * whole._book.count
+    if wheels:
+        (mean, cov), (same_mean, same_cov) = whole.wheel_errors, regional.wheel_errors
+        np.testing.assert_allclose(same_mean, mean, atol=0.01 * np.sqrt(np.diag(cov)).min())
+        np.testing.assert_allclose(same_cov, cov, rtol=0.01, atol=1e-8)
 
 
 @pytest.mark.parametrize("lines", [False, True])

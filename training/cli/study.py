@@ -34,6 +34,7 @@ STUDIES = {
         "training.studies.recovery.command",
         "faults made mid-episode: is the belief lost, does it know, is it found again?",
     ),
+    "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
     "recording-cost": ("training.studies.recording_cost", "what recording an episode takes"),
 }
 """Name → the module whose function ``study`` it is, and a line for the list."""

@@ -1,0 +1,37 @@
+"""``mecanum study scale`` on a small plan: figures by area, a picture, and going on where it stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from tests.training.plans import write_room
+from training.cli import main
+from training.studies import scale
+
+
+def test_a_room_is_explored_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan, out = write_room(tmp_path / "hall.png"), tmp_path / "out"
+    command = ["study", "scale", str(plan), "--agent", "nearest-frontier", "--out", str(out)]
+    assert main(command) == 0
+    (found,) = json.loads((out / "scale.json").read_text())
+    assert found["plan"] == "hall" and found["coverage"] > 0.95 and found["collisions"] == 0
+    (row,) = found["rows"]
+    assert 5.0 < row["area_m2"] < found["area_m2"] + 2.0
+    assert row["steps"] == round(found["time_s"] / 0.1)
+    assert row["step_ms"]["median"] < row["decision_ms"]["median"] <= row["decision_ms"]["p99"]
+    picture = cv2.imread(str(out / "hall_nearest-frontier.png"))
+    assert picture is not None and picture.shape[1] > 500
+    monkeypatch.setattr(scale, "explore", None)  # it is all there
+    assert main(command) == 0
+
+
+def test_what_was_typed_wrong_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", "scale", str(tmp_path / "none.yaml"), "--out", str(tmp_path)]) == 2
+    assert "no such file" in capsys.readouterr().err
+    plan = write_room(tmp_path / "hall.png")
+    assert main(["study", "scale", str(plan), "--agent", "brisk", "--out", str(tmp_path)]) == 2
+    assert "brisk-tour" in capsys.readouterr().err
