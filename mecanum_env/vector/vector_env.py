@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from functools import partial
 from multiprocessing.connection import Connection
@@ -57,6 +57,9 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         Steps after which an episode is truncated.
     context : str, optional
         How processes are started (``"fork"``, ``"forkserver"``, ``"spawn"``); the platform's way if left out.
+    make : callable, optional
+        Makes one of them, instead of settings: an environment around an ``ExploreEnv``, that hands on its infos.
+        It is called in the processes, so they must be able to import it.
     **settings
         Those of :class:`mecanum_env.env.ExploreEnv`.
 
@@ -75,6 +78,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         copy: bool = True,
         max_episode_steps: int | None = None,
         context: str | None = None,
+        make: Callable[[], gymnasium.Env[Any, Any]] | None = None,
         **settings: Any,
     ) -> None:
         super().__init__()
@@ -82,7 +86,12 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         for name, value in (("num_envs", num_envs), ("workers", cores if workers is None else workers)):
             if value < 1:
                 raise ValueError(f"{name} must be at least 1, got {value}")
-        like = ExploreEnv(**settings)  # tells what is wrong with the settings before any process is started
+        if make is not None and settings:
+            raise ValueError(
+                f"settings are what make gives its environments: {', '.join(settings)} is one too many"
+            )
+        make = make or partial(_make, settings)
+        like = make()  # tells what is wrong with the settings before any process is started
         observation, action = cast("spaces.Dict", like.observation_space), cast("spaces.Box", like.action_space)
         mode = AutoresetMode(autoreset_mode)
         self.num_envs, self.copy = num_envs, copy
@@ -93,7 +102,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         self.action_space = batch_space(action, num_envs)
         processes = multiprocessing.get_context(context)
         self._board = Board(processes, num_envs, observation, action)
-        make = partial(_make, max_episode_steps, settings)
+        make = partial(_limited, make, max_episode_steps)
         shares = np.array_split(np.arange(num_envs), min(cores if workers is None else workers, num_envs))
         self._rows = [share.tolist() for share in shares]
         self._own: Share | None = Share(make, self._board, 0, len(self._rows[0]), mode)
@@ -224,6 +233,11 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         return infos
 
 
-def _make(max_episode_steps: int | None, settings: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    env: gymnasium.Env[Any, Any] = ExploreEnv(**deepcopy(settings))
-    return env if max_episode_steps is None else TimeLimit(env, max_episode_steps)
+def _make(settings: dict[str, Any]) -> gymnasium.Env[Any, Any]:
+    return ExploreEnv(**deepcopy(settings))
+
+
+def _limited(
+    make: Callable[[], gymnasium.Env[Any, Any]], max_episode_steps: int | None
+) -> gymnasium.Env[Any, Any]:
+    return make() if max_episode_steps is None else TimeLimit(make(), max_episode_steps)

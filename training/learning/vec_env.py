@@ -29,15 +29,15 @@ class ExploreVecEnv(VecEnv):
         How many environments.
     seed : int, optional
         Of the first one's first episode; the others follow.
-    max_episode_steps : int
-        Steps after which an episode is truncated.
+    max_episode_steps : int, optional
+        Steps after which an episode is truncated; None where environments see to that themselves.
     **settings
         Those of ``ExploreVectorEnv``.
     """
 
     def __init__(
-        self, n_envs: int, *, seed: int | None = None, max_episode_steps: int = mecanum_env.MAX_EPISODE_STEPS,
-        **settings: Any,
+        self, n_envs: int, *, seed: int | None = None,
+        max_episode_steps: int | None = mecanum_env.MAX_EPISODE_STEPS, **settings: Any,
     ) -> None:  # fmt: skip
         self.envs = ExploreVectorEnv(
             n_envs, autoreset_mode=AutoresetMode.SAME_STEP, max_episode_steps=max_episode_steps, **settings

@@ -2,13 +2,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit, TransformAction
 
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv
 
+from mecanum_env.env import ExploreEnv
 from training.learning.vec_env import ExploreVecEnv
 
 ID = "mecanum_env:mecanum_env/Explore-v0"
@@ -48,6 +52,29 @@ def test_every_bit_is_that_of_stable_baselines_own() -> None:
     assert ended >= 6
     ours.close()
     theirs.close()
+
+
+def _turned() -> gymnasium.Env[Any, Any]:
+    env = ExploreEnv(rooms="rectangular", slam="ekf")
+    return TransformAction(TimeLimit(env, 8), lambda action: action[::-1], env.action_space)
+
+
+def test_worlds_of_ones_own_are_those_of_stable_baselines_dummy() -> None:
+    ours, theirs = ExploreVecEnv(3, make=_turned, workers=2, max_episode_steps=None), DummyVecEnv([_turned] * 3)
+    for envs in (ours, theirs):
+        envs.seed(5)
+        envs.reset()
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        actions = rng.uniform(-1, 1, (3, 3)).astype(np.float32)
+        (got, rewards, *_), (want, their_rewards, *_) = ours.step(actions), theirs.step(actions)
+        assert isinstance(got, dict) and isinstance(want, dict)
+        assert all(np.array_equal(got[key], want[key]) for key in want)
+        np.testing.assert_array_equal(rewards, their_rewards)
+    for envs in (ours, theirs):
+        envs.close()
+    with pytest.raises(ValueError, match="rooms is one too many"):
+        ExploreVecEnv(3, make=_turned, rooms="maze")
 
 
 def test_what_stable_baselines_asks_of_it() -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load_file, save
-from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import VecMonitor
 
 from agents.learned.drive_network import DriveNetwork
 from slam.formats import atomic_write, replacing
@@ -26,6 +26,8 @@ from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork
 from training.learning.end_to_end.ppo import DrivePolicy, DriveWorld, make_model
 from training.learning.end_to_end.rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
 from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, words
+from training.learning.vec_env import ExploreVecEnv
+from training.runs.campaign import one_thread_each
 
 __all__ = ["DriveRun", "summary"]
 
@@ -111,7 +113,12 @@ class DriveRun(FolderRun):
     def _practise(self, pool: ProcessPoolExecutor) -> None:
         config, ppo = self.config, self.config.ppo
         network = DriveNetwork(self.weights, config.planning, uncertainty=config.uncertainty)
-        env = VecMonitor(DummyVecEnv([partial(DriveWorld, config.world, network)] * ppo.environments))
+        world = partial(DriveWorld, config.world, network)
+        with one_thread_each():
+            envs = ExploreVecEnv(
+                ppo.environments, make=world, workers=self._workers, max_episode_steps=None, context="spawn"
+            )
+        env = VecMonitor(envs)
         try:
             model = make_model(config, env)
             policy = cast("DrivePolicy", model.policy)
