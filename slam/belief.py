@@ -22,6 +22,7 @@ def point_covs(cov: Array) -> Array:
     return cov[rows[:, :, None], rows[:, None, :]]
 
 
+_LANDMARKS = ("landmarks", "landmark_ids", "landmark_kinds", "lines", "line_ends")
 _COVARIANCES = ("landmark_cov", "joint_cov", "whole_cov")
 
 
@@ -43,34 +44,46 @@ class Belief:
     line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]
     health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)
-    _read: Callable[[], Array] | None = field(default=None, repr=False, compare=False)  # see postponed
+    _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array]] | None = field(
+        default=None, repr=False, compare=False
+    )
 
     @classmethod
-    def postponed(cls, read: Callable[[], Array], **known: Any) -> Belief:
-        """Return a belief whose three covariances are read when first asked for.
+    def postponed(
+        cls, landmarks: Callable[[], dict[str, Any]], whole_cov: Callable[[], Array], **known: Any
+    ) -> Belief:
+        """Return a belief whose landmarks, walls and their covariances are read when first asked for.
 
-        Those of a large map take long to copy, and most who are given a belief never look at them. ``read``
-        returns ``whole_cov``; whoever gave the belief calls :meth:`settle` before that becomes another.
+        Those of a large map take long to copy, and most who are given a belief never look at them. Whoever gave
+        the belief calls :meth:`settle` before the estimate becomes another.
         """
-        belief = cls(landmark_cov=np.zeros(0), _read=read, **known)
-        for name in _COVARIANCES:
+        later: Any = None
+        belief = cls(
+            landmarks=later, landmark_cov=later, landmark_ids=later, _read=(landmarks, whole_cov), **known
+        )
+        for name in (*_LANDMARKS, *_COVARIANCES):
             object.__delattr__(belief, name)
         return belief
 
     def settle(self) -> None:
         """Read what was postponed."""
-        if self._read is None:
-            return
-        whole, points = self._read(), 3 + 2 * len(self.landmarks)
-        joint = whole[:points, :points].copy() if len(whole) > points else whole
-        for name, value in zip((*_COVARIANCES, "_read"), (point_covs(joint), joint, whole, None), strict=True):
-            object.__setattr__(self, name, value)
+        if self._read is not None:
+            for name in (_LANDMARKS[0], _COVARIANCES[0]):
+                getattr(self, name)
+            object.__setattr__(self, "_read", None)
 
     if not TYPE_CHECKING:  # to a type checker it would say that there is any attribute
 
         def __getattr__(self, name: str) -> Any:
             """Read what was postponed: called where an attribute is not there."""
-            if name not in _COVARIANCES:
+            if name in _LANDMARKS:
+                values = self._read[0]()
+            elif name in _COVARIANCES:
+                whole, points = self._read[1](), 3 + 2 * len(self.landmarks)
+                joint = whole[:points, :points].copy() if len(whole) > points else whole
+                values = dict(zip(_COVARIANCES, (point_covs(joint), joint, whole), strict=True))
+            else:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-            self.settle()
-            return getattr(self, name)
+            for key, value in values.items():
+                object.__setattr__(self, key, value)
+            return values[name]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -364,23 +365,26 @@ class EkfSlam(LandmarkBackend):
     @property
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
-        marks = self._marks
-        rows, lines = np.flatnonzero(marks[:, 0] != LINE), np.flatnonzero(marks[:, 0] == LINE)
-        points, _ = self._map_points()
         belief = Belief.postponed(
-            lambda: self._covariance(np.concatenate([rows, lines])),
-            pose=self.pose,
-            pose_cov=self.pose_cov,
-            landmarks=points[rows],
-            landmark_ids=self._ids[rows],
-            grid=self.grid,
-            health=self.health,
-            landmark_kinds=marks[rows, 0].astype(np.int8),
-            lines=points[lines],
-            line_ends=joint.line_ends(points[lines], marks[lines, 6:8]),
-        )
+            self._landmarks, lambda: self._covariance(np.concatenate(self._points_and_walls())), pose=self.pose,
+            pose_cov=self.pose_cov, grid=self.grid, health=self.health,
+        )  # fmt: skip
         self._given.append(weakref.ref(belief))
         return belief
+
+    def _points_and_walls(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows of both among all landmarks."""
+        walls = self._marks[:, 0] == LINE
+        return np.flatnonzero(~walls), np.flatnonzero(walls)
+
+    def _landmarks(self) -> dict[str, Any]:
+        """Return what the belief says of landmarks, but for their covariance."""
+        marks, (points, _), (rows, walls) = self._marks, self._map_points(), self._points_and_walls()
+        return {
+            "landmarks": points[rows], "landmark_ids": self._ids[rows],
+            "landmark_kinds": marks[rows, 0].astype(np.int8), "lines": points[walls],
+            "line_ends": joint.line_ends(points[walls], marks[walls, 6:8]),
+        }  # fmt: skip
 
     def _settle_beliefs(self) -> None:
         """Have the beliefs that were given, and that someone still holds, read what changes now."""

@@ -1,4 +1,4 @@
-"""Beliefs whose covariances are read when asked for: they stay what they were when they were given."""
+"""Beliefs whose landmarks and covariances are read when asked for: they stay what they were when they were given."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import pytest
 import slam
 from slam.types import Observations, Odometry
 
-FIELDS = ("pose", "pose_cov", "landmarks", "landmark_cov", "joint_cov", "whole_cov")
+FIELDS = (
+    "pose", "pose_cov", "landmarks", "landmark_ids", "lines", "landmark_cov", "joint_cov", "whole_cov"
+)  # fmt: skip
 
 
 def _backend(name: str) -> slam.Backend:
