@@ -11,19 +11,14 @@ from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
 
-__all__ = ["Belief", "point_covs"]
+__all__ = ["Belief"]
 
 Array = NDArray[np.float64]
 
 
-def point_covs(cov: Array) -> Array:
-    """Return the landmarks' own covariances ``(n, 2, 2)``, of a joint one ``(3 + 2n, 3 + 2n)``."""
-    rows = 3 + np.arange(len(cov) - 3).reshape(-1, 2)
-    return cov[rows[:, :, None], rows[:, None, :]]
-
-
-_LANDMARKS = ("landmarks", "landmark_ids", "landmark_kinds", "lines", "line_ends")
-_COVARIANCES = ("landmark_cov", "joint_cov", "whole_cov")
+_POSTPONED = (
+    "landmarks", "landmark_ids", "landmark_kinds", "lines", "line_ends", "landmark_cov", "joint_cov", "whole_cov",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)
@@ -44,14 +39,15 @@ class Belief:
     line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]
     health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)
-    _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array]] | None = field(
+    _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array], Callable[[], Array]] | None = field(
         default=None, repr=False, compare=False
-    )
+    )  # see postponed
 
     @classmethod
     def postponed(
-        cls, landmarks: Callable[[], dict[str, Any]], whole_cov: Callable[[], Array], **known: Any
-    ) -> Belief:
+        cls, landmarks: Callable[[], dict[str, Any]], landmark_cov: Callable[[], Array],
+        whole_cov: Callable[[], Array], **known: Any,
+    ) -> Belief:  # fmt: skip
         """Return a belief whose landmarks, walls and their covariances are read when first asked for.
 
         Those of a large map take long to copy, and most who are given a belief never look at them. Whoever gave
@@ -59,16 +55,17 @@ class Belief:
         """
         later: Any = None
         belief = cls(
-            landmarks=later, landmark_cov=later, landmark_ids=later, _read=(landmarks, whole_cov), **known
-        )
-        for name in (*_LANDMARKS, *_COVARIANCES):
+            landmarks=later, landmark_cov=later, landmark_ids=later, _read=(landmarks, landmark_cov, whole_cov),
+            **known,
+        )  # fmt: skip
+        for name in _POSTPONED:
             object.__delattr__(belief, name)
         return belief
 
     def settle(self) -> None:
         """Read what was postponed."""
         if self._read is not None:
-            for name in (_LANDMARKS[0], _COVARIANCES[0]):
+            for name in _POSTPONED:
                 getattr(self, name)
             object.__setattr__(self, "_read", None)
 
@@ -76,14 +73,19 @@ class Belief:
 
         def __getattr__(self, name: str) -> Any:
             """Read what was postponed: called where an attribute is not there."""
-            if name in _LANDMARKS:
-                values = self._read[0]()
-            elif name in _COVARIANCES:
-                whole, points = self._read[1](), 3 + 2 * len(self.landmarks)
-                joint = whole[:points, :points].copy() if len(whole) > points else whole
-                values = dict(zip(_COVARIANCES, (point_covs(joint), joint, whole), strict=True))
-            else:
+            if name not in _POSTPONED:
                 raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            landmarks, landmark_cov, whole_cov = self._read
+            if name == "landmark_cov":
+                values = {name: landmark_cov()}
+            elif name in ("joint_cov", "whole_cov"):
+                whole, points = whole_cov(), 3 + 2 * len(self.landmarks)
+                values = {
+                    "joint_cov": whole[:points, :points].copy() if len(whole) > points else whole,
+                    "whole_cov": whole,
+                }
+            else:
+                values = landmarks()
             for key, value in values.items():
                 object.__setattr__(self, key, value)
             return values[name]

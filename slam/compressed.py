@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -32,7 +32,7 @@ from slam.landmarks.book import MARKS
 from slam.settings import require
 from slam.types import LINE, Observations, Scan
 
-__all__ = ["CompressedEkfConfig", "CompressedEkfSlam", "read_rows"]
+__all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,15 @@ class CompressedEkfConfig(EkfConfig):
         require(self.margin_m >= 0, "CompressedEkfConfig.margin_m must be ≥ 0")
         require(self.whole_up_to >= 0, "CompressedEkfConfig.whole_up_to must be ≥ 0")
         require(self.rank_tolerance > 0, "CompressedEkfConfig.rank_tolerance must be > 0")
+
+
+class Change(NamedTuple):
+    """What a region's corrections make of the rest of the map. The first columns are the map's own."""
+
+    x: Array  # (n,) the map's state; what is far is up to date
+    left: Array  # (k, ≥ n) L and …
+    right: Array  # (k, ≥ n) … R: the covariance of what is far gains Lᵀ R
+    own: Array  # (own, ≥ n) covariance of the states beside the map with what is far
 
 
 class CompressedEkfSlam(EkfSlam):
@@ -165,29 +174,39 @@ class CompressedEkfSlam(EkfSlam):
             self._enlarge_map(1 + 2 * (3 * needed // 4))  # odd: three of the robot, two a landmark
         if self.recovery.kept is not None and self.recovery.kept["_map_p"] is self._map_p:
             self._map_p = _copied(self._map_p)
-        self._merge(self._map_x, self._map_p, self._map_own)
+        change = self._change()
+        self._write(self._map_p, change)
+        self._map_x[b], self._map_own[:, b] = change.x[b], change.own[:, b]
         self._map_x[a], self._map_own[:, a] = self._x[: self._n], self._beside.cross[: self._beside.own, : self._n]
         self._map_ids[self._near], self._map_marks[self._near] = self._book.ids, self._book.marks
 
-    def _merge(self, x: Array, p: Array, own: Array) -> None:
-        """Write what the region has become, and what that makes of the rest, into the map's state and covariance.
+    def _change(self) -> Change:
+        """Return what the region's corrections make of the rest."""
+        y, v, k = self._beside, self._v, self._beside.own
+        end = int(state_rows(self._far, robot=True).max()) + 1
+        size = max(end, int(state_rows(self._near, robot=True).max()) + 1)
+        change = Change(
+            self._map_x.copy(), aligned_zeros(len(v), size), aligned_zeros(len(v), size),
+            np.zeros((k, max(size, len(self._map_x)))),
+        )  # fmt: skip
+        if len(v):
+            add_combination(change.x, end, y.mean[k:], v)
+            change.left[:, :end] = v[:, :end]
+            change.right[:, :end] = product(y.cov[k:, k:], v, end)[:, :end]
+            change.own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
+        return change
 
-        What ``x`` and ``own`` have of the region itself stays as it is.
-        """
+    def _cross(self, rows: int) -> Array:
+        """Return the covariance ``(rows, n)`` of the region's first states with what is far; 0 with the others."""
+        return product(self._beside.cross[self._beside.own :, :rows].T, self._v, self._v.shape[1])
+
+    def _write(self, p: Array, change: Change) -> None:
+        """Write what region and rest have become into the map's covariance."""
         a, b = state_rows(self._near, robot=True), state_rows(self._far, robot=False)
-        y, v, k, size = self._beside, self._v, self._beside.own, int(b.max(initial=-1)) + 1
-        cross = product(y.cross[k:, : self._n].T, v, size)
-        if size:
-            x[b] = self._far_states()[b]
-            downdate(p, size, v, product(-y.cov[k:, k:], v, size), len(v), 0)
-            own[:, b] = product(y.cov[:k, k:], v, size)[:, b]
-        _write_rows(p, a, b, self._p, cross)
-
-    def _far_states(self) -> Array:
-        """Return the map's state, of which what is far is up to date."""
-        x, beside = self._map_x.copy(), self._beside
-        add_combination(x, int(state_rows(self._far, robot=True).max()) + 1, beside.mean[beside.own :], self._v)
-        return x
+        _write_rows(p, a, b, self._p, self._cross(self._n))
+        if len(b):
+            size = max(int(a.max()), int(b.max())) + 1
+            downdate(p, size, change.left, -change.right, len(change.left), 0)
 
     def _enter(self) -> None:
         """Begin to filter the region, a few numbers standing for what is far."""
@@ -197,7 +216,7 @@ class CompressedEkfSlam(EkfSlam):
         n = self._n = len(a)
         self._x[:n] = self._map_x[a]
         rows = np.empty((n, int(max(a.max(), b.max(initial=0))) + 1))
-        read_rows(self._map_p, a, rows)
+        _read_rows(self._map_p, a, rows)
         self._p[:n, :n] = rows[:, a]
         beside = self._beside
         beside.part()
@@ -232,10 +251,20 @@ class CompressedEkfSlam(EkfSlam):
         size = max(int(rows.max()) + 1, len(self._map_p))
         p = aligned_zeros(size, size)
         p[: len(self._map_p), : len(self._map_p)] = self._map_p[:, : len(self._map_p)]
-        self._merge(self._map_x.copy(), p, self._map_own.copy())
+        self._write(p, self._change())
         out = np.empty((len(rows), len(rows)))
         read_block(p, rows, out)
         return out
+
+    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+        near = landmarks[landmarks < self._book.count]
+        far = self._far[landmarks[len(near) :] - self._book.count]
+        covs = super()._own_covariances(near)
+        if not len(far):
+            return covs
+        change, others = self._change(), np.empty((len(far), 2, 2))
+        _far_blocks(self._map_p, change.left, change.right, far, others)
+        return np.concatenate([covs, others])
 
     @property
     def landmark_count(self) -> int:
@@ -257,9 +286,8 @@ class CompressedEkfSlam(EkfSlam):
         ids = self._ids
         row_of_id = np.full(max(len(self._book.row_of_id), int(ids.max(initial=0)) + 1), -1, np.int64)
         row_of_id[ids] = np.arange(len(ids))
-        return np.concatenate(
-            [self._points, self._far_states()[state_rows(self._far, robot=False)].reshape(-1, 2)]
-        ), row_of_id
+        far = self._change().x[state_rows(self._far, robot=False)].reshape(-1, 2)
+        return np.concatenate([self._points, far]), row_of_id
 
 
 def _distance(x: Array, marks: Array, px: float, py: float) -> Array:
@@ -281,7 +309,7 @@ def _copied(p: Array) -> Array:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def read_rows(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+def _read_rows(p: Array, rows: NDArray[np.int64], out: Array) -> None:
     """Write rows of the symmetric matrix whose upper triangle is p, as many columns as ``out`` has."""
     for k in range(rows.shape[0]):
         i = rows[k]
@@ -300,3 +328,16 @@ def _write_rows(p: Array, a: NDArray[np.int64], b: NDArray[np.int64], block: Arr
             p[min(i, a[e]), max(i, a[e])] = block[k, e]
         for j in b:
             p[min(i, j), max(i, j)] = cross[k, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _far_blocks(p: Array, left: Array, right: Array, places: NDArray[np.int64], out: Array) -> None:
+    """Write the covariances ``(m, 2, 2)`` of landmarks by themselves: P's, and what Lᵀ R adds."""
+    for k in range(places.shape[0]):
+        i = 3 + 2 * places[k]
+        for e in range(2):
+            for f in range(e, 2):
+                total = p[i + e, i + f]
+                for q in range(left.shape[0]):
+                    total += left[q, i + e] * right[q, i + f]
+                out[k, e, f] = out[k, f, e] = total

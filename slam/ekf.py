@@ -353,6 +353,11 @@ class EkfSlam(LandmarkBackend):
         joint.read_block(self._p, rows, out)
         return out
 
+    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+        """Return the covariances ``(n, 2, 2)`` of some landmarks, each by itself."""
+        i, p = 3 + 2 * landmarks, self._p
+        return np.stack([p[i, i], p[i, i + 1], p[i, i + 1], p[i + 1, i + 1]], axis=-1).reshape(-1, 2, 2)
+
     @property
     def _ids(self) -> NDArray[np.int64]:
         """Ids ``(n,)`` of every landmark."""
@@ -366,8 +371,9 @@ class EkfSlam(LandmarkBackend):
     def belief(self) -> Belief:
         """Pose, landmarks, joint covariance (of pose and points) and grid."""
         belief = Belief.postponed(
-            self._landmarks, lambda: self._covariance(np.concatenate(self._points_and_walls())), pose=self.pose,
-            pose_cov=self.pose_cov, grid=self.grid, health=self.health,
+            self._landmarks, lambda: self._own_covariances(self._points_and_walls()[0]),
+            lambda: self._covariance(np.concatenate(self._points_and_walls())),
+            pose=self.pose, pose_cov=self.pose_cov, grid=self.grid, health=self.health,
         )  # fmt: skip
         self._given.append(weakref.ref(belief))
         return belief

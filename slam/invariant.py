@@ -15,10 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.compressed import CompressedEkfConfig, CompressedEkfSlam, read_rows
+from slam.compressed import Change, CompressedEkfConfig, CompressedEkfSlam
 from slam.gaussian.companions import Companions
-from slam.gaussian.joint_gaussian import state_rows
-from slam.gaussian.lanes import aligned_zeros
+from slam.gaussian.joint_gaussian import state_rows, symmetric_block
 from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate, product
@@ -102,34 +101,27 @@ class InvariantEkfSlam(CompressedEkfSlam):
         super()._enter()
         self._turned = 0.0
 
-    def _far_states(self) -> Array:
-        return self._retracted()[0]
-
-    def _retracted(self) -> tuple[Array, Array]:
-        """Return the map's state after retraction by all that the region corrected, and A's columns ``(3, n)``."""
-        x, far = self._map_x.copy(), state_rows(self._far, robot=False)
-        delta, columns = super()._far_states() - x, np.zeros((3, len(x)))
+    def _change(self) -> Change:
+        """Return what the region's corrections make of the rest, its retraction and reset included."""
+        change = super()._change()
+        if not len(self._far):
+            return change
+        far, size = state_rows(self._far, robot=False), change.left.shape[1]
+        x, delta, columns = self._map_x.copy(), change.x - self._map_x, np.zeros((3, len(change.x)))
         x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
         _retract(x, int(far.max()) + 1, delta, self._map_marks, columns)
-        a = np.zeros_like(columns)
+        a, robot = np.zeros((3, size)), [2, 0, 1]
         a[:, far] = columns[:, far]
-        return x, a
-
-    def _merge(self, x: Array, p: Array, own: Array) -> None:
-        if not len(self._far):
-            super()._merge(x, p, own)
-            return
-        _, a = self._retracted()
-        super()._merge(x, p, own)
-        # The reset of what is far, as in invariant_update.
-        size, columns, robot = len(p), a.shape[1], [2, 0, 1]
-        rows, pairs = np.empty((3, size)), aligned_zeros(6, size)
-        read_rows(p, np.arange(3), rows)
-        pairs[::2, :columns] = a
-        pairs[1::2, :size] = -rows[robot]
-        pairs[1::2, :columns] -= product(0.5 * rows[np.ix_(robot, robot)], a, columns)[:, :columns]
-        downdate(p, size, pairs, pairs, 0, 3)
-        own += product(self._beside.cross[: len(own), robot], a, columns)[:, : own.shape[1]]
+        # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
+        u, cross = np.zeros((3, size)), self._cross(3)
+        u[:, : cross.shape[1]] = cross
+        region = np.empty((self._n, self._n))
+        symmetric_block(self._p, region)
+        u[:, state_rows(self._near, robot=True)] = region[:3]
+        u = u[robot] + product(0.5 * region[np.ix_(robot, robot)], a, size)
+        own = change.own.copy()
+        own[:, :size] += product(self._beside.cross[: len(own), robot], a, size)[:, : own.shape[1]]
+        return Change(x, np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)
 
     @property
     def wheel_errors(self) -> tuple[Array, Array] | None:

@@ -17,7 +17,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.belief import point_covs
 from slam.particles.maps import innovation
 
 __all__ = ["InheritedError", "beyond", "common_descent"]
@@ -90,7 +89,8 @@ class InheritedError:
 
     def of_landmarks(self) -> Array:
         """Return the landmarks' own covariances ``(n, 2, 2)``."""
-        return point_covs(self.cov)
+        cov, rows = self.cov, np.arange(3, self._size).reshape(-1, 2)
+        return np.asarray(cov[rows[:, :, None], rows[:, None, :]])
 
 
 def common_descent(origin: Indices, weights: Array) -> float:

@@ -1,4 +1,4 @@
-"""Beliefs whose landmarks and covariances are read when asked for: they stay what they were when they were given."""
+"""Beliefs whose landmarks and covariances are read when asked for: they stay what they were when given."""
 
 from __future__ import annotations
 

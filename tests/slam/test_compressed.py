@@ -36,6 +36,9 @@ def compare(full: slam.Belief, compressed: slam.Belief, *, sigmas: float = 0.0) 
         order = np.argsort(belief.landmark_ids)
         rows = np.concatenate([np.arange(3), np.column_stack([3 + 2 * order, 4 + 2 * order]).ravel()])
         assert belief.joint_cov is not None
+        for i, cov in enumerate(belief.landmark_cov):
+            block = belief.joint_cov[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i]
+            np.testing.assert_allclose(cov, block, rtol=1e-7, atol=1e-12)
         by_id.append((belief.landmarks[order], belief.landmark_cov[order], belief.joint_cov[np.ix_(rows, rows)]))
     if sigmas:
         (means, _, cov), (same_means, _, same_cov) = by_id
