@@ -114,7 +114,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         a[:, far] = columns[:, far]
         # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
         u, cross = np.zeros((3, size)), self._cross(3)
-        u[:, : cross.shape[1]] = cross
+        u[:, far] = cross[:, far]
         region = np.empty((self._n, self._n))
         symmetric_block(self._p, region)
         u[:, state_rows(self._near, robot=True)] = region[:3]
