@@ -20,8 +20,7 @@ from agents.view_points.frontiers import FrontierConfig, Frontiers, find, fronti
 from agents.view_points.gain import expected_area
 from agents.view_points.sight import Watch, view_points
 from agents.view_points.troubles import Troubles
-from agents.ways import cost_map as cost_maps
-from agents.ways.cost_map import CostMap, PlannerConfig
+from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig, belief_classes
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
@@ -96,6 +95,7 @@ class Explorer(Agent):
         self._follower = PathFollower(
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )
+        self._cost_maps = CostMaps(self.config.planner, self._robot)
         self._time = 0.0
         self._chosen_at = -math.inf
         self._target: Array | None = None  # the frontier point behind the goal
@@ -146,7 +146,7 @@ class Explorer(Agent):
 
     def _candidates(self, belief: Belief) -> Candidates:
         config = self.config
-        cost_map = cost_maps.build(belief, config.planner, self._robot)
+        cost_map = self._cost_maps.of(belief)
         travel = travel_costs(cost_map)
         watch = self._watch_kept()
         frontiers = find(cost_map, self._frontier_config, watch)
@@ -269,7 +269,7 @@ class Explorer(Agent):
         row, col = grid.to_cells(point)
         rows = slice(max(int(row) - span - 1, 0), max(int(row) + span + 2, 0))
         cols = slice(max(int(col) - span - 1, 0), max(int(col) + span + 2, 0))
-        window = cost_maps.belief_classes(belief, rows, cols)
+        window = belief_classes(belief, rows, cols)
         if window.shape[0] < 3 or window.shape[1] < 3:
             return True
         return frontier_cells(window) * grid.resolution >= 0.5 * self._frontier_config.min_extent_m

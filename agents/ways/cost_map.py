@@ -15,13 +15,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
+from agents.ways.coarsening import FAR_M, to_walls
+from agents.ways.keeping import KeptBlocks
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import not_negative, positive
 
-__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma"]
+__all__ = [
+    "CostMap", "CostMaps", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -106,36 +109,44 @@ def clearance(log_odds: NDArray[np.int8], resolution: float) -> NDArray[np.float
 
 
 def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
-    """Return the planning grid of a belief for a body of this size."""
-    fine_resolution = belief.grid.resolution
-    wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
-    factor = max(1, round(wanted / fine_resolution))
-    resolution = factor * fine_resolution
-    rows, cols = _extent(belief)
-    # Blocks lie on the lattice of the frame, not of the grid's present corner.
-    corner = [
-        belief.grid.origin[0] + cols.start * fine_resolution,
-        belief.grid.origin[1] + rows.start * fine_resolution,
-    ]
-    col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
-    origin = (corner[0] - (col_pad + factor) * fine_resolution, corner[1] - (row_pad + factor) * fine_resolution)
-    blocks = coarsen(
-        belief.grid.log_odds[rows, cols],
-        belief.grid.visited[rows, cols],
-        resolution=fine_resolution,
-        factor=factor,
-        pads=(row_pad, col_pad),
-    )
-    classes, wall = blocks.classes, blocks.clearance
-    x, y = float(belief.pose[0]), float(belief.pose[1])
-    row = min(max(int((y - origin[1]) // resolution), 1), classes.shape[0] - 2)
-    col = min(max(int((x - origin[0]) // resolution), 1), classes.shape[1] - 2)
-    weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
-    # Wherever the robot stands, it is allowed to stand, and to leave.
-    reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
-    highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
-    _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
-    return CostMap(classes, wall, weight, resolution, origin, (row, col), blocks.suspect)
+    """Return the planning grid of a belief for a body of this size, made from nothing."""
+    return CostMaps(config, robot).of(belief)
+
+
+class CostMaps:
+    """Planning grids of one belief after the other: each costs as much as was drawn since the last."""
+
+    def __init__(self, config: PlannerConfig, robot: RobotConfig) -> None:
+        self._config, self._robot = config, robot
+        self._kept: KeptBlocks | None = None
+
+    def of(self, belief: Belief) -> CostMap:
+        """Return the planning grid of a belief; its arrays are written into when the next is asked for."""
+        config, robot, grid = self._config, self._robot, belief.grid
+        wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
+        factor = max(1, round(wanted / grid.resolution))
+        resolution = factor * grid.resolution
+        if self._kept is None or self._kept.factor != factor:
+            self._kept = KeptBlocks(factor)
+        here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
+        self._kept.follow(grid, (int(here[0]), int(here[1])))
+        classes, wall = self._kept.blocks.classes, self._kept.blocks.clearance
+        # Blocks lie on the lattice of the frame, not of the grid's present corner.
+        lattice = zip(grid.origin, grid.lattice_origin[::-1], self._kept.corner[::-1], strict=True)
+        left, low = (
+            begin + (at - first) * grid.resolution - (at % factor + factor) * grid.resolution
+            for begin, first, at in lattice
+        )
+        origin = left, low
+        x, y = float(belief.pose[0]), float(belief.pose[1])
+        row = min(max(int((y - origin[1]) // resolution), 1), classes.shape[0] - 2)
+        col = min(max(int((x - origin[0]) // resolution), 1), classes.shape[1] - 2)
+        weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
+        # Wherever the robot stands, it is allowed to stand, and to leave.
+        reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
+        highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
+        _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
+        return CostMap(classes, wall, weight, resolution, origin, (row, col), self._kept.blocks.suspect)
 
 
 def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
@@ -146,15 +157,6 @@ def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: fl
 def tight_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
     """Return the clearance [m] that the robot needs while its long side lies along the path."""
     return robot.inscribed_radius_m + config.tight_margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
-
-
-def _extent(belief: Belief) -> tuple[slice, slice]:
-    """Rows and columns of the grid that hold anything known, and the robot: its spare rim costs time."""
-    grid = belief.grid
-    here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
-    row0, col0, row1, col1 = known_extent(grid.log_odds, grid.visited)
-    row, col = int(here[0]), int(here[1])
-    return slice(min(row0, row), max(row1, row + 1)), slice(min(col0, col), max(col1, col + 1))
 
 
 def position_sigma(pose_cov: Array) -> float:
