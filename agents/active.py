@@ -129,6 +129,9 @@ class ActiveSlam(Tour):
         self._weigh_detour(candidates, belief, paths[index], prices[index])
         return best
 
+    def _costs_asked(self) -> int | None:
+        return None  # the way back to where the pose was well known may be a long one
+
     def _price(
         self, candidates: Candidates, outlook: Outlook, belief: Belief
     ) -> tuple[list[float], list[Array], list[int]]:

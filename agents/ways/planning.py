@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 # Neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8.
 _D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 _D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+_ALL_BUCKETS = 2**30  # more than there are
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,23 +32,35 @@ class TravelCosts:
     """Cost of the cheapest way from the robot to each cell, and the step that way ends with."""
 
     cost: NDArray[np.float32]  # (rows, cols) weighted metres, inf where it cannot get
-    step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where inf
+    step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where none is known
+    beyond_m: float = math.inf  # this is the cost of all that costs at least so much: it was not searched for
 
 
-def travel_costs(cost_map: CostMap) -> TravelCosts:
+def travel_costs(cost_map: CostMap, *, within_m: float = math.inf) -> TravelCosts:
     """Return the travel costs from the robot's cell.
 
     A step costs its length times the mean weight of its two cells. A diagonal step needs both cells beside it
     free, so that no path slips between two walls that touch at a corner.
+
+    With ``within_m``, ways are searched for only as far as they cost about that much [weighted m]: what lies
+    within is the same, and where the robot can get at all is known beyond, too.
     """
-    shape = cost_map.weight.shape
+    shape, resolution = cost_map.weight.shape, np.float32(cost_map.resolution)
     cost = np.full(shape, np.inf, dtype=np.float32)
     step = np.full(shape, -1, dtype=np.int8)
     highest = float(cost_map.weight.max())
     buckets = math.ceil(math.sqrt(2.0) * highest) + 3
-    _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, cost, step)
-    cost *= np.float32(cost_map.resolution)
-    return TravelCosts(cost, step)
+    last = math.ceil(min(within_m / cost_map.resolution, _ALL_BUCKETS))
+    done = _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, last, cost, step)
+    cost *= resolution
+    if done:
+        return TravelCosts(cost, step)
+    beyond = np.float32(last) * resolution
+    # A diagonal step needs the cells beside it: where it can get, it can without any.
+    passable = (cost_map.weight > 0.0).view(np.uint8)
+    cv2.floodFill(passable, None, cost_map.start[::-1], 2, flags=4)
+    cost[(passable == 2) & np.isinf(cost)] = beyond
+    return TravelCosts(cost, step, float(beyond))
 
 
 def shortest_path(
@@ -88,10 +102,12 @@ def resample(path: Array, spacing_m: float) -> Array:
 
 @njit(cache=True, nogil=True)
 def _dial(
-    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, cost: NDArray[np.float32],
-    step: NDArray[np.int8],
-) -> None:  # fmt: skip
+    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, last: int,
+    cost: NDArray[np.float32], step: NDArray[np.int8],
+) -> bool:  # fmt: skip
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
+
+    Bucket ``last`` and those after it are left; return whether there was none of them.
 
     Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
     before. Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack
@@ -114,7 +130,7 @@ def _dial(
     node_of[0], below[0], top[0] = start, -1, 0
     waiting = 1
     bucket = place = 0  # place is bucket modulo buckets
-    while waiting > 0:
+    while waiting > 0 and bucket < last:
         while top[place] >= 0:
             entry = top[place]
             node = np.int64(node_of[entry])
@@ -161,6 +177,13 @@ def _dial(
                 waiting += 1
         bucket += 1
         place = place + 1 if place + 1 < buckets else 0
+    for place in range(buckets):
+        entry = top[place]
+        while entry >= 0:
+            if costs[node_of[entry]] >= bucket:
+                costs[node_of[entry]], steps[node_of[entry]] = np.inf, -1
+            entry = below[entry]
+    return waiting == 0
 
 
 @njit(cache=True, nogil=True)
