@@ -62,13 +62,29 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
     """
     poses = np.array(watch.poses, dtype=np.float64).reshape(-1, 3)
     poses[:, :2] = cost_map.in_cells(poses[:, :2])
-    # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
-    poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
+    seen = np.zeros(len(cells), dtype=np.bool_)
+    if not len(poses):
+        return seen
     reach = watch.range_m / cost_map.resolution
-    # A cell to spare: what rounding puts just within reach is not left out here.
-    x, far = cells[:, 1] + 0.5, reach + 1.0
-    first, beyond = np.searchsorted(poses[:, 0], x - far), np.searchsorted(poses[:, 0], x + far, side="right")
-    return _first_seen(cost_map.classes, cells, normals, poses, first, beyond, reach, watch.half_view_rad) >= 0
+    # In bands of y and there in order of x, so that only those near a cell need to be looked at; of equals, the
+    # latest are the likeliest. A cell to spare: what rounding puts just within reach is not left out here.
+    far = reach + 1.0
+    left = poses[:, 0].min()
+    width = poses[:, 0].max() - left + 1.0
+    place = np.floor(poses[:, 1] / far) * width + (poses[:, 0] - left)
+    order = np.argsort(place[::-1], kind="stable")
+    poses, place = poses[::-1][order], place[::-1][order]
+    x, band = cells[:, 1] + 0.5 - left, np.floor((cells[:, 0] + 0.5) / far)
+    for aside in (0.0, -1.0, 1.0):
+        begin = (band + aside) * width
+        first = np.searchsorted(place, begin + np.clip(x - far, 0.0, width - 0.5))
+        beyond = np.searchsorted(place, begin + np.clip(x + far, 0.0, width - 0.5), side="right")
+        some = np.flatnonzero(~seen & (first < beyond))
+        seen[some] = _first_seen(
+            cost_map.classes, cells[some], normals[some], poses, first[some], beyond[some], reach,
+            watch.half_view_rad,
+        ) >= 0  # fmt: skip
+    return seen
 
 
 def first_in_good_sight(
