@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,50 +11,9 @@ import pytest
 from agents.ways.boxes import NOTHING, Box
 from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig, build
 from mecanum_env.config import RobotConfig
-from slam.belief import Belief
-from slam.grids.occupancy import OccupancyGrid
-from slam.types import Scan
-from tests.agents.grids import belief_of, room
+from tests.agents.grids import Walk
 
 ROBOT = RobotConfig()
-_BEAMS = 180
-
-
-def scan_of(rng: np.random.Generator, reach_m: float = 3.0) -> Scan:
-    """A scan of walls that come and go."""
-    angles = np.linspace(0.0, 2.0 * np.pi, _BEAMS, endpoint=False)
-    waves = rng.uniform(0.0, 1.0, 4) @ np.cos(np.outer(np.arange(1, 5), angles) + rng.uniform(0, 6, (4, 1)))
-    ranges = np.clip(reach_m * (0.6 + 0.2 * waves), 0.2, None)
-    ranges[rng.random(_BEAMS) < 0.05] = math.inf
-    return Scan(ranges, 0.0, 2.0 * np.pi / _BEAMS, reach_m + 1.0, 0.02)
-
-
-class Walk:
-    """A belief whose robot walks about and draws what it sees, off the grid again and again."""
-
-    def __init__(self, seed: int) -> None:
-        self.rng = np.random.default_rng(seed)
-        self.pose = np.zeros(3)
-        self.grid = OccupancyGrid()
-        self.kept: list[tuple[np.ndarray, Scan]] = []
-
-    def go(self, steps: int) -> Belief:
-        for _ in range(steps):
-            self.pose += self.rng.normal(0.0, [0.5, 0.5, 1.0])
-            scan = scan_of(self.rng)
-            self.kept.append((self.pose.copy(), scan))
-            self.grid.integrate(self.pose, scan, body=(self.pose[0], self.pose[1], 0.25))
-        return self.belief()
-
-    def redraw(self) -> Belief:
-        """The whole map, from poses that are a little different."""
-        poses = np.array([pose for pose, _ in self.kept]) + self.rng.normal(0.0, 0.03, (len(self.kept), 3))
-        self.grid.redraw(poses, [(scan, np.zeros(0, np.int16)) for _, scan in self.kept])
-        return self.belief()
-
-    def belief(self) -> Belief:
-        known = belief_of(room(1.0, 1.0), tuple(self.pose), sigma=float(self.rng.choice([0.01, 0.03, 0.1])))
-        return replace(known, grid=self.grid)
 
 
 def assert_same(kept: CostMap, made: CostMap) -> None:
