@@ -52,14 +52,14 @@ def travel_costs(cost_map: CostMap, *, within_m: float = math.inf) -> TravelCost
     buckets = math.ceil(math.sqrt(2.0) * highest) + 3
     last = math.ceil(min(within_m / cost_map.resolution, _ALL_BUCKETS))
     done = _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, last, cost, step)
-    cost *= resolution
     if done:
+        cost *= resolution
         return TravelCosts(cost, step)
     beyond = np.float32(last) * resolution
     # A diagonal step needs the cells beside it: where it can get, it can without any.
     passable = (cost_map.weight > 0.0).view(np.uint8)
     cv2.floodFill(passable, None, cost_map.start[::-1], 2, flags=4)
-    cost[(passable == 2) & np.isinf(cost)] = beyond
+    _to_metres(cost, resolution, passable, beyond)
     return TravelCosts(cost, step, float(beyond))
 
 
@@ -182,6 +182,17 @@ def _dial(
                 costs[node_of[rest]], steps[node_of[rest]] = np.inf, -1
             rest = below[rest]
     return waiting == 0
+
+
+@njit(cache=True, nogil=True)
+def _to_metres(
+    cost: NDArray[np.float32], resolution: np.float32, reached: NDArray[np.uint8], beyond: np.float32
+) -> None:
+    """Turn cells into metres, and what is unknown into ``beyond`` where it was ``reached``: 2."""
+    for row in range(cost.shape[0]):
+        for col in range(cost.shape[1]):
+            known = cost[row, col] * resolution
+            cost[row, col] = beyond if known == np.inf and reached[row, col] == 2 else known
 
 
 @njit(cache=True, nogil=True)
