@@ -139,7 +139,7 @@ def _clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray
     labels = np.empty(len(cells), dtype=np.int64)
     boxes = np.empty((len(cells), 2), dtype=np.int64)
     order = np.lexsort((cells[:, 1] // 2, cells[:, 0] // 2))
-    count = _join(cells, order, np.full(shape, -1, dtype=np.int32), labels, boxes)
+    count = _join(cells, order, np.zeros(shape, dtype=np.int32), labels, boxes)
     return labels, boxes[:count]
 
 
@@ -199,10 +199,10 @@ def _join(
     cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], labels: NDArray[np.int64],
     boxes: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is −1 all over."""
+    """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is 0 all over."""
     rows, cols = index.shape
     for i in range(len(cells)):
-        index[cells[i, 0], cells[i, 1]] = i
+        index[cells[i, 0], cells[i, 1]] = i + 1
     labels[:] = -1
     stack = np.empty(len(cells), dtype=np.int64)
     count = 0
@@ -221,7 +221,7 @@ def _join(
             low_c, high_c = min(low_c, col), max(high_c, col)
             for r in range(max(row - 1, 0), min(row + 2, rows)):
                 for c in range(max(col - 1, 0), min(col + 2, cols)):
-                    other = index[r, c]
+                    other = index[r, c] - 1
                     if other >= 0 and labels[other] < 0:
                         labels[other] = count
                         stack[height] = other
