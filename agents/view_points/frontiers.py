@@ -165,13 +165,23 @@ def _pieces(
 
 def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
     """Return unit vectors ``(m, 2)`` (x, y) from each cell towards the unknown cells within two cells of it."""
-    rows, cols = classes.shape
-    shift_r, shift_c = (v.ravel() for v in np.mgrid[-2:3, -2:3])
-    r, c = cells[:, :1] + shift_r, cells[:, 1:] + shift_c
-    unknown = classes[np.clip(r, 0, rows - 1), np.clip(c, 0, cols - 1)] == UNKNOWN
-    vector = np.stack([unknown @ shift_c, unknown @ shift_r], axis=1).astype(np.float64)
+    vector = np.zeros((len(cells), 2))
+    _towards_unknown(classes, cells, vector)
     norm = np.hypot(vector[:, 0], vector[:, 1])
     return vector / np.where(norm > 0, norm, 1.0)[:, None]
+
+
+@njit(cache=True, nogil=True)
+def _towards_unknown(classes: NDArray[np.int8], cells: NDArray[np.int64], vector: Array) -> None:
+    """Add up the steps (x, y) to unknown cells; beyond the grid all is as on its rim."""
+    rows, cols = classes.shape
+    for i in range(len(cells)):
+        for down in range(-2, 3):
+            row = min(max(cells[i, 0] + down, 0), rows - 1)
+            for along in range(-2, 3):
+                if classes[row, min(max(cells[i, 1] + along, 0), cols - 1)] == UNKNOWN:
+                    vector[i, 0] += along
+                    vector[i, 1] += down
 
 
 @njit(cache=True, nogil=True)
