@@ -26,7 +26,6 @@ from agents.explorer import Candidates
 from agents.tour import Outlook, Tour, TourConfig
 from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
 from agents.view_points.sightings import expected_sightings
-from agents.ways import cost_map as cost_maps
 from slam.belief import Belief
 from slam.settings import not_negative, positive, require
 
@@ -129,6 +128,9 @@ class ActiveSlam(Tour):
         index = chosen.index(best)
         self._weigh_detour(candidates, belief, paths[index], prices[index])
         return best
+
+    def _costs_asked(self) -> int | None:
+        return None  # the way back to where the pose was well known may be a long one
 
     def _price(
         self, candidates: Candidates, outlook: Outlook, belief: Belief
@@ -246,7 +248,7 @@ class ActiveSlam(Tour):
         marks = marks_of(belief)
         if not len(marks.kinds):
             return False
-        cost_map = cost_maps.build(belief, config.planner, self._robot)
+        cost_map = self._cost_maps.of(belief)
         seen, _ = expected_sightings(
             cost_map, marks.x[None, :3], marks.x[3:].reshape(-1, 2), marks.kinds, marks.ends,
             lidar=self._lidar, model=config.foresight.sensor, most=config.look.most,

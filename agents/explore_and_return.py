@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.driving.control import PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
-from agents.ways import cost_map as cost_maps
 from agents.ways.planning import travel_costs
 from slam import geometry
 from slam.belief import Belief
@@ -121,7 +120,7 @@ class ExploreAndReturn(NearestFrontier):
 
     def _way_home(self, belief: Belief) -> tuple[Array, float]:
         """Return the path ``(n, 2)`` [m] to the start, or to the reachable place nearest to it, and its cost."""
-        cost_map = cost_maps.build(belief, self.config.planner, self._robot)
+        cost_map = self._cost_maps.of(belief)
         travel = travel_costs(cost_map)
         reached = np.argwhere(np.isfinite(travel.cost))
         away = np.hypot(*(cost_map.to_points(reached) - _HOME[:2]).T)

@@ -18,10 +18,9 @@ from agents.base import Agent, Goal
 from agents.driving.control import ControlConfig, PathFollower
 from agents.view_points.frontiers import FrontierConfig, Frontiers, find, frontier_cells
 from agents.view_points.gain import expected_area
-from agents.view_points.sight import Watch, view_points
+from agents.view_points.sight import Track, Watch, view_points
 from agents.view_points.troubles import Troubles
-from agents.ways import cost_map as cost_maps
-from agents.ways.cost_map import CostMap, PlannerConfig
+from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig, belief_classes
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
@@ -31,6 +30,7 @@ __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 
 Array = NDArray[np.float64]
 
+_WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
 _LOST = 0.1  # health of a belief below which it is no good for driving
 
 
@@ -85,6 +85,8 @@ class Explorer(Agent):
     def __init__(self, config: Any = None, **body: Any) -> None:
         super().__init__(config, **body)
         self._frontier_config = self.config.frontiers.for_body(self._robot.width_m)
+        # Beyond far_m all costs ask the same extent of a frontier.
+        self._least_within_m = max(_WITHIN_M, self.config.frontiers.far_m)
         self._forget()
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
@@ -96,6 +98,8 @@ class Explorer(Agent):
         self._follower = PathFollower(
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )
+        self._cost_maps = CostMaps(self.config.planner, self._robot)
+        self._within_m = self._least_within_m  # [weighted m] that the next choice is likely to ask ways for
         self._time = 0.0
         self._chosen_at = -math.inf
         self._target: Array | None = None  # the frontier point behind the goal
@@ -107,7 +111,7 @@ class Explorer(Agent):
         self._lost_for = 0.0
         self._troubles = Troubles(0.6 * self.config.patience.same_m)
         self._ending = "covered"  # why there is nothing left to choose, once there is nothing
-        self._track: list[Array] = []  # sensor poses (3,) that frontiers were seen from
+        self._track = Track()  # sensor poses that frontiers were seen from
 
     # ---- choosing ------------------------------------------------------------------------------------------
 
@@ -145,11 +149,36 @@ class Explorer(Agent):
         return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
 
     def _candidates(self, belief: Belief) -> Candidates:
-        config = self.config
-        cost_map = cost_maps.build(belief, config.planner, self._robot)
-        travel = travel_costs(cost_map)
+        cost_map = self._cost_maps.of(belief)
         watch = self._watch_kept()
         frontiers = find(cost_map, self._frontier_config, watch)
+        # Ways are searched for as far as they are asked for: on a large map most frontiers are far away.
+        asked = self._costs_asked()
+        within_m = math.inf if asked is None else self._within_m
+        while True:
+            travel = travel_costs(cost_map, within_m=within_m)
+            cells, costs = self._views(cost_map, travel, frontiers, watch)
+            known = costs[costs < travel.beyond_m]
+            if asked is None or len(known) >= asked or not (np.isfinite(costs) & (costs >= travel.beyond_m)).any():
+                break
+            within_m *= 4.0
+        if asked is not None and len(known):
+            farthest = float(np.sort(known)[min(asked, len(known)) - 1])
+            self._within_m = max(1.2 * farthest, self._least_within_m)
+        return Candidates(cost_map, travel, frontiers, cells, costs, self._current(frontiers, costs))
+
+    def _costs_asked(self) -> int | None:
+        """Return of how many of the candidates, the cheapest, the strategy asks costs and cells; None: of all.
+
+        The others cost at least ``travel.beyond_m``, and that is what stands there.
+        """
+        return None
+
+    def _views(
+        self, cost_map: CostMap, travel: TravelCosts, frontiers: Frontiers, watch: Watch
+    ) -> tuple[NDArray[np.int64], Array]:
+        """Return cells ``(m, 2)`` and costs ``(m,)`` of :class:`Candidates`; take note of why none may be left."""
+        config = self.config
         troubles = self._troubles.near(frontiers.targets)
         looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
         cells, costs = view_points(
@@ -170,7 +199,7 @@ class Explorer(Agent):
         avoided = np.array([t is not None and t.avoid_until_s > self._time for t in troubles], dtype=bool)
         if np.isfinite(costs[~avoided]).any():
             costs[avoided] = np.inf
-        return Candidates(cost_map, travel, frontiers, cells, costs, self._current(frontiers, costs))
+        return cells, costs
 
     def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> NDArray[np.bool_]:
         """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""
@@ -182,7 +211,7 @@ class Explorer(Agent):
         # Beams fall no farther apart than a cell of the planning grid.
         dense = max(self.config.planner.resolution_m / self._lidar.angle_increment, 1.0)
         return Watch(
-            poses=np.array(self._track).reshape(-1, 3),
+            poses=self._track.poses,
             range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, dense),
             half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
         )
@@ -195,13 +224,13 @@ class Explorer(Agent):
         """Remember from where the sensor has looked, every little way and turn."""
         x, y, heading = belief.pose.tolist()
         x, y = x + self._lidar.offset_m * math.cos(heading), y + self._lidar.offset_m * math.sin(heading)
-        if self._track:
-            last_x, last_y, last_heading = self._track[-1].tolist()
+        if len(self._track.poses):
+            last_x, last_y, last_heading = self._track.poses[-1].tolist()
             moved = math.hypot(x - last_x, y - last_y)
             turned = abs(geometry.wrap_scalar(heading - last_heading))
             if moved < 0.2 and (self._lidar.field_of_view_deg >= 360.0 or turned < 0.3):
                 return
-        self._track.append(np.array([x, y, geometry.wrap_scalar(heading)]))
+        self._track.append((x, y, geometry.wrap_scalar(heading)))
 
     def _current(self, frontiers: Frontiers, costs: Array) -> int | None:
         if self._target is None or not len(costs):
@@ -269,7 +298,7 @@ class Explorer(Agent):
         row, col = grid.to_cells(point)
         rows = slice(max(int(row) - span - 1, 0), max(int(row) + span + 2, 0))
         cols = slice(max(int(col) - span - 1, 0), max(int(col) + span + 2, 0))
-        window = cost_maps.belief_classes(belief, rows, cols)
+        window = belief_classes(belief, rows, cols)
         if window.shape[0] < 3 or window.shape[1] < 3:
             return True
         return frontier_cells(window) * grid.resolution >= 0.5 * self._frontier_config.min_extent_m

@@ -96,6 +96,10 @@ class Tour(StationAgent, Explorer):
         """Return the piece of frontier that the tour begins with."""
         return self._index
 
+    def _costs_asked(self) -> int | None:
+        # Those that the tour is over; stations ask for ways to all of them.
+        return self.config.places if self.config.stations.spacing_m == 0 else None
+
     def _candidates(self, belief: Belief) -> Candidates:
         """Return the candidates, the first place of the tour put in as the view point of what is picked."""
         self._outlook: Outlook | None = None
@@ -186,8 +190,7 @@ class Tour(StationAgent, Explorer):
     def _looked_from(self, cost_map: CostMap, cells: Cells) -> NDArray[np.bool_]:
         """Return from which stations ``(n,)`` the sensor looked already: what is left was not seen from there."""
         looked = np.zeros(cost_map.classes.shape, dtype=np.bool_)
-        if self._track:
-            looked[tuple(cost_map.to_cells(np.array(self._track)[:, :2]).T)] = True
+        looked[tuple(cost_map.to_cells(self._track.poses[:, :2]).T)] = True
         return np.asarray(looked[tuple(cells.T)])
 
 

@@ -110,6 +110,9 @@ class Chooser(Tour):
         """Return what was chosen."""
         return self._taken
 
+    def _costs_asked(self) -> int | None:
+        return None  # in how many places views may be had is among what is shown
+
     def _candidates(self, belief: Belief) -> Candidates:
         # Those that were described: the choice was made among them.
         found, self._found = self._found, None

@@ -139,7 +139,7 @@ def _clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray
     labels = np.empty(len(cells), dtype=np.int64)
     boxes = np.empty((len(cells), 2), dtype=np.int64)
     order = np.lexsort((cells[:, 1] // 2, cells[:, 0] // 2))
-    count = _join(cells, order, np.full(shape, -1, dtype=np.int32), labels, boxes)
+    count = _join(cells, order, np.zeros(shape, dtype=np.int32), labels, boxes)
     return labels, boxes[:count]
 
 
@@ -165,13 +165,23 @@ def _pieces(
 
 def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
     """Return unit vectors ``(m, 2)`` (x, y) from each cell towards the unknown cells within two cells of it."""
-    rows, cols = classes.shape
-    shift_r, shift_c = (v.ravel() for v in np.mgrid[-2:3, -2:3])
-    r, c = cells[:, :1] + shift_r, cells[:, 1:] + shift_c
-    unknown = classes[np.clip(r, 0, rows - 1), np.clip(c, 0, cols - 1)] == UNKNOWN
-    vector = np.stack([unknown @ shift_c, unknown @ shift_r], axis=1).astype(np.float64)
+    vector = np.zeros((len(cells), 2))
+    _towards_unknown(classes, cells, vector)
     norm = np.hypot(vector[:, 0], vector[:, 1])
     return vector / np.where(norm > 0, norm, 1.0)[:, None]
+
+
+@njit(cache=True, nogil=True)
+def _towards_unknown(classes: NDArray[np.int8], cells: NDArray[np.int64], vector: Array) -> None:
+    """Add up the steps (x, y) to unknown cells; beyond the grid all is as on its rim."""
+    rows, cols = classes.shape
+    for i in range(len(cells)):
+        for down in range(-2, 3):
+            row = min(max(cells[i, 0] + down, 0), rows - 1)
+            for along in range(-2, 3):
+                if classes[row, min(max(cells[i, 1] + along, 0), cols - 1)] == UNKNOWN:
+                    vector[i, 0] += along
+                    vector[i, 1] += down
 
 
 @njit(cache=True, nogil=True)
@@ -199,10 +209,10 @@ def _join(
     cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], labels: NDArray[np.int64],
     boxes: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is −1 all over."""
+    """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is 0 all over."""
     rows, cols = index.shape
     for i in range(len(cells)):
-        index[cells[i, 0], cells[i, 1]] = i
+        index[cells[i, 0], cells[i, 1]] = i + 1
     labels[:] = -1
     stack = np.empty(len(cells), dtype=np.int64)
     count = 0
@@ -221,7 +231,7 @@ def _join(
             low_c, high_c = min(low_c, col), max(high_c, col)
             for r in range(max(row - 1, 0), min(row + 2, rows)):
                 for c in range(max(col - 1, 0), min(col + 2, cols)):
-                    other = index[r, c]
+                    other = index[r, c] - 1
                     if other >= 0 and labels[other] < 0:
                         labels[other] = count
                         stack[height] = other

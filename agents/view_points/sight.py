@@ -20,7 +20,7 @@ from agents.ways.cost_map import CostMap, kind_at
 from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["Watch", "first_in_good_sight", "in_good_sight", "view_points"]
+__all__ = ["Track", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,25 @@ class Watch:
     half_view_rad: float  # half the field of view; π and more: all round
 
 
+class Track:
+    """Sensor poses, in an array that grows by doubling: it is read at every choice."""
+
+    def __init__(self) -> None:
+        self._room, self._count = np.zeros((64, 3)), 0
+
+    @property
+    def poses(self) -> Array:
+        """The poses ``(k, 3)``, oldest first; later ones are written behind them."""
+        return self._room[: self._count]
+
+    def append(self, pose: tuple[float, float, float]) -> None:
+        """Add the latest pose: x [m], y [m], θ [rad]."""
+        if self._count == len(self._room):
+            self._room = np.vstack([self._room, np.zeros_like(self._room)])
+        self._room[self._count] = pose
+        self._count += 1
+
+
 def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, watch: Watch) -> NDArray[np.bool_]:
     """Return which frontier cells ``(n, 2)`` (row, column) were in good sight from any of the watch's poses.
 
@@ -43,13 +62,29 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
     """
     poses = np.array(watch.poses, dtype=np.float64).reshape(-1, 3)
     poses[:, :2] = cost_map.in_cells(poses[:, :2])
-    # In order of x, so that only those near a cell need to be looked at; of equals, the latest are the likeliest.
-    poses = poses[::-1][np.argsort(poses[::-1, 0], kind="stable")]
+    seen = np.zeros(len(cells), dtype=np.bool_)
+    if not len(poses):
+        return seen
     reach = watch.range_m / cost_map.resolution
-    # A cell to spare: what rounding puts just within reach is not left out here.
-    x, far = cells[:, 1] + 0.5, reach + 1.0
-    first, beyond = np.searchsorted(poses[:, 0], x - far), np.searchsorted(poses[:, 0], x + far, side="right")
-    return _first_seen(cost_map.classes, cells, normals, poses, first, beyond, reach, watch.half_view_rad) >= 0
+    # In bands of y and there in order of x, so that only those near a cell need to be looked at; of equals, the
+    # latest are the likeliest. A cell to spare: what rounding puts just within reach is not left out here.
+    far = reach + 1.0
+    left = poses[:, 0].min()
+    width = poses[:, 0].max() - left + 1.0
+    place = np.floor(poses[:, 1] / far) * width + (poses[:, 0] - left)
+    order = np.argsort(place[::-1], kind="stable")
+    poses, place = poses[::-1][order], place[::-1][order]
+    x, band = cells[:, 1] + 0.5 - left, np.floor((cells[:, 0] + 0.5) / far)
+    for aside in (0.0, -1.0, 1.0):
+        begin = (band + aside) * width
+        first = np.searchsorted(place, begin + np.clip(x - far, 0.0, width - 0.5))
+        beyond = np.searchsorted(place, begin + np.clip(x + far, 0.0, width - 0.5), side="right")
+        some = np.flatnonzero(~seen & (first < beyond))
+        seen[some] = _first_seen(
+            cost_map.classes, cells[some], normals[some], poses, first[some], beyond[some], reach,
+            watch.half_view_rad,
+        ) >= 0  # fmt: skip
+    return seen
 
 
 def first_in_good_sight(
@@ -94,12 +129,18 @@ def view_points(
 
     Sight lines are walked backwards from a point ``beyond_m`` behind the frontier. Where no reachable cell sees
     that point, one near the frontier that sees the frontier itself will do: it is the last that can be tried.
+    A piece whose cost is ``travel.beyond_m`` is seen from no cell that costs less, and from any of the others.
     """
-    reach = _NEARER * range_m / cost_map.resolution
+    reach, beyond = _NEARER * range_m / cost_map.resolution, beyond_m / cost_map.resolution
     start = cost_map.in_cells(targets)
     cells = np.full((len(start), 2), -1, dtype=np.int64)
     costs = np.full(len(start), np.inf)
-    _look(cost_map.classes, travel.cost, start, normals, reach, beyond_m / cost_map.resolution, cells, costs)
+    # No way is shorter than the straight line: where that alone is too long, one place is as good as another.
+    away = np.hypot(start[:, 0] - cost_map.start[1], start[:, 1] - cost_map.start[0]) - (
+        reach + 2.0 * beyond + 4.0
+    )
+    enough = np.where(away * cost_map.resolution > travel.beyond_m, travel.beyond_m, 0.0)
+    _look(cost_map.classes, travel.cost, start, normals, reach, beyond, enough, cells, costs)
     return cells, costs
 
 
@@ -152,9 +193,12 @@ def _is_free_line(classes: NDArray[np.int8], x0: float, y0: float, x1: float, y1
 @njit(cache=True, nogil=True)
 def _look(
     classes: NDArray[np.int8], cost: NDArray[np.float32], targets: Array, normals: Array, reach: float,
-    beyond: float, cells: NDArray[np.int64], costs: Array,
+    beyond: float, enough: Array, cells: NDArray[np.int64], costs: Array,
 ) -> None:  # fmt: skip
-    """Find the cheapest cell in sight of each target; positions in cells, x first."""
+    """Find the cheapest cell in sight of each target, or one that costs no more than ``enough`` of it.
+
+    Positions are in cells, x first.
+    """
     for i in range(targets.shape[0]):
         x, y = targets[i, 0], targets[i, 1]
         nx, ny = normals[i, 0], normals[i, 1]
@@ -162,15 +206,15 @@ def _look(
         while push > 0.0 and kind_at(classes, math.floor(y + push * ny), math.floor(x + push * nx)) == OCCUPIED:
             push -= 1.0
         push = max(push, 0.0)
-        _sweep(classes, cost, x, y, nx, ny, reach, push, push + 2.0, i, cells, costs)
+        _sweep(classes, cost, x, y, nx, ny, reach, push, push + 2.0, i, enough[i], cells, costs)
         if costs[i] == np.inf:
-            _sweep(classes, cost, x, y, 0.0, 0.0, 0.4 * reach, 0.0, 1.0, i, cells, costs)
+            _sweep(classes, cost, x, y, 0.0, 0.0, 0.4 * reach, 0.0, 1.0, i, enough[i], cells, costs)
 
 
 @njit(cache=True, nogil=True)
 def _sweep(
     classes: NDArray[np.int8], cost: NDArray[np.float32], x: float, y: float, nx: float, ny: float, reach: float,
-    push: float, blind: float, index: int, cells: NDArray[np.int64], costs: Array,
+    push: float, blind: float, index: int, enough: float, cells: NDArray[np.int64], costs: Array,
 ) -> None:  # fmt: skip
     """Walk sight lines from ``push`` cells behind (x, y) and keep to the places that see it well.
 
@@ -198,3 +242,5 @@ def _sweep(
             if square <= (reach * math.sqrt(square) if flat else reach * (ex * nx + ey * ny)):
                 costs[index] = cost[row, col]
                 cells[index, 0], cells[index, 1] = row, col
+                if costs[index] <= enough:
+                    return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -11,15 +12,18 @@ from numpy.typing import NDArray
 
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["FAR_M", "Blocks", "coarsen", "known_extent", "to_walls"]
+__all__ = ["FAR_M", "OCCUPIED_LEAST", "Blocks", "coarsen", "fill_blocks", "known_extent", "to_walls"]
+
+Corners = tuple[int, int, int, int]
 
 FAR_M = 10.0
 """Clearances [m] beyond this say nothing more."""
 
 _LOG_ODDS = np.arange(256, dtype=np.uint8).view(np.int8)
-# Classes are ranges of log-odds: free up to here, and occupied from here.
+# Classes are ranges of log-odds: free up to here …
 _FREE_MOST = int(_LOG_ODDS[CLASS_OF == FREE].max())
-_OCCUPIED_LEAST = int(_LOG_ODDS[CLASS_OF == OCCUPIED].min())
+OCCUPIED_LEAST = int(_LOG_ODDS[CLASS_OF == OCCUPIED].min())
+"""… and occupied from here."""
 _NO_WALL = (CLASS_OF != OCCUPIED).astype(np.uint8)
 
 # Three counts in one number: of free fine cells, of occupied ones, and of suspect ones.
@@ -35,6 +39,15 @@ class Blocks:
     clearance: NDArray[np.float32]  # (rows, cols) [m] from the block's centre to the nearest occupied edge
     suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
 
+    @classmethod
+    def blank(cls, rows: int, cols: int) -> Self:
+        """Return so many blocks, all unknown."""
+        return cls(
+            np.full((rows, cols), UNKNOWN, dtype=np.int8),
+            np.full((rows, cols), FAR_M, dtype=np.float32),
+            np.zeros((rows, cols), dtype=np.bool_),
+        )
+
 
 def coarsen(
     log_odds: NDArray[np.int8],
@@ -47,14 +60,12 @@ def coarsen(
     """Return blocks of ``factor`` × ``factor`` cells; the corner lies ``pads`` (row, column) into the first."""
     rows = -(-(log_odds.shape[0] + pads[0]) // factor) + 2
     cols = -(-(log_odds.shape[1] + pads[1]) // factor) + 2
-    classes = np.full((rows, cols), UNKNOWN, dtype=np.int8)
-    clearance = np.full((rows, cols), FAR_M, dtype=np.float32)
-    suspect = np.zeros((rows, cols), dtype=np.bool_)
-    _fill(
-        log_odds, visited, to_walls(log_odds), np.float32(resolution), np.float32(FAR_M), factor,
-        pads[0], pads[1], classes, clearance, suspect,
+    blocks = Blocks.blank(rows, cols)
+    fill_blocks(
+        log_odds, visited, to_walls(log_odds), (0, 0, *log_odds.shape), (1, 1, rows - 1, cols - 1), resolution,
+        factor, *pads, blocks.classes, blocks.clearance, blocks.suspect,
     )  # fmt: skip
-    return Blocks(classes, clearance, suspect)
+    return blocks
 
 
 def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
@@ -100,33 +111,59 @@ def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _fill(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], resolution: np.float32,
-    far: np.float32, factor: int, row_pad: int, col_pad: int, classes: NDArray[np.int8],
+def fill_blocks(
+    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], extent: Corners,
+    box: Corners, resolution: float, factor: int, row_pad: int, col_pad: int, classes: NDArray[np.int8],
     clearance: NDArray[np.float32], suspect: NDArray[np.bool_],
 ) -> None:  # fmt: skip
-    """Fill the blocks but for the ring, a row of them at a time."""
-    fine_rows, fine_cols = log_odds.shape
-    blocks = classes.shape[1] - 2
-    metres, marks = np.empty(fine_cols, dtype=np.float32), np.empty(fine_cols, dtype=np.int64)
+    """Fill a box of blocks, a row of them at a time.
+
+    Parameters
+    ----------
+    log_odds, visited, distance
+        Planes ``(rows, cols)`` of fine cells, the last from :func:`to_walls`.
+    extent
+        First row and column, and those beyond the last, of the fine cells that there are blocks of.
+    box
+        The same of the blocks to fill; block (1, 1) is the first that is none of the ring's.
+    resolution
+        Side of a fine cell [m].
+    factor, row_pad, col_pad
+        Fine cells to a side of a block, and how far into block (1, 1) the extent begins.
+    classes, clearance, suspect
+        As in :class:`Blocks`.
+    """
+    row0, col0, row1, col1 = extent
+    near, far = np.float32(resolution), np.float32(FAR_M)
+    blocks = box[3] - box[1]
+    # Fine columns of these blocks, as counted from the first block's beginning.
+    before = (box[1] - 1) * factor - col_pad
+    first, beyond = col0 + max(before, 0), min(col0 + before + blocks * factor, col1)
+    pad = max(-before, 0)
+    metres, marks = np.empty(beyond - first, dtype=np.float32), np.empty(beyond - first, dtype=np.int64)
     totals, counts = np.empty(blocks), np.empty(blocks, dtype=np.int64)
     inside = np.zeros(blocks, dtype=np.int64)  # fine columns of each
-    for col in range(fine_cols):
-        inside[(col + col_pad) // factor] += 1
-    for row in range(1, classes.shape[0] - 1):
+    for col in range(beyond - first):
+        inside[(col + pad) // factor] += 1
+    for row in range(box[0], box[2]):
         totals[:] = 0.0
         counts[:] = 0
-        low, high = max((row - 1) * factor - row_pad, 0), min(row * factor - row_pad, fine_rows)
+        low, high = max(row0 + (row - 1) * factor - row_pad, row0), min(row0 + row * factor - row_pad, row1)
         for r in range(low, high):
-            _read(log_odds[r], visited[r], distance[r], resolution, far, metres, marks)
+            _read(
+                log_odds[r, first:beyond], visited[r, first:beyond], distance[r, first:beyond], near, far, metres,
+                marks,
+            )  # fmt: skip
             for i in range(factor):
-                _add(metres, marks, i - col_pad, factor, totals, counts)
+                _add(metres, marks, i - pad, factor, totals, counts)
         for block in range(blocks):
-            count, col = counts[block], block + 1
+            count, col = counts[block], box[1] + block
             if (count >> _FIELD) & _COUNT:
                 classes[row, col] = OCCUPIED
             elif 2 * (count & _COUNT) > factor * factor:
                 classes[row, col] = FREE
+            else:
+                classes[row, col] = UNKNOWN
             suspect[row, col] = count >> (2 * _FIELD) != 0
             # The mean over a block is the distance at its centre, to second order.
             clearance[row, col] = totals[block] / (inside[block] * (high - low))
@@ -143,7 +180,7 @@ def _read(
         metres[col] = min((distance[col] - half) * resolution, far)
     for col in range(log_odds.shape[0]):
         odds = log_odds[col]
-        occupied = odds >= _OCCUPIED_LEAST
+        occupied = odds >= OCCUPIED_LEAST
         free = (odds <= _FREE_MOST) | ((visited[col] != 0) & ~occupied)
         unsettled = (odds > 0) & ~occupied & ~free
         marks[col] = np.int64(free) | np.int64(occupied) << _FIELD | np.int64(unsettled) << (2 * _FIELD)

@@ -15,13 +15,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from agents.ways.coarsening import FAR_M, coarsen, known_extent, to_walls
+from agents.ways.boxes import NOTHING, Box
+from agents.ways.coarsening import FAR_M, Blocks, to_walls
+from agents.ways.keeping import KeptBlocks
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import not_negative, positive
 
-__all__ = ["CostMap", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma"]
+__all__ = [
+    "CostMap", "CostMaps", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
@@ -106,36 +110,75 @@ def clearance(log_odds: NDArray[np.int8], resolution: float) -> NDArray[np.float
 
 
 def build(belief: Belief, config: PlannerConfig, robot: RobotConfig) -> CostMap:
-    """Return the planning grid of a belief for a body of this size."""
-    fine_resolution = belief.grid.resolution
-    wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
-    factor = max(1, round(wanted / fine_resolution))
-    resolution = factor * fine_resolution
-    rows, cols = _extent(belief)
-    # Blocks lie on the lattice of the frame, not of the grid's present corner.
-    corner = [
-        belief.grid.origin[0] + cols.start * fine_resolution,
-        belief.grid.origin[1] + rows.start * fine_resolution,
-    ]
-    col_pad, row_pad = (round(v / fine_resolution) % factor for v in corner)
-    origin = (corner[0] - (col_pad + factor) * fine_resolution, corner[1] - (row_pad + factor) * fine_resolution)
-    blocks = coarsen(
-        belief.grid.log_odds[rows, cols],
-        belief.grid.visited[rows, cols],
-        resolution=fine_resolution,
-        factor=factor,
-        pads=(row_pad, col_pad),
-    )
-    classes, wall = blocks.classes, blocks.clearance
-    x, y = float(belief.pose[0]), float(belief.pose[1])
-    row = min(max(int((y - origin[1]) // resolution), 1), classes.shape[0] - 2)
-    col = min(max(int((x - origin[0]) // resolution), 1), classes.shape[1] - 2)
-    weight = _weigh(classes, wall, resolution, config, robot, position_sigma(belief.pose_cov))
-    # Wherever the robot stands, it is allowed to stand, and to leave.
-    reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
-    highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
-    _free_start(classes, wall, weight, row, col, reach, robot.circumscribed_radius_m / resolution, highest)
-    return CostMap(classes, wall, weight, resolution, origin, (row, col), blocks.suspect)
+    """Return the planning grid of a belief for a body of this size, made from nothing."""
+    return CostMaps(config, robot).of(belief)
+
+
+class CostMaps:
+    """Planning grids of one belief after the other: each costs as much as was drawn since the last."""
+
+    def __init__(self, config: PlannerConfig, robot: RobotConfig) -> None:
+        self._config, self._robot = config, robot
+        self._kept: KeptBlocks | None = None
+        self._box, self._levels = NOTHING, (0.0, 0.0, 0.0)  # of the weights
+        self._weight: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self._start = NOTHING  # where the robot was let out of where it stood
+
+    def of(self, belief: Belief) -> CostMap:
+        """Return the planning grid of a belief; its arrays are written into when the next is asked for."""
+        config, robot, grid = self._config, self._robot, belief.grid
+        wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
+        factor = max(1, round(wanted / grid.resolution))
+        resolution = factor * grid.resolution
+        if self._kept is None or self._kept.factor != factor:
+            self._kept = KeptBlocks(factor)
+        here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
+        changed = self._kept.follow(grid, (int(here[0]), int(here[1])))
+        blocks = self._kept.blocks
+        # Blocks lie on the lattice of the frame, not of the grid's present corner.
+        lattice = zip(grid.origin, grid.lattice_origin[::-1], self._kept.corner[::-1], strict=True)
+        left, low = (
+            begin + (at - first) * grid.resolution - (at % factor + factor) * grid.resolution
+            for begin, first, at in lattice
+        )
+        x, y = float(belief.pose[0]), float(belief.pose[1])
+        row = min(max(int((y - low) // resolution), 1), blocks.classes.shape[0] - 2)
+        col = min(max(int((x - left) // resolution), 1), blocks.classes.shape[1] - 2)
+        weight = self._weigh(blocks, changed, resolution, position_sigma(belief.pose_cov))
+        # Wherever the robot stands, it is allowed to stand, and to leave.
+        reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
+        highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
+        _free_start(
+            blocks.classes, blocks.clearance, weight, row, col, reach, robot.circumscribed_radius_m / resolution,
+            highest,
+        )  # fmt: skip
+        self._start = Box(row, col, row + 1, col + 1).grown(math.ceil(reach))
+        return CostMap(
+            blocks.classes, blocks.clearance, weight, resolution, (left, low), (row, col), blocks.suspect
+        )
+
+    def _weigh(self, blocks: Blocks, changed: list[Box], resolution: float, sigma_m: float) -> NDArray[np.float32]:
+        """Return the price of a metre in each block, weighed anew where it may be another."""
+        config, robot = self._config, self._robot
+        assert self._kept is not None
+        tight = tight_clearance(config, robot, sigma_m)
+        comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
+        levels = tight, comfortable, comfortable + config.preferred_m
+        near = (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5  # unknown, in blocks
+        inside = Box(0, 0, *blocks.classes.shape).grown(-1)
+        if self._kept.box != self._box or levels != self._levels:
+            self._weight = np.zeros(blocks.classes.shape, dtype=np.float32)
+            parts = [inside]
+        else:
+            parts = [part.grown(math.ceil(near)) for part in changed] + [self._start]
+        self._box, self._levels = self._kept.box, levels
+        for part in parts:
+            part = part.within(inside)
+            _weigh_cells(
+                blocks.classes, blocks.clearance, _near_unknown(blocks.classes, part, near), part, levels,
+                config.near_cost, config.tight_cost, self._weight,
+            )  # fmt: skip
+        return self._weight
 
 
 def comfortable_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -> float:
@@ -148,15 +191,6 @@ def tight_clearance(config: PlannerConfig, robot: RobotConfig, sigma_m: float) -
     return robot.inscribed_radius_m + config.tight_margin_m + min(2.0 * sigma_m, config.max_sigma_margin_m)
 
 
-def _extent(belief: Belief) -> tuple[slice, slice]:
-    """Rows and columns of the grid that hold anything known, and the robot: its spare rim costs time."""
-    grid = belief.grid
-    here = np.clip(grid.to_cells(np.asarray(belief.pose)[None, :2])[0], 0, np.array(grid.shape) - 1)
-    row0, col0, row1, col1 = known_extent(grid.log_odds, grid.visited)
-    row, col = int(here[0]), int(here[1])
-    return slice(min(row0, row), max(row1, row + 1)), slice(min(col0, col), max(col1, col + 1))
-
-
 def position_sigma(pose_cov: Array) -> float:
     """Largest standard deviation of the position [m]."""
     block = np.asarray(pose_cov)[:2, :2]
@@ -165,38 +199,16 @@ def position_sigma(pose_cov: Array) -> float:
     return math.sqrt(max(float(mean + spread), 0.0))
 
 
-def _weigh(
-    classes: NDArray[np.int8],
-    wall: NDArray[np.float32],
-    resolution: float,
-    config: PlannerConfig,
-    robot: RobotConfig,
-    sigma_m: float,
-) -> NDArray[np.float32]:
-    tight = tight_clearance(config, robot, sigma_m)
-    comfortable = max(comfortable_clearance(config, robot, sigma_m), tight + 1e-3)
-    unknown = _near_unknown(classes, (robot.inscribed_radius_m + config.unknown_margin_m) / resolution + 0.5)
-    weight = np.zeros(classes.shape, dtype=np.float32)
-    _weigh_cells(
-        classes,
-        wall,
-        unknown,
-        np.array([tight, comfortable, comfortable + config.preferred_m]),
-        config.near_cost,
-        config.tight_cost,
-        weight,
-    )
-    return weight
-
-
-def _near_unknown(classes: NDArray[np.int8], reach: float) -> NDArray[np.uint8]:
-    """Return, not 0, the cells nearer than ``reach`` cells to an unknown one."""
-    side = 2 * math.ceil(reach) + 1
-    apart = np.ones((side, side), dtype=np.uint8)
-    apart[side // 2, side // 2] = 0
+def _near_unknown(classes: NDArray[np.int8], part: Box, reach: float) -> NDArray[np.uint8]:
+    """Return, not 0, the cells of a part that are nearer than ``reach`` cells to an unknown one."""
+    span = math.ceil(reach)
+    apart = np.ones((2 * span + 1, 2 * span + 1), dtype=np.uint8)
+    apart[span, span] = 0
     # A disc laid over each unknown cell: cheaper than the distance of every cell, of which none but this is asked.
     disc = (cv2.distanceTransform(apart, cv2.DIST_L2, cv2.DIST_MASK_3) < np.float64(reach)).astype(np.uint8)
-    return np.asarray(cv2.dilate((classes == UNKNOWN).view(np.uint8), disc), dtype=np.uint8)
+    window = part.grown(span).within(Box(0, 0, *classes.shape))
+    near = cv2.dilate((classes[window.slices] == UNKNOWN).view(np.uint8), disc)
+    return np.ascontiguousarray(near[part.seen_from(window).slices], dtype=np.uint8)
 
 
 @njit(cache=True, nogil=True)
@@ -211,16 +223,18 @@ def _classify(
 
 @njit(cache=True, nogil=True)
 def _weigh_cells(
-    classes: NDArray[np.int8], wall: NDArray[np.float32], near_unknown: NDArray[np.uint8], levels: Array,
-    near_cost: float, tight_cost: float, weight: NDArray[np.float32],
+    classes: NDArray[np.int8], wall: NDArray[np.float32], near_unknown: NDArray[np.uint8],
+    part: tuple[int, int, int, int], levels: tuple[float, float, float], near_cost: float, tight_cost: float,
+    weight: NDArray[np.float32],
 ) -> None:  # fmt: skip
+    """Weigh a part of the cells; ``near_unknown`` is as large as that."""
     tight, comfortable, preferred = levels
-    for row in range(1, classes.shape[0] - 1):
-        for col in range(1, classes.shape[1] - 1):
+    for row in range(part[0], part[2]):
+        for col in range(part[1], part[3]):
             distance = wall[row, col]
-            if classes[row, col] != FREE or distance < tight or near_unknown[row, col] != 0:
-                continue
-            if distance >= preferred:
+            if classes[row, col] != FREE or distance < tight or near_unknown[row - part[0], col - part[1]] != 0:
+                weight[row, col] = 0.0
+            elif distance >= preferred:
                 weight[row, col] = 1.0
             elif distance >= comfortable:
                 share = (preferred - distance) / (preferred - comfortable)

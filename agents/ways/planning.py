@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ Array = NDArray[np.float64]
 # Neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8.
 _D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
 _D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
+_ALL_BUCKETS = 2**30  # more than there are
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,23 +32,35 @@ class TravelCosts:
     """Cost of the cheapest way from the robot to each cell, and the step that way ends with."""
 
     cost: NDArray[np.float32]  # (rows, cols) weighted metres, inf where it cannot get
-    step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where inf
+    step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where none is known
+    beyond_m: float = math.inf  # this is the cost of all that costs at least so much: it was not searched for
 
 
-def travel_costs(cost_map: CostMap) -> TravelCosts:
+def travel_costs(cost_map: CostMap, *, within_m: float = math.inf) -> TravelCosts:
     """Return the travel costs from the robot's cell.
 
     A step costs its length times the mean weight of its two cells. A diagonal step needs both cells beside it
     free, so that no path slips between two walls that touch at a corner.
+
+    With ``within_m``, ways are searched for only as far as they cost about that much [weighted m]: what lies
+    within is the same, and where the robot can get at all is known beyond, too.
     """
-    shape = cost_map.weight.shape
+    shape, resolution = cost_map.weight.shape, np.float32(cost_map.resolution)
     cost = np.full(shape, np.inf, dtype=np.float32)
     step = np.full(shape, -1, dtype=np.int8)
     highest = float(cost_map.weight.max())
     buckets = math.ceil(math.sqrt(2.0) * highest) + 3
-    _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, cost, step)
-    cost *= np.float32(cost_map.resolution)
-    return TravelCosts(cost, step)
+    last = math.ceil(min(within_m / cost_map.resolution, _ALL_BUCKETS))
+    done = _dial(cost_map.weight, cost_map.start[0], cost_map.start[1], buckets, last, cost, step)
+    if done:
+        cost *= resolution
+        return TravelCosts(cost, step)
+    beyond = np.float32(last) * resolution
+    # A diagonal step needs the cells beside it: where it can get, it can without any.
+    passable = (cost_map.weight > 0.0).view(np.uint8)
+    cv2.floodFill(passable, None, cost_map.start[::-1], 2, flags=4)
+    _to_metres(cost, resolution, passable, beyond)
+    return TravelCosts(cost, step, float(beyond))
 
 
 def shortest_path(
@@ -86,12 +100,14 @@ def resample(path: Array, spacing_m: float) -> Array:
     return np.vstack(pieces)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _dial(
-    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, cost: NDArray[np.float32],
-    step: NDArray[np.int8],
-) -> None:  # fmt: skip
+    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, last: int,
+    cost: NDArray[np.float32], step: NDArray[np.int8],
+) -> bool:  # fmt: skip
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
+
+    Bucket ``last`` and those after it are left; return whether there was none of them.
 
     Weights are 0 or at least 1, so that nothing taken from a bucket makes another of it cheaper than what left it
     before. Each bucket is a stack, a list linked through ``below``. A node that becomes cheaper is put on a stack
@@ -99,68 +115,84 @@ def _dial(
     Entries taken off are used again, so that the lists stay as short as the front is long, and in the processor's
     cache.
     """
-    cols = weight.shape[1]
+    u = np.uint64  # as indices, others are tested for being negative
     weights, costs, steps = weight.ravel(), cost.ravel(), step.ravel()
-    offsets = _D_ROW * cols + _D_COL
-    diagonal = 0.5 * math.sqrt(2.0)
     ahead, ahead_count = _ahead()
+    offsets, beside, half_lengths = _edges(ahead, weight.shape[1])
     # Each of its eight edges makes a node cheaper once at most. What is never written takes no memory.
     node_of = np.empty(8 * weights.shape[0], dtype=np.int32)
     below = np.empty(8 * weights.shape[0], dtype=np.int32)
     top = np.full(buckets, -1, dtype=np.int32)
     used, spare = 1, np.int32(-1)
-    start = start_row * cols + start_col
+    start = start_row * weight.shape[1] + start_col
     costs[start] = 0.0
     node_of[0], below[0], top[0] = start, -1, 0
     waiting = 1
     bucket = place = 0  # place is bucket modulo buckets
-    while waiting > 0:
-        while top[place] >= 0:
-            entry = top[place]
+    while waiting > 0 and bucket < last:
+        while top[u(place)] >= 0:
+            entry = u(top[u(place)])
             node = np.int64(node_of[entry])
-            top[place] = below[entry]
+            top[u(place)] = below[entry]
             below[entry] = spare
-            spare = entry
+            spare = np.int32(entry)
             waiting -= 1
-            here = costs[node]
+            here = costs[u(node)]
             if int(here) != bucket:  # done, from a lower bucket
                 continue
-            own = weights[node]
+            own = weights[u(node)]
             least = here + np.float32(1.0)
-            way = np.int64(steps[node])  # −1, at the start, is the last row
-            for i in range(ahead_count[way]):
-                k = ahead[way, i]
-                other = node + offsets[k]
+            way = u(steps[u(node)]) if steps[u(node)] >= 0 else u(8)
+            for i in range(u(ahead_count[way])):
+                other = u(node + offsets[way, i])
                 before = costs[other]
                 if before <= least:  # most neighbours: settled, at no more than the cheapest edge would make
                     continue
                 price = weights[other]
                 if price <= 0.0:
                     continue
-                total = here + np.float32((diagonal if k & 1 else 0.5) * (own + price))
+                total = here + np.float32(half_lengths[way, i] * (own + price))
                 if total >= before:
                     continue
-                if k & 1 and (
-                    weights[node + offsets[k - 1]] <= 0.0 or weights[node + offsets[(k + 1) & 7]] <= 0.0
-                ):
-                    continue
+                k = ahead[way, i]
+                if k & 1:
+                    left, right = u(node + beside[way, i, u(0)]), u(node + beside[way, i, u(1)])
+                    if weights[left] <= 0.0 or weights[right] <= 0.0:
+                        continue
                 costs[other] = total
                 steps[other] = k
                 to = place + int(total) - bucket
                 if to >= buckets:
                     to -= buckets
                 if spare >= 0:
-                    entry = spare
+                    entry = u(spare)
                     spare = below[entry]
                 else:
-                    entry = np.int32(used)
+                    entry = u(used)
                     used += 1
-                node_of[entry] = other
-                below[entry] = top[to]
-                top[to] = entry
+                node_of[entry] = np.int32(other)
+                below[entry] = top[u(to)]
+                top[u(to)] = np.int32(entry)
                 waiting += 1
         bucket += 1
         place = place + 1 if place + 1 < buckets else 0
+    for rest in top:
+        while rest >= 0:
+            if costs[node_of[rest]] >= bucket:
+                costs[node_of[rest]], steps[node_of[rest]] = np.inf, -1
+            rest = below[rest]
+    return waiting == 0
+
+
+@njit(cache=True, nogil=True)
+def _to_metres(
+    cost: NDArray[np.float32], resolution: np.float32, reached: NDArray[np.uint8], beyond: np.float32
+) -> None:
+    """Turn cells into metres, and what is unknown into ``beyond`` where it was ``reached``: 2."""
+    for row in range(cost.shape[0]):
+        for col in range(cost.shape[1]):
+            known = cost[row, col] * resolution
+            cost[row, col] = beyond if known == np.inf and reached[row, col] == 2 else known
 
 
 @njit(cache=True, nogil=True)
@@ -180,6 +212,24 @@ def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
                 ahead[way, count[way]] = k
                 count[way] += 1
     return ahead, count
+
+
+@njit(cache=True, nogil=True)
+def _edges(ahead: NDArray[np.int64], cols: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Return where the neighbours lie ``(9, 8)``, and the two cells beside each step ``(9, 8, 2)``, by index.
+
+    And half the length of each step ``(9, 8)``.
+    """
+    around = _D_ROW * cols + _D_COL
+    offsets, half_lengths = np.zeros((9, 8), dtype=np.int64), np.zeros((9, 8))
+    beside = np.zeros((9, 8, 2), dtype=np.int64)
+    for way in range(9):
+        for i in range(8):
+            k = ahead[way, i]
+            offsets[way, i] = around[k]
+            beside[way, i, 0], beside[way, i, 1] = around[(k - 1) & 7], around[(k + 1) & 7]
+            half_lengths[way, i] = 0.5 * math.sqrt(2.0) if k & 1 else 0.5
+    return offsets, beside, half_lengths
 
 
 @njit(cache=True, nogil=True)

@@ -39,16 +39,16 @@ def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64], *,
 def _along_tree(cost: NDArray[np.float32], step: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
     n = len(cells)
     out = np.zeros((n, n))
-    passed = np.full(cost.shape, -1, dtype=np.int32)
+    passed = np.zeros(cost.shape, dtype=np.int32)  # by the way to which place, from 1; zeros take no time
     for i in range(n):
         row, col = cells[i, 0], cells[i, 1]
-        passed[row, col] = i
+        passed[row, col] = i + 1
         while step[row, col] >= 0:
             row, col = cell_before(step, row, col)
-            passed[row, col] = i
+            passed[row, col] = i + 1
         for j in range(i):
             row, col = cells[j, 0], cells[j, 1]
-            while passed[row, col] != i and step[row, col] >= 0:
+            while passed[row, col] != i + 1 and step[row, col] >= 0:
                 row, col = cell_before(step, row, col)
             out[i, j] = cost[cells[i, 0], cells[i, 1]] + cost[cells[j, 0], cells[j, 1]] - 2.0 * cost[row, col]
             out[j, i] = out[i, j]

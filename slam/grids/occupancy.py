@@ -70,6 +70,8 @@ class OccupancyGrid:
         Cells a side of a block.
     revision : int
         Goes up when the whole map was redrawn, so that whoever follows ``take_changes`` starts over.
+    drawings : int
+        Goes up whenever anything is drawn, so that any number of readers can ask :meth:`drawn_since`.
     """
 
     def __init__(self, resolution: float = 0.05) -> None:
@@ -82,7 +84,8 @@ class OccupancyGrid:
         self.log_odds, self.visited = _blank(shape).view(np.int8), _blank(shape)
         self.known_cells = 0
         self.entropy_bit = 0.0
-        self.revision = 0
+        self.revision = self.drawings = 0
+        self._drawn = np.zeros((2, 2), np.int64)  # the last drawing that touched each chunk
         self._changes = np.zeros((1024, 4), np.int32)
         self._change_count = 0
         self._lidar: tuple[int, float, float, float] | None = None
@@ -108,6 +111,7 @@ class OccupancyGrid:
         view[classes == FREE] = MIN_LOG_ODDS
         grid.known_cells = int(np.count_nonzero(grid.log_odds))
         grid._build_overview()
+        grid._note_drawn(row, col, row + rows, col + cols)
         return grid
 
     # ---- geometry ------------------------------------------------------------------------------------------
@@ -168,6 +172,19 @@ class OccupancyGrid:
         self._change_count = 0
         return changes
 
+    def drawn_since(self, drawing: int) -> tuple[int, int, int, int]:
+        """Return a box around all that was drawn after so many ``drawings``; it is empty where nothing was.
+
+        First row and column, and those beyond the last. Nothing is forgotten: every reader counts for itself.
+        """
+        chunks = self._drawn > drawing
+        rows, cols = np.flatnonzero(chunks.any(axis=1)), np.flatnonzero(chunks.any(axis=0))
+        if not len(rows):
+            return 0, 0, 0, 0
+        return (
+            _CHUNK * int(rows[0]), _CHUNK * int(cols[0]), _CHUNK * int(rows[-1] + 1), _CHUNK * int(cols[-1] + 1)
+        )  # fmt: skip
+
     def agreement(self, sensor_pose: Array, scan: Scan) -> float:
         """Return the sum of the log-odds [nat] of the cells that a scan's beams end in, seen from a pose ``(3,)``.
 
@@ -191,6 +208,7 @@ class OccupancyGrid:
         self.revision += 1
         self._change_count = 0
         self._build_overview()
+        self._note_drawn(self._row0, self._col0, self._row1, self._col1)
 
     def redraw(self, sensor_poses: Array, scans: Iterable[tuple[Scan, NDArray[np.int16]]]) -> None:
         """Draw anew from poses ``(n, 3)`` of scans, each with its surfaces; followers start over."""
@@ -203,6 +221,7 @@ class OccupancyGrid:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
         x, y, radius = self._make_room_for(x, y, radius)
         mark_disc(self.visited, self.overview_sums, self._overview_shift, y - self._row0, x - self._col0, radius)
+        self._note_disc(x, y, radius)
 
     def integrate(
         self, sensor_pose: Array | tuple[float, float, float], scan: Scan,
@@ -254,6 +273,9 @@ class OccupancyGrid:
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
+        self._note_drawn(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
+        if body is not None:
+            self._note_disc(body_x, body_y, radius)
 
     def _prepare_for(self, scan: Scan) -> None:
         """Make the tables and buffers for scans of this one's lidar, where the last one was of another."""
@@ -280,6 +302,17 @@ class OccupancyGrid:
         self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
         return x, y, radius
 
+    def _note_disc(self, x: float, y: float, radius: float) -> None:
+        """Take note that a disc was drawn, in cells of the lattice."""
+        self._note_drawn(int(y - radius) - 1, int(x - radius) - 1, int(y + radius) + 2, int(x + radius) + 2)
+
+    def _note_drawn(self, row0: int, col0: int, row1: int, col1: int) -> None:
+        """Take note that lattice cells [row0, row1) × [col0, col1) were drawn in."""
+        self.drawings += 1
+        rows = slice(max(row0 - self._row0, 0) // _CHUNK, -((self._row0 - row1) // _CHUNK))
+        cols = slice(max(col0 - self._col0, 0) // _CHUNK, -((self._col0 - col1) // _CHUNK))
+        self._drawn[rows, cols] = self.drawings
+
     def _grow(self, row0: int, col0: int, row1: int, col1: int) -> None:
         """Make room for lattice cells [row0, row1) × [col0, col1), in chunks and with some to spare."""
         if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row1 and col1 <= self._col1:
@@ -298,7 +331,10 @@ class OccupancyGrid:
         log_odds, visited = _blank(shape).view(np.int8), _blank(shape)
         log_odds[r : r + rows, c : c + cols] = self.log_odds
         visited[r : r + rows, c : c + cols] = self.visited
-        self.log_odds, self.visited = log_odds, visited
+        drawn = np.zeros((shape[0] // _CHUNK, shape[1] // _CHUNK), np.int64)
+        r, c, (rows, cols) = r // _CHUNK, c // _CHUNK, self._drawn.shape
+        drawn[r : r + rows, c : c + cols] = self._drawn
+        self.log_odds, self.visited, self._drawn = log_odds, visited, drawn
         self._row0, self._col0, self._row1, self._col1 = new_row0, new_col0, new_row1, new_col1
         self._build_overview()
 

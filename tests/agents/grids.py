@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,8 +13,10 @@ from mecanum_env.config import RobotConfig
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.types import Scan
 
 RESOLUTION = 0.05
+_BEAMS = 180
 
 
 def belief_of(
@@ -79,3 +84,40 @@ def drive(pose: NDArray[np.float64], action: NDArray[np.float32], robot: RobotCo
     """Move a robot that does at once what it is told."""
     limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])
     return geometry.compose(pose, geometry.exp(action.astype(np.float64) * limits * dt))
+
+
+def scan_of(rng: np.random.Generator, reach_m: float = 3.0) -> Scan:
+    """A scan of walls that come and go."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _BEAMS, endpoint=False)
+    waves = rng.uniform(0.0, 1.0, 4) @ np.cos(np.outer(np.arange(1, 5), angles) + rng.uniform(0, 6, (4, 1)))
+    ranges = np.clip(reach_m * (0.6 + 0.2 * waves), 0.2, None)
+    ranges[rng.random(_BEAMS) < 0.05] = math.inf
+    return Scan(ranges, 0.0, 2.0 * np.pi / _BEAMS, reach_m + 1.0, 0.02)
+
+
+class Walk:
+    """A belief whose robot walks about and draws what it sees, off the grid again and again."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.pose = np.zeros(3)
+        self.grid = OccupancyGrid()
+        self.kept: list[tuple[np.ndarray, Scan]] = []
+
+    def go(self, steps: int) -> Belief:
+        for _ in range(steps):
+            self.pose += self.rng.normal(0.0, [0.5, 0.5, 1.0])
+            scan = scan_of(self.rng)
+            self.kept.append((self.pose.copy(), scan))
+            self.grid.integrate(self.pose, scan, body=(self.pose[0], self.pose[1], 0.25))
+        return self.belief()
+
+    def redraw(self) -> Belief:
+        """The whole map, from poses that are a little different."""
+        poses = np.array([pose for pose, _ in self.kept]) + self.rng.normal(0.0, 0.03, (len(self.kept), 3))
+        self.grid.redraw(poses, [(scan, np.zeros(0, np.int16)) for _, scan in self.kept])
+        return self.belief()
+
+    def belief(self) -> Belief:
+        known = belief_of(room(1.0, 1.0), tuple(self.pose), sigma=float(self.rng.choice([0.01, 0.03, 0.1])))
+        return replace(known, grid=self.grid)

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 
 import agents
 from agents.stations.lattice import count_in_sight, in_sight, join, line_is_free, ways
-from agents.tour import Outlook, TourConfig
+from agents.tour import Outlook, Tour, TourConfig
 from agents.ways import cost_map as cost_maps
 from agents.ways.cost_map import PlannerConfig
 from agents.ways.planning import travel_costs
 from agents.ways.routing import best_tour, cover, draw_luck, improve, nearest_order, order_cost, tours_begun_with
 from agents.ways.travel import between
-from mecanum_env.config import RobotConfig
+from mecanum_env.config import LidarConfig, RobotConfig
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from tests.agents.grids import belief_of, fill, room, two_rooms
+from tests.agents.grids import Walk, belief_of, fill, room, two_rooms
 
 SHORT = {"view_range_m": 0.8}
 seeds = st.integers(0, 2**31 - 1)
@@ -249,3 +249,34 @@ def test_stops_on_stations_only():
     hops = (goal.pose[:2] - 0.2) / 4.0
     np.testing.assert_allclose(hops, np.round(hops), atol=1e-9)
     assert goal.pose[0] > 10.0
+
+
+class AsksForAll(Tour):
+    """The tour, with ways to every frontier searched for at every choice."""
+
+    def _costs_asked(self) -> None:
+        return None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_choices_are_those_made_with_ways_to_everywhere(seed, monkeypatch):
+    monkeypatch.setattr("agents.explorer._WITHIN_M", 0.5)
+    config = {"places": 2, "frontiers": {"far_m": 1.0, "min_unknown_m2": 0.01}}
+    walk, within = Walk(seed), []
+    lidar = LidarConfig()
+    some, every = (kind(config, robot=RobotConfig(), lidar=lidar, step_s=0.1) for kind in (Tour, AsksForAll))
+    for agent in (some, every):
+        agent.reset(walk.go(1), seed)
+    for _ in range(12):
+        belief = walk.go(2)
+        goals = []
+        for agent in (some, every):
+            agent.looked(belief)
+            goals.append(agent.choose(belief))
+            if goals[-1] is not None and agent is some:
+                within.append(agent._within_m)
+        assert (goals[0] is None) == (goals[1] is None) and some.status == every.status
+        if goals[0] is not None:
+            np.testing.assert_array_equal(goals[0].path, goals[1].path)
+            np.testing.assert_array_equal(goals[0].pose, goals[1].pose)
+    assert within and max(within) > min(within)  # it was not always as far as the least

@@ -126,6 +126,26 @@ def test_travel_costs_and_their_ties_against_the_plain_algorithm(seed, levels):
     np.testing.assert_array_equal(travel.step, step)
 
 
+@settings(max_examples=60, deadline=None)
+@given(seeds, st.sampled_from([1, 2, 9]), st.floats(0.0, 3.0))
+def test_ways_within_a_cost_are_the_same_and_beyond_it_is_known_where_there_are_any(seed, levels, within_m):
+    rng = np.random.default_rng(seed)
+    weight = rng.integers(1, levels + 1, rng.integers(4, 24, 2)).astype(np.float32)
+    weight[rng.random(weight.shape) < 0.5 * rng.random()] = 0.0
+    weight[[0, -1], :] = weight[:, [0, -1]] = 0.0
+    weight[2, 2] = 1.0
+    cost_map = plain_cost_map(np.zeros(weight.shape, dtype=np.int8), weight, (2, 2))
+    whole, part = travel_costs(cost_map), travel_costs(cost_map, within_m=within_m)
+    near = part.cost < part.beyond_m
+    assert near[whole.cost < within_m].all() or np.isfinite(whole.cost).sum() == near.sum()
+    np.testing.assert_array_equal(part.cost[near], whole.cost[near])
+    np.testing.assert_array_equal(part.step[near], whole.step[near])
+    np.testing.assert_array_equal(np.isfinite(part.cost), np.isfinite(whole.cost))
+    far = ~near & np.isfinite(whole.cost)
+    assert (whole.cost[far] >= part.beyond_m).all() and (part.cost[far] == np.float32(part.beyond_m)).all()
+    assert (part.step[far & (part.cost > part.beyond_m)] == -1).all()
+
+
 @settings(max_examples=80, deadline=None)
 @given(seeds)
 def test_clusters_against_opencv(seed):

@@ -132,6 +132,33 @@ def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share:
     np.testing.assert_array_equal(kept, grid.overview_sums)
 
 
+def test_every_reader_is_told_what_was_drawn_since_it_looked() -> None:
+    grid, rng = OccupancyGrid(), np.random.default_rng(0)
+    read = {"often": (grid.drawings, grid.log_odds.copy()), "seldom": (grid.drawings, grid.log_odds.copy())}
+    origins = dict.fromkeys(read, grid.lattice_origin)
+    for k in range(24):
+        pose = np.array([rng.uniform(-20, 20), rng.uniform(-20, 20), rng.uniform(-3, 3)])
+        seen = room_scan(np.array([3.0, 2.5, pose[2]]))  # wherever it is taken from
+        happens = rng.integers(0, 4)  # or nothing does
+        if happens == 0:
+            grid.mark_visited(pose[0], pose[1], 0.25)
+        elif happens == 1 and k > 10:
+            grid.redraw(pose[None], [(seen, np.zeros(0, np.int16))])
+        elif happens < 3:
+            grid.integrate(pose, seen, body=(pose[0] + 5.0, pose[1], 0.25))
+        for name in ("often", "seldom") if k % 5 == 4 else ("often",):
+            drawing, before = read[name]
+            row0, col0, row1, col1 = grid.drawn_since(drawing)
+            kept = np.zeros(grid.shape, np.int8)
+            r, c = (old - new for old, new in zip(origins[name], grid.lattice_origin, strict=True))
+            kept[r : r + before.shape[0], c : c + before.shape[1]] = before
+            now = np.where(grid.visited, 100, grid.log_odds).astype(np.int8)
+            kept[row0:row1, col0:col1] = now[row0:row1, col0:col1]
+            np.testing.assert_array_equal(kept, now)
+            assert drawing != grid.drawings or row0 == row1
+            read[name], origins[name] = (grid.drawings, now.copy()), grid.lattice_origin
+
+
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda grid: pickle.loads(pickle.dumps(grid))])
 def test_a_copy_goes_its_own_way_and_has_the_bytes_that_kernels_read_behind_the_cells(
     duplicate: Callable[[OccupancyGrid], OccupancyGrid],
