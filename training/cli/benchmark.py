@@ -52,6 +52,7 @@ def benchmark(
     ] = "way-points",
     max_steps: opt.MaxSteps = None,
     workers: opt.Workers = None,
+    ray: opt.Ray = None,
     out: opt.Out = Path("out/benchmark"),
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html, one page of all of it.")
@@ -74,6 +75,7 @@ def benchmark(
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
       mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
     """  # noqa: D301
+    who = opt.workers_of(workers, ray)
     if protocol is not None or maps is not None:
         suites_only = {
             "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
@@ -86,7 +88,7 @@ def benchmark(
         names = [part.strip() for part in agents.split(",") if part.strip()]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers, scan=scan)
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task
@@ -99,7 +101,7 @@ def benchmark(
         floor_plans=floor_plans, max_steps=max_steps,
     )  # fmt: skip
     try:
-        result = task.benchmark(plan, out=out, workers=workers)
+        result = task.benchmark(plan, out=out, workers=who)
     except task.EpisodesFailed as failed:
         if report:
             write_report(out, failed.report)

@@ -7,7 +7,6 @@ numbers of its own, drawn by the run's seed and its number.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -26,6 +25,7 @@ from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork
 from training.learning.end_to_end.ppo import DrivePolicy, DriveWorld, make_model
 from training.learning.end_to_end.rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
 from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, words
+from training.runs.campaign import Pool
 
 __all__ = ["DriveRun", "summary"]
 
@@ -41,7 +41,7 @@ class DriveRun(FolderRun):
     config: DriveConfig
     seeds_from = 2000
 
-    def _train(self, pool: ProcessPoolExecutor) -> None:
+    def _train(self, pool: Pool) -> None:
         torch.manual_seed(self.config.seed)
         self._plan, self._control = PlanNetwork(), ControlNetwork()
         checkpoint = self.out / "checkpoint.safetensors"
@@ -62,7 +62,7 @@ class DriveRun(FolderRun):
 
     # ---- lessons -------------------------------------------------------------------------------------------
 
-    def _round(self, number: int, pool: ProcessPoolExecutor) -> None:
+    def _round(self, number: int, pool: Pool) -> None:
         learning = self.config.learning
         if not (self.out / f"maps-{number}.npz").exists():
             self._give_lessons(number, pool)
@@ -85,7 +85,7 @@ class DriveRun(FolderRun):
         self._keep(round=number + 1)
         self._say(f"round {number} of {len(self.config.lessons.teacher_shares)} done")
 
-    def _give_lessons(self, number: int, pool: ProcessPoolExecutor) -> None:
+    def _give_lessons(self, number: int, pool: Pool) -> None:
         config, weights = self.config, self.weights
         lessons, world = config.lessons, config.world
         rng = np.random.default_rng([self.config.seed, 1000 + number])
@@ -108,7 +108,7 @@ class DriveRun(FolderRun):
 
     # ---- practice ------------------------------------------------------------------------------------------
 
-    def _practise(self, pool: ProcessPoolExecutor) -> None:
+    def _practise(self, pool: Pool) -> None:
         config, ppo = self.config, self.config.ppo
         network = DriveNetwork(self.weights, config.planning, uncertainty=config.uncertainty)
         env = VecMonitor(DummyVecEnv([partial(DriveWorld, config.world, network)] * ppo.environments))
@@ -131,7 +131,7 @@ class DriveRun(FolderRun):
         finally:
             env.close()
 
-    def _evaluate(self, pool: ProcessPoolExecutor, at: dict[str, int]) -> None:
+    def _evaluate(self, pool: Pool, at: dict[str, int]) -> None:
         config, weights = self.config, self.weights
         jobs = [
             Episode(config, weights, rooms, seed, seed, config.world.time_limit_s)
