@@ -11,6 +11,7 @@ import pickle
 import queue
 import signal
 import socket
+import subprocess
 import sys
 import threading
 from collections import deque
@@ -36,7 +37,11 @@ RETRIES = 5
 """How often an item is begun anew where its worker, or the node, died under it."""
 
 LOCAL, RUNNING = "local", "auto"
-_ANSWERS_WITHIN_S = 5.0
+_WITHIN_S = 10.0
+_REMEDY = (
+    "start one by ray start --head and give the address that it names, set RAY_AUTH_MODE=token if it asks for "
+    "one, or leave the address out for a Ray of this machine alone"
+)
 
 
 @dataclass(frozen=True)
@@ -53,27 +58,38 @@ def find_cluster(address: str, most: int | None = None) -> Cluster:
     Raises
     ------
     BadInput
-        Where Ray is not installed, or nothing answers at the address.
+        Where Ray is not installed, or none answers at the address.
     """
     with needs_extra("ray", "--ray"):
         import ray  # noqa: F401
     if address not in (LOCAL, RUNNING):
+        _check_reachable(address)
+    if address != LOCAL:
         _check_answers(address)
     return Cluster(address, most)
 
 
-def _check_answers(address: str) -> None:
-    """Ask at an address before Ray does, which takes long to say in many lines that nobody is there."""
+def _check_reachable(address: str) -> None:
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or "/" in host:
         raise BadInput(f"--ray {address!r} is no address; give HOST:PORT of a cluster's head, auto or local")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), _ANSWERS_WITHIN_S).close()
+        socket.create_connection((host.strip("[]"), int(port)), _WITHIN_S).close()
     except (OSError, OverflowError) as error:
-        raise BadInput(
-            f"--ray {address}: nothing answers there ({one_line(error)}); start it with ray start --head, "
-            "give the address that it names, or leave the address out for a Ray of this machine alone"
-        ) from error
+        raise BadInput(f"--ray {address}: nothing answers there ({one_line(error)}); {_REMEDY}") from error
+
+
+def _check_answers(address: str) -> None:
+    """Ask before ``ray.init`` does, which is long in giving up, and says so in many lines."""
+    where = () if address == RUNNING else ("--address", address)
+    command = (sys.executable, "-m", "ray.scripts.scripts", "status", *where)
+    try:
+        asked = subprocess.run(command, capture_output=True, text=True, timeout=_WITHIN_S, check=False)
+        problem = asked.stderr.strip().rpartition("\n")[2] if asked.returncode else ""
+    except subprocess.TimeoutExpired:
+        problem = f"silent for {_WITHIN_S:.0f} s"
+    if problem:
+        raise BadInput(f"--ray {address}: no Ray answers there ({problem[:200]}); {_REMEDY}")
 
 
 # ---- on a worker -----------------------------------------------------------------------------------------------
@@ -232,10 +248,10 @@ def _connected(cluster: Cluster) -> Iterator[None]:
             cluster.address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False, logging_level="ERROR",
             **settings,
         )  # fmt: skip
-    except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError, OSError) as error:
+    except Exception as error:
         raise BadInput(
-            f"--ray {cluster.address}: cannot use it ({one_line(error)[:300]}); docs/how-to/cluster.md says what "
-            "it needs (the same versions, a node on this machine, RAY_AUTH_MODE=token where it asks for a token)"
+            f"--ray {cluster.address}: cannot use it ({one_line(error)[:300]}); it needs a node on this machine "
+            "(ray start), and the same Python and Ray on every node"
         ) from error
     finally:
         # Ray takes SIGTERM for itself, and would end with what is not stored yet.
