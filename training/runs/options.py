@@ -61,8 +61,9 @@ class Command(TyperCommand):
         """Put in the address that is meant, then parse."""
         meant = os.environ.get("RAY_ADDRESS") or "local"
         words = []
-        for word, after in zip(args, [*args[1:], "--"], strict=True):
-            words += [word, meant] if word == "--ray" and after.startswith("-") else [word]
+        for k, word in enumerate(args):
+            bare = word == "--ray" and (k + 1 == len(args) or args[k + 1].startswith("-"))
+            words += [word, meant] if bare else [word]
         return super().parse_args(ctx, words)
 
 
