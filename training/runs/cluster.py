@@ -162,13 +162,11 @@ class RayPool(Executor):
     def _hand_out(self) -> None:
         """Give Ray what there is to do, never more at a time than was asked for."""
         waiting: deque[tuple[Future[Any], bytes]] = deque()
-        while waiting or self._running or not self._ended:
+        while not self._stopped and (waiting or self._running or not self._ended):
             event = self._events.get()  # None: an item is done, or all shall end
-            if self._stopped:
-                return
             if event is not None:
                 waiting.append(event)
-            while waiting and len(self._running) < self._most:
+            while waiting and len(self._running) < self._most and not self._stopped:
                 future, call = waiting.popleft()
                 if future.set_running_or_notify_cancel():
                     reference = self._task.remote(self._origin, call)
@@ -193,11 +191,11 @@ class RayPool(Executor):
         """End, once all is done; with ``cancel_futures`` stop what runs, too."""
         self._ended, self._stopped = True, cancel_futures
         self._events.put(None)
+        if wait or cancel_futures:
+            self._thread.join()  # whoever hands work to a Ray that is gone starts another
         if cancel_futures:
             for reference in list(self._running):
                 self._ray.cancel(reference, force=True)
-        if wait:
-            self._thread.join()
 
     @contextmanager
     def channel(self) -> Iterator[queue.Queue[Any]]:
