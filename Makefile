@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OTHER_GYMNASIUM := 1.2.2
 OTHER := $(VENV)/gymnasium-$(OTHER_GYMNASIUM)
-RAY := $(VENV)/ray
+RLLIB := $(VENV)/rllib
 SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
@@ -31,7 +31,7 @@ $(VENV)/core.stamp: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test.stamp: $(VENV)/core.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,human,video,ros,rerun,docs]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,human,video,ros,rerun,ray,parquet,docs]'
 	@touch $@
 
 $(OTHER).stamp: $(VENV)/test.stamp
@@ -40,10 +40,10 @@ $(OTHER).stamp: $(VENV)/test.stamp
 	@touch $@
 
 # RLlib pins the oldest Gymnasium, so it cannot share an environment with the newest: all other versions stay.
-$(RAY).stamp: pyproject.toml constraints.txt
-	test -x $(RAY)/bin/python || $(PYTHON) -m venv $(RAY)
-	grep -v '^gymnasium==' constraints.txt > $(RAY)/constraints.txt
-	$(RAY)/bin/python -m pip install --quiet -c $(RAY)/constraints.txt -e '.[ray,test]'
+$(RLLIB).stamp: pyproject.toml constraints.txt
+	test -x $(RLLIB)/bin/python || $(PYTHON) -m venv $(RLLIB)
+	grep -v '^gymnasium==' constraints.txt > $(RLLIB)/constraints.txt
+	$(RLLIB)/bin/python -m pip install --quiet -c $(RLLIB)/constraints.txt -e '.[rllib,test]'
 	@touch $@
 
 install: $(VENV)/core.stamp ## install the core into .venv
@@ -75,8 +75,8 @@ other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) $(API_TESTS)
 
-rllib: $(RAY).stamp ## the RLlib example, in an environment of its own (not in CI: large)
-	$(RAY)/bin/python -m pytest tests/examples -k rllib
+rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in CI: large)
+	$(RLLIB)/bin/python -m pytest tests/examples -k rllib
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo

@@ -17,7 +17,18 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text("utf-8")
 FLOORS = ("slam", "mecanum_env", "agents", "training")  # lowest first
-HEAVY = ("matplotlib", "torch", "stable_baselines3", "pygame", "imageio_ffmpeg", "mcap", "rerun", "mkdocs")
+HEAVY = (
+    "matplotlib",
+    "torch",
+    "stable_baselines3",
+    "pygame",
+    "imageio_ffmpeg",
+    "mcap",
+    "rerun",
+    "mkdocs",
+    "ray",
+    "pyarrow",
+)
 
 # What an agent must not touch: the environment's ground truth, what holds it, and what info tells of it.
 TRUTH_NAMES = {"truth", "true_pose", "floor_plan", "FloorPlan", "position_error_m", "heading_error_rad"}

@@ -192,7 +192,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         for process in getattr(self, "_processes", []):
             process.join(_PATIENCE_S)
             if process.is_alive():
-                process.terminate()
+                process.kill()
                 process.join()
         if (own := getattr(self, "_own", None)) is not None:
             own.close()

@@ -116,7 +116,8 @@ def work(
     mode: AutoresetMode,
 ) -> None:  # fmt: skip
     """Do what the pipe says until it says to quit, or until nobody is at its other end any more."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the caller's affair
+    for told in (signal.SIGINT, signal.SIGTERM):  # they reach every process of a job: it is the caller's affair
+        signal.signal(told, signal.SIG_IGN)
     np.seterr(all="warn")
     share: Share | None = None
     try:

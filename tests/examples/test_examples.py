@@ -34,7 +34,7 @@ def test_every_example_is_run() -> None:
 @pytest.mark.parametrize("name", sorted(RUNS))
 def test_it_runs(name: str, tmp_path: Path) -> None:
     for module in NEEDS[name]:
-        extra = "ray" if module.startswith("ray") else "train"
+        extra = "rllib" if module.startswith("ray") else "train"
         pytest.importorskip(module, reason=f"{name} needs the extra `{extra}`: {module} is not installed")
     arguments, said = RUNS[name]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))

@@ -1,6 +1,6 @@
 """``mecanum benchmark``: agents × backends × suites × seeds.
 
 ``suites`` say what is run, ``run`` runs it, an ``episode`` a row, ``store`` keeps the rows, ``figures`` sums them
-up. ``tables`` are made of those, for ``output``, ``report`` with its ``report_charts``, and ``leaderboard``.
-``evaluate`` and ``ratios`` are studies.
+up. ``tables`` are made of those, for ``output``, ``report`` with its ``report_charts``, and ``leaderboard``;
+``parquet`` is for other programs. ``evaluate`` and ``ratios`` are studies.
 """

@@ -24,7 +24,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Seeds, Workers
+from training.runs.options import Backends, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
 
 __all__ = ["study", "summarise"]
@@ -119,6 +119,7 @@ def study(
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     seeds: Seeds = "10000:10049",
     workers: Workers = None,
+    ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/accuracy"),
 ) -> None:
     """Explore over seeds, rooms and backends: one row each, and their medians."""
@@ -130,7 +131,8 @@ def study(
         jobs = [
             (r, b, s, agent, noise) for s in parse_seeds(seeds) for r in rooms.split(",") for b in slam.split(",")
         ]
-    every = resume(out / "episodes.jsonl", jobs, run_job, workers=workers, what="episodes")
+    who = workers_of(workers, ray)
+    every = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")
     rows = [every[job] for job in sorted(set(jobs))]
     summaries = summarise(rows)
     versions = {name: version(name) for name in ("mecanum-slam", "numpy", "numba", "pymunk", "gymnasium")}

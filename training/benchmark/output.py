@@ -16,7 +16,7 @@ from training.figures.statistics import Comparison, Interval
 from training.figures.tables import csv_table
 from training.runs.running import plain
 
-__all__ = ["FILES", "Entry", "Report", "as_json", "centres", "markdown", "table", "write_tables"]
+__all__ = ["FILES", "KEY_COLUMNS", "Entry", "Report", "as_json", "centres", "markdown", "table", "write_tables"]
 
 FILES = (
     "results.sqlite",
@@ -27,10 +27,10 @@ FILES = (
     "summary.json",
     "tables.md",
 )
-"""What a benchmark writes, beside settings.json and, if asked for, report.html."""
+"""What a benchmark writes, beside settings.json and, if asked for, report.html and episodes.parquet."""
 
 _WHO_COLUMNS = ("suite", "agent", "slam")
-_KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
+KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
 # What a terminal has room for.
 _COLUMNS = (
     "reached_95", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
@@ -137,7 +137,7 @@ def write_tables(out: Path, report: Report) -> None:
     """Write ``episodes.csv``, ``summary.csv``, ``comparison.csv`` and ``summary.json``."""
     found = as_json(report)
     episodes = [
-        dict(zip(_KEY_COLUMNS, key, strict=True)) | row.metrics
+        dict(zip(KEY_COLUMNS, key, strict=True)) | row.metrics
         for entry in report.entries
         for key, row in zip(entry.group.keys, entry.group.rows, strict=True)
     ]
@@ -146,7 +146,7 @@ def write_tables(out: Path, report: Report) -> None:
         for e in report.entries
         for key, figure in _figures(e).items()
     ]
-    atomic_write(out / "episodes.csv", csv_table(episodes, _KEY_COLUMNS))
+    atomic_write(out / "episodes.csv", csv_table(episodes, KEY_COLUMNS))
     atomic_write(out / "summary.csv", csv_table(summary, _WHO_COLUMNS))
     atomic_write(out / "comparison.csv", csv_table(_comparison(report, found["comparison"]), _WHO_COLUMNS))
     text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)

@@ -27,7 +27,7 @@ from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
 from training.episodes.room_pictures import parse_seeds
-from training.runs.campaign import backend_names, keep_settings, run_all
+from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
 from training.runs.running import versions
@@ -152,7 +152,7 @@ class BenchmarkPlan:
         return _config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
 
 
-def benchmark(plan: BenchmarkPlan, *, out: Path, workers: int | None) -> Report:
+def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
     """Run the episodes that ``out`` does not hold yet, write the tables, and return what they hold.
 
     Raises

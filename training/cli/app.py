@@ -21,6 +21,7 @@ from training.cli.rooms import rooms
 from training.cli.study import study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
+from training.runs.options import Command
 from training.runs.signals import INTERRUPTED, TERMINATED, heed_sigterm
 
 __all__ = ["app", "main"]
@@ -70,7 +71,7 @@ def _root(
 
 
 for command in (explore, rooms, speed, consistency, complexity, replay, benchmark, train, play, policy):
-    app.command()(command)
+    app.command(cls=Command)(command)
 # A study's options are its own: what follows the name is handed on as it was typed.
 app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})(
     study

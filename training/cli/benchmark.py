@@ -52,9 +52,13 @@ def benchmark(
     ] = "way-points",
     max_steps: opt.MaxSteps = None,
     workers: opt.Workers = None,
+    ray: opt.Ray = None,
     out: opt.Out = Path("out/benchmark"),
     report: Annotated[
         bool, typer.Option("--report", help="Also write report.html, one page of all of it.")
+    ] = False,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Also write episodes.parquet, for pandas, DuckDB and the like.")
     ] = False,
     as_json: opt.Json = False,
 ) -> None:
@@ -63,7 +67,7 @@ def benchmark(
     Writes into --out: results.sqlite with each episode as it comes, so that the same command goes on where it was
     broken off and more agents, backends, suites or seeds are added to those that are there; episodes.csv,
     summary.csv, comparison.csv, tables.md, summary.json, config.toml, settings.json and, with --report,
-    report.html. docs/how-to/benchmark.md says what is counted, and how.
+    report.html, with --parquet, episodes.parquet. docs/how-to/benchmark.md says what is counted, and how.
 
     \b
     Examples:
@@ -72,12 +76,15 @@ def benchmark(
       mecanum benchmark --suite apartments,apartments-slippery --slam ekf,invariant-ekf --workers 2 --out out/two
       mecanum benchmark --suite all --split validation --out out/validation --json
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
+      mecanum benchmark --suite all --ray 10.0.0.5:6379 --out out/cluster --parquet
       mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
     """  # noqa: D301
+    who = opt.workers_of(workers, ray)
     if protocol is not None or maps is not None:
         suites_only = {
             "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
             "--baseline": baseline, "--max-steps": max_steps, "--report": report or None,
+            "--parquet": parquet or None,
         }  # fmt: skip
         _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
         assert maps is not None
@@ -86,26 +93,34 @@ def benchmark(
         names = [part.strip() for part in agents.split(",") if part.strip()]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=workers, scan=scan)
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task
+    from training.benchmark.output import Report, table
     from training.benchmark.output import as_json as as_mapping
-    from training.benchmark.output import table
+    from training.benchmark.parquet import require, write_parquet
     from training.benchmark.report import write_report
 
     plan = task.BenchmarkPlan.parse(
         suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
         floor_plans=floor_plans, max_steps=max_steps,
     )  # fmt: skip
-    try:
-        result = task.benchmark(plan, out=out, workers=workers)
-    except task.EpisodesFailed as failed:
+    if parquet:
+        require()
+
+    def write(result: Report) -> None:
         if report:
-            write_report(out, failed.report)
+            write_report(out, result)
+        if parquet:
+            write_parquet(out, result)
+
+    try:
+        result = task.benchmark(plan, out=out, workers=who)
+    except task.EpisodesFailed as failed:
+        write(failed.report)
         raise
-    if report:
-        write_report(out, result)
+    write(result)
     print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Json, Workers
+from training.runs.options import Backends, Json, Ray, Workers, workers_of
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -67,6 +67,7 @@ def consistency(
     noise: Annotated[float, typer.Option(help="Times the noise, told to the backends.")] = 1.0,
     seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
     workers: Workers = None,
+    ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/consistency"),
     as_json: Json = False,
 ) -> None:
@@ -84,8 +85,9 @@ def consistency(
     from training.studies import consistency as study
 
     result = study.consistency(
-        backends=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0, out=out, workers=workers
-    )
+        backends=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0, out=out,
+        workers=workers_of(workers, ray),
+    )  # fmt: skip
     print(json.dumps(result) if as_json else study.table(result))
 
 

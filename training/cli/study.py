@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from training.runs.errors import BadInput, needs_extra, suggestion
+from training.runs.options import Command
 
 __all__ = ["STUDIES", "study", "study_command"]
 
@@ -70,5 +71,5 @@ def study_command(name: str) -> Any:
         add_completion=False, rich_markup_mode=None, context_settings={"help_option_names": ["-h", "--help"]}
     )
     with needs_extra("train"):
-        app.command(name)(import_module(STUDIES[name][0]).study)
+        app.command(name, cls=Command)(import_module(STUDIES[name][0]).study)
     return typer.main.get_command(app)

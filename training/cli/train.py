@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from training.runs.errors import BadInput, Interrupted, bad_input, check_writable, needs_extra, suggestion
+from training.runs.options import Ray, workers_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -37,6 +38,7 @@ def train(
             help="Processes of lessons and trials; members trained at once.  [default: one a core]",
         ),
     ] = None,
+    ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
 ) -> None:
@@ -62,9 +64,10 @@ def train(
         raise BadInput(f"{out} holds no run to go on with; leave out --resume")
     with needs_extra("train", "training"):
         make_run = _runner(settings)
+    who = workers_of(workers, ray) or os.cpu_count() or 1
     with bad_input():
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
-        run = make_run(settings, out, workers=workers or os.cpu_count() or 1, log=_say, command=command)
+        run = make_run(settings, out, workers=who, log=_say, command=command)
     try:
         run.train()
     except KeyboardInterrupt as error:

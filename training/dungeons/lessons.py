@@ -24,7 +24,7 @@ from slam.grids.occupancy import FREE, OCCUPIED
 from training.dungeons.plans import dungeon_plan
 from training.dungeons.walks import MOST, MOST_HOPS, LearnedDriver, Stop, TourDriver, Walk
 from training.dungeons.world import CELL_M
-from training.runs.campaign import run_all
+from training.runs.campaign import Workers, run_all
 
 __all__ = ["Lessons", "gather", "lessons_of", "read_lessons"]
 
@@ -104,7 +104,7 @@ def _true_share(stop: Stop, shown: Picture) -> NDArray[np.uint8]:
 # ---- on disk ---------------------------------------------------------------------------------------------------
 
 
-def gather(folder: Path, seeds: range, *, policy: Path | None = None, workers: int = 1) -> None:
+def gather(folder: Path, seeds: range, *, policy: Path | None = None, workers: Workers = 1) -> None:
     """Write the lessons of each seed that the folder does not hold yet, a file a plan.
 
     ``policy`` holds the weights of the network that drives; the tour does where there is none.
@@ -117,8 +117,9 @@ def gather(folder: Path, seeds: range, *, policy: Path | None = None, workers: i
     folder.mkdir(parents=True, exist_ok=True)
     jobs = [seed for seed in seeds if not _file(folder, seed).exists()]
     if jobs:
-        write = functools.partial(_write, folder, policy)
-        run_all(jobs, write, workers=workers, keep=lambda _job, _result: None, what="plans")
+        # A worker need not see the folder.
+        of_seed = functools.partial(_arrays, None if policy is None else policy.read_bytes())
+        run_all(jobs, of_seed, workers=workers, keep=functools.partial(_write, folder), what="plans")
 
 
 def read_lessons(*parts: tuple[Path, range]) -> Lessons:
@@ -137,12 +138,15 @@ def _file(folder: Path, seed: int) -> Path:
 
 
 @functools.lru_cache(maxsize=1)
-def _driver(policy: Path | None) -> TourDriver:
+def _driver(policy: bytes | None) -> TourDriver:
     return TourDriver() if policy is None else LearnedDriver.read(policy)
 
 
-def _write(folder: Path, policy: Path | None, seed: int) -> None:
+def _arrays(policy: bytes | None, seed: int) -> dict[str, NDArray[Any]]:
     lessons = lessons_of(seed, _driver(policy))
-    arrays = {} if lessons is None else {f.name: getattr(lessons, f.name) for f in fields(lessons)}
+    return {} if lessons is None else {f.name: getattr(lessons, f.name) for f in fields(lessons)}
+
+
+def _write(folder: Path, seed: int, arrays: dict[str, NDArray[Any]]) -> None:
     with replacing(_file(folder, seed)) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]

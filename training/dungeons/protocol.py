@@ -25,7 +25,7 @@ from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import Dungeon, layout, load
 from training.figures.tables import csv_table, markdown_table, number
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import Workers, installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
 from training.runs.rows import resume
 
@@ -61,7 +61,7 @@ _RESAMPLES = 10_000
 
 
 def run_dungeons(
-    maps: Path, agent_names: Sequence[str], *, out: Path, workers: int | None = 1, scan: str = "way-points"
+    maps: Path, agent_names: Sequence[str], *, out: Path, workers: Workers = 1, scan: str = "way-points"
 ) -> dict[str, Any]:
     """Run every agent on every map that ``out`` does not hold yet, and return the summary of all asked for.
 

@@ -31,7 +31,8 @@ from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork
 from training.dungeons.plans import dungeon_plan
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import Workers, installed_version, keep_settings
+from training.runs.options import Ray, workers_of
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
@@ -250,17 +251,18 @@ def study(
     free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Processes that gather lessons.")] = 1,
+    ray: Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""
     config = TrainingConfig(
         rounds=rounds, plans=plans, later_plans=later_plans, validation_plans=validation_plans, epochs=epochs,
         batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, seed=seed,
     )  # fmt: skip
-    run(out, config, workers=workers)
+    run(out, config, workers=workers_of(workers, ray))
     print(out / _WEIGHTS)
 
 
-def run(out: Path, config: TrainingConfig, *, workers: int) -> None:
+def run(out: Path, config: TrainingConfig, *, workers: Workers) -> None:
     """Gather lessons, train and write the policy."""
     settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
     keep_settings(out, settings, [_WEIGHTS])

@@ -10,13 +10,12 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from safetensors.torch import load_file
+from safetensors.torch import load
 
 from agents.learned.station_network import (
     PLANES,
@@ -193,11 +192,11 @@ class LearnedDriver(TourDriver):
         self._network = halved.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
     @classmethod
-    def read(cls, path: Path) -> LearnedDriver:
+    def read(cls, weights: bytes) -> LearnedDriver:
         """Return the driver of a file of weights, without what only training needs."""
         network = StationNetwork()
-        weights = {name: value.float() for name, value in load_file(path).items()}
-        network.load_state_dict(weights, strict=False)  # the part that foresees free space is left out there
+        found = {name: value.float() for name, value in load(weights).items()}
+        network.load_state_dict(found, strict=False)  # the part that foresees free space is left out there
         return cls(network)
 
     def choose(self, stops: Sequence[Stop]) -> list[int]:

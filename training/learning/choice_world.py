@@ -16,7 +16,7 @@ from training.episodes.true_places import TruePlaces
 from training.learning.config import RehearsalConfig, RoomsConfig, WorldConfig
 from training.learning.hindsight import Hindsight
 from training.learning.jump_world import JumpWorld
-from training.runs.campaign import start_worker
+from training.runs.processes import start_worker
 
 __all__ = ["Families", "Rehearsal", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
 

@@ -6,9 +6,9 @@ What PPO comes to from other random weights errs elsewhere: the mean of what the
 from __future__ import annotations
 
 import json
-import multiprocessing
 import queue
-from concurrent.futures import Future, ProcessPoolExecutor
+import socket
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from training.learning.config import TrainConfig
 from training.learning.folder import FolderRun, seed_of
 from training.learning.networks import read_zip
 from training.learning.ppo import Run, Weights, evaluate, trials_in_full
+from training.runs.campaign import Pool
+from training.runs.errors import BadInput
 
 __all__ = ["EnsembleRun", "best_weights", "curve_of"]
 
@@ -26,15 +28,14 @@ class EnsembleRun(FolderRun):
     """A run for each member, in folders ``member-1``, ``member-2`` and so on, and a trial of all at the end.
 
     A member that is done is not trained again. As many members as there are workers are trained at a time, each in
-    one process.
+    one process, which writes into the member's folder: the nodes of a cluster have to share it.
     """
 
     config: TrainConfig
 
-    def _train(self, pool: ProcessPoolExecutor) -> None:
+    def _train(self, pool: Pool) -> None:
         folders = _folders(self.config, self.out)
-        with multiprocessing.get_context("spawn").Manager() as manager:
-            said = manager.Queue()
+        with pool.channel() as said:
             futures = []
             for number, folder in enumerate(folders):
                 config = replace(self.config, members=1, seed=seed_of(self.config.seed, number))
@@ -66,6 +67,12 @@ class EnsembleRun(FolderRun):
 def _train_member(config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]]) -> None:
     def log(text: str) -> None:
         said.put((out.name, text))
+
+    if not (out.parent / "progress.json").exists():
+        raise BadInput(
+            f"{socket.gethostname()} has no {out.parent}: members are trained into --out; give a folder "
+            "that every node shares"
+        )
 
     Run(config, out, workers=1, log=log, command=command).train()
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from slam.formats import atomic_write, replacing
 from slam.settings import to_mapping
 from training.learning.config import PpoConfig
-from training.runs.campaign import worker_pool
+from training.runs.campaign import Pool, Workers, worker_pool
 
 __all__ = ["FIRST_VALIDATION_SEED", "FolderRun", "save_model", "seed_of", "words"]
 
@@ -47,7 +46,7 @@ class FolderRun:
     """Number of the first chunk's seed."""
 
     def __init__(
-        self, config: Any, out: Path, *, workers: int, log: Callable[[str], None], command: str = ""
+        self, config: Any, out: Path, *, workers: Workers, log: Callable[[str], None], command: str = ""
     ) -> None:
         self.config, self.out, self._workers, self._log = config, out, workers, log
         settings = json.loads(json.dumps(to_mapping(config)))
@@ -73,7 +72,7 @@ class FolderRun:
             self._train(pool)
         self._keep(done=True)
 
-    def _train(self, pool: ProcessPoolExecutor) -> None:
+    def _train(self, pool: Pool) -> None:
         raise NotImplementedError
 
     def _learn(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -20,7 +19,8 @@ from training.learning.config import PpoConfig, TrainConfig, WorldConfig
 from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, save_model
 from training.learning.networks import ChoicePolicy, read_zip
 from training.learning.semi_markov import Durations, SemiMarkovBuffer
-from training.runs.campaign import one_thread_each
+from training.runs.campaign import Pool
+from training.runs.processes import one_thread_each
 
 __all__ = ["Run", "Trial", "evaluate", "make_model", "trials_in_full"]
 
@@ -30,18 +30,18 @@ Weights = dict[str, NDArray[np.float32]]
 class Run(FolderRun):
     """A run of one network: chunks of rollouts, those of the rehearsal first; the folder gets ``best.zip``, too.
 
-    With one worker the rollouts are made in this process; with more, each of their environments has a process of
-    its own. What is learned is the same.
+    With one worker the rollouts are made in this process; with more, or on a cluster, each of their environments
+    has a process of its own on this machine: they step in turn with the network. What is learned is the same.
     """
 
     config: TrainConfig
 
-    def _train(self, pool: ProcessPoolExecutor) -> None:
+    def _train(self, pool: Pool) -> None:
         for stage in _stages(self.config):
             if self._progress["chunk"] <= stage.first + stage.ppo.chunks:
                 self._enact(stage, pool)
 
-    def _enact(self, stage: _Stage, pool: ProcessPoolExecutor) -> None:
+    def _enact(self, stage: _Stage, pool: Pool) -> None:
         env = VecMonitor(self._environments(stage.makers))
         try:
             model = make_model(self.config, env, stage.ppo)
@@ -63,9 +63,7 @@ class Run(FolderRun):
             apart: Any = [partial(world_of_worker, maker) for maker in makers]
             return SubprocVecEnv(apart, start_method="spawn")
 
-    def _try_out(
-        self, stage: _Stage, model: MaskablePPO, network: torch.nn.Module, pool: ProcessPoolExecutor
-    ) -> None:
+    def _try_out(self, stage: _Stage, model: MaskablePPO, network: torch.nn.Module, pool: Pool) -> None:
         weights = {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
         result = evaluate(weights, self.config.heads, stage.trials, pool)
         at = {"stage": stage.name, "steps": self._progress["steps"]}
@@ -137,7 +135,7 @@ def _trials(
     ]
 
 
-def evaluate(weights: Weights, heads: int, trials: Sequence[Trial], pool: ProcessPoolExecutor) -> dict[str, Any]:
+def evaluate(weights: Weights, heads: int, trials: Sequence[Trial], pool: Pool) -> dict[str, Any]:
     """Return how long a policy, chance aside, takes to 95 % on validation seeds; unreached counts as the limit."""
     ends = list(pool.map(_try, [(weights, heads, trial) for trial in trials]))
     times: dict[str, list[float]] = {trial.family: [] for trial in trials}

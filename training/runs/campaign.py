@@ -3,41 +3,42 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
-import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from concurrent.futures import as_completed
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any, TypeVar
-
-import cv2
 
 import slam
 from slam.formats import atomic_write
 from slam.settings import unknown_name
+from training.runs.cluster import Cluster, RayPool, ray_pool
 from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.processes import ProcessPool, process_pool
 from training.runs.progress import Progress
 from training.runs.running import versions
 
 __all__ = [
+    "Pool",
+    "Workers",
     "backend_names",
     "installed_version",
     "keep_settings",
-    "one_thread_each",
     "run_all",
-    "start_worker",
     "worker_pool",
 ]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+Workers = int | Cluster | None
+"""Who does the work: so many processes of this machine (None: one a core), or those of a Ray cluster."""
+
+Pool = ProcessPool | RayPool
+"""An executor of work, with a ``channel`` for what is said meanwhile."""
+
 SETTINGS = "settings.json"
-# The libraries' own threads only get in each other's way where every core has its worker.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 # ---- what was asked for ----------------------------------------------------------------------------------------
@@ -107,16 +108,18 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
 
 
 def run_all(
-    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: int | None,
+    jobs: Sequence[Job], work: Callable[[Job], Result], *, workers: Workers,
     keep: Callable[[Job, Result], None], what: str = "runs", apart: bool = False,
 ) -> None:  # fmt: skip
-    """Do every job, in ``workers`` processes (None: one a core), and keep each result as it comes.
+    """Do every job, and keep each result as it comes.
 
     Parameters
     ----------
     jobs, work
-        ``work(job)`` is called in a spawned process with single-threaded libraries, or in this one where one
-        worker is enough. Both have to be picklable.
+        ``work(job)`` is called in another process with single-threaded libraries, or in this one where one
+        worker of this machine is enough. Both have to be picklable.
+    workers
+        See :data:`Workers`.
     keep
         Called here with a job and its result.
     what
@@ -133,8 +136,7 @@ def run_all(
     if not total:
         return
     try:
-        at_most = min(workers or os.cpu_count() or 1, total)
-        with Progress(what, total) as progress, closing(_results(jobs, work, at_most, apart)) as results:
+        with Progress(what, total) as progress, closing(_results(jobs, work, workers, apart)) as results:
             progress.show(0, f"0/{total}")
             for job, result in results:
                 keep(job, result)
@@ -147,64 +149,22 @@ def run_all(
 
 
 def _results(
-    jobs: Sequence[Job], work: Callable[[Job], Result], workers: int, apart: bool
+    jobs: Sequence[Job], work: Callable[[Job], Result], workers: Workers, apart: bool
 ) -> Generator[tuple[Job, Result], None, None]:
-    if workers == 1 and not apart:
-        for job in jobs:
-            yield job, work(job)
-        return
+    if not isinstance(workers, Cluster):
+        workers = min(workers or os.cpu_count() or 1, len(jobs))
+        if workers == 1 and not apart:
+            for job in jobs:
+                yield job, work(job)
+            return
     with worker_pool(workers) as pool:
         futures = {pool.submit(work, job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
 
-@contextmanager
-def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Give spawned processes with single-threaded libraries, which Ctrl-C ends when it ends this one."""
-    before = set(multiprocessing.active_children())
-    with one_thread_each():
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(workers, mp_context=context, initializer=start_worker)
-        try:
-            yield pool
-        except BaseException:
-            # Do not wait for what is half done: nobody will keep it.
-            pool.shutdown(wait=False, cancel_futures=True)
-            for child in set(multiprocessing.active_children()) - before:
-                child.kill()
-            raise
-        pool.shutdown()
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Have the processes that are started meanwhile load their libraries with one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def start_worker() -> None:
-    """Set up a worker process: it leaves Ctrl-C and SIGTERM to its parent, and ends with it."""
-    # Ctrl-C reaches every process of the terminal's group, a scheduler's SIGTERM every one of its job; the parent
-    # alone decides what they mean.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    cv2.setNumThreads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """End this process when the one that started it is gone: killed, it cannot tell its workers to stop."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+def worker_pool(workers: Workers) -> AbstractContextManager[Pool]:
+    """Give processes with single-threaded libraries, which Ctrl-C ends when it ends this one."""
+    if isinstance(workers, Cluster):
+        return ray_pool(workers)
+    return process_pool(workers or os.cpu_count() or 1)

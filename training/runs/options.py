@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from training.runs.errors import BadInput
 
+if TYPE_CHECKING:
+    from training.runs.campaign import Workers as Whose
+
 __all__ = [
-    "Backends", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Robot", "RoomSeed",
-    "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers", "whole_numbers",
+    "Backends", "Command", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Ray", "Robot",
+    "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers", "whole_numbers", "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
@@ -29,6 +34,14 @@ MaxSteps = Annotated[
 ]
 Noise = Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Ray = Annotated[
+    str | None,
+    typer.Option(
+        metavar="[ADDRESS]",
+        help="Work on Ray: HOST:PORT of a cluster's head, auto (what runs here) or local (started for this "
+        "command; also without an address, unless RAY_ADDRESS has one). See docs/how-to/cluster.md.",
+    ),
+]
 Robot = Annotated[str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")]
 Rooms = Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")]
 RoomSeed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
@@ -39,6 +52,28 @@ Seed = Annotated[int, typer.Option(min=0)]
 Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
 Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
+
+
+class Command(TyperCommand):
+    """A command whose ``--ray`` may stand without an address, which Typer does not offer."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put in the address that is meant, then parse."""
+        meant = os.environ.get("RAY_ADDRESS") or "local"
+        words = []
+        for k, word in enumerate(args):
+            bare = word == "--ray" and (k + 1 == len(args) or args[k + 1].startswith("-"))
+            words += [word, meant] if bare else [word]
+        return super().parse_args(ctx, words)
+
+
+def workers_of(workers: int | None, ray: str | None) -> Whose:
+    """Return who does the work, as ``--workers`` and ``--ray`` say; :class:`BadInput` where Ray is not there."""
+    if ray is None:
+        return workers
+    from training.runs.cluster import find_cluster
+
+    return find_cluster(ray, workers)
 
 
 def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:

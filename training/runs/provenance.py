@@ -9,9 +9,10 @@ from functools import cache
 from importlib.util import find_spec, resolve_name
 from pathlib import Path
 
-__all__ = ["code_digest", "modules_behind", "short_digest"]
+__all__ = ["code_digest", "modules_behind", "project_digest", "short_digest"]
 
 _PROJECT = ("slam", "mecanum_env", "agents", "training")
+_READ = frozenset({".py", ".safetensors", ".json", ".toml"})
 # Who explores is asked for by its own module: neither the registry of the agents nor the bound that knows the map,
 # which stand beside what runs an episode, changes what another agent does.
 _ONLY_IF_ASKED = frozenset({"agents", "training.episodes.known_map"})
@@ -30,6 +31,17 @@ def code_digest(*modules: str) -> str:
     """Return a digest of the source of modules and of all they import, as :func:`modules_behind` finds it."""
     files = modules_behind(*modules)
     return short_digest(part for name in sorted(files) for part in (name.encode(), files[name].read_bytes()))
+
+
+def project_digest() -> str:
+    """Return a digest of all of the project that results may depend on: its source, its policies."""
+    files = []
+    for package in _PROJECT:
+        found = _file(package)
+        assert found is not None
+        files += [(path.relative_to(found.parents[1]), path) for path in found.parent.rglob("*")]
+    kept = sorted((str(name), path) for name, path in files if path.suffix in _READ)
+    return short_digest(part for name, path in kept for part in (name.encode(), path.read_bytes()))
 
 
 def modules_behind(*modules: str) -> dict[str, Path]:

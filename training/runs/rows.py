@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from training.runs.campaign import run_all
+from training.runs.campaign import Workers, run_all
 
 __all__ = ["resume"]
 
@@ -16,7 +16,7 @@ Row = TypeVar("Row")
 
 
 def resume(
-    store: Path, jobs: Sequence[Job], work: Callable[[Job], Row], *, workers: int | None, what: str = "runs",
+    store: Path, jobs: Sequence[Job], work: Callable[[Job], Row], *, workers: Workers, what: str = "runs",
     apart: bool = False,
 ) -> dict[Job, Row]:  # fmt: skip
     """Do the jobs that a store does not hold yet; return the rows of all of them, in their order.

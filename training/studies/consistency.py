@@ -29,7 +29,7 @@ from slam.settings import unknown_name
 from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
 from training.figures.tables import number, text_table
-from training.runs.campaign import backend_names, installed_version, keep_settings
+from training.runs.campaign import Workers, backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.rows import resume
 from training.studies.circle_world import WORLDS, drive, not_observing
@@ -101,7 +101,7 @@ def _in_rooms(name: str, rooms: str, seed: int, steps: int, noise: float) -> Row
 
 def consistency(
     *, backends: str, rooms: str, runs: int, steps: int | None, noise: float, seed0: int, out: Path,
-    workers: int | None,
+    workers: Workers,
 ) -> dict[str, Any]:  # fmt: skip
     """Do the runs that ``out`` does not hold yet, write ``consistency.json`` and ``.png``, return the former.
 

@@ -22,7 +22,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Seeds, Workers
+from training.runs.options import Backends, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
 from training.studies.exploring import exploring
 
@@ -105,16 +105,18 @@ def study(
     slam: Backends = "ekf,invariant-ekf,fastslam1,fastslam2",
     seeds: Seeds = "10000:10019",
     workers: Workers = None,
+    ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper-d"),
 ) -> None:
     """Repeat paper D's table: how far mapped corners are from the true ones, backend by backend."""
     with bad_input():
         backends = backend_names(slam)
         chosen = parse_seeds(seeds)
+    who = workers_of(workers, ray)
     settings = {"version": installed_version(), "max_steps": MAX_STEPS}
     keep_settings(out, settings, FILES)
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
-    rows = resume(out / "episodes.jsonl", jobs, run_job, workers=workers, what="episodes")
+    rows = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")
     summaries = summarise(rows, backends)
     atomic_write(out / "paper_d.json", json.dumps({**settings, "summaries": summaries}, indent=1) + "\n")
     print(_table(summaries))

@@ -23,8 +23,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from slam.settings import unknown_name
-from training.runs.campaign import start_worker
 from training.runs.errors import one_line
+from training.runs.processes import start_worker
 
 if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig

@@ -7,7 +7,6 @@ numbers of its own, drawn by the run's seed and its number.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -27,7 +26,8 @@ from training.learning.end_to_end.ppo import DrivePolicy, DriveWorld, make_model
 from training.learning.end_to_end.rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
 from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, words
 from training.learning.vec_env import ExploreVecEnv
-from training.runs.campaign import one_thread_each
+from training.runs.campaign import Pool
+from training.runs.processes import one_thread_each
 
 __all__ = ["DriveRun", "summary"]
 
@@ -43,7 +43,7 @@ class DriveRun(FolderRun):
     config: DriveConfig
     seeds_from = 2000
 
-    def _train(self, pool: ProcessPoolExecutor) -> None:
+    def _train(self, pool: Pool) -> None:
         torch.manual_seed(self.config.seed)
         self._plan, self._control = PlanNetwork(), ControlNetwork()
         checkpoint = self.out / "checkpoint.safetensors"
@@ -64,7 +64,7 @@ class DriveRun(FolderRun):
 
     # ---- lessons -------------------------------------------------------------------------------------------
 
-    def _round(self, number: int, pool: ProcessPoolExecutor) -> None:
+    def _round(self, number: int, pool: Pool) -> None:
         learning = self.config.learning
         if not (self.out / f"maps-{number}.npz").exists():
             self._give_lessons(number, pool)
@@ -87,7 +87,7 @@ class DriveRun(FolderRun):
         self._keep(round=number + 1)
         self._say(f"round {number} of {len(self.config.lessons.teacher_shares)} done")
 
-    def _give_lessons(self, number: int, pool: ProcessPoolExecutor) -> None:
+    def _give_lessons(self, number: int, pool: Pool) -> None:
         config, weights = self.config, self.weights
         lessons, world = config.lessons, config.world
         rng = np.random.default_rng([self.config.seed, 1000 + number])
@@ -110,13 +110,14 @@ class DriveRun(FolderRun):
 
     # ---- practice ------------------------------------------------------------------------------------------
 
-    def _practise(self, pool: ProcessPoolExecutor) -> None:
+    def _practise(self, pool: Pool) -> None:
         config, ppo = self.config, self.config.ppo
         network = DriveNetwork(self.weights, config.planning, uncertainty=config.uncertainty)
         world = partial(DriveWorld, config.world, network)
+        workers = self._workers if isinstance(self._workers, int) else None  # in this machine, in any case
         with one_thread_each():
             envs = ExploreVecEnv(
-                ppo.environments, make=world, workers=self._workers, max_episode_steps=None, context="spawn"
+                ppo.environments, make=world, workers=workers, max_episode_steps=None, context="spawn"
             )
         env = VecMonitor(envs)
         try:
@@ -138,7 +139,7 @@ class DriveRun(FolderRun):
         finally:
             env.close()
 
-    def _evaluate(self, pool: ProcessPoolExecutor, at: dict[str, int]) -> None:
+    def _evaluate(self, pool: Pool, at: dict[str, int]) -> None:
         config, weights = self.config, self.weights
         jobs = [
             Episode(config, weights, rooms, seed, seed, config.world.time_limit_s)

@@ -25,8 +25,9 @@ from slam.odometry.filters import OdometryFilterConfig
 from slam.odometry.riccati import RECOVERIES, Tolerances
 from slam.odometry.transform_filter import KalmanBucyFilter
 from training.figures.charts import COLOURS, INK, chart, label, png
+from training.runs.campaign import Workers
 from training.runs.errors import check_writable
-from training.runs.options import Seed
+from training.runs.options import Ray, Seed, workers_of
 from training.runs.running import versions
 from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
@@ -188,7 +189,7 @@ def _work() -> tuple[dict[str, Any], Figure]:
 # ---- on board --------------------------------------------------------------------------------------------------
 
 
-def _odometry(episodes: int, explorations: int, steps: int, workers: int) -> tuple[dict[str, Any], Figure]:
+def _odometry(episodes: int, explorations: int, steps: int, workers: Workers) -> tuple[dict[str, Any], Figure]:
     training = {n: odometry.drives(n, seed=odometry.TRAINING_SEED, episodes=episodes) for n in odometry.NOISES}
     scanned = odometry.scan_process(training)
     config = OdometryFilterConfig()
@@ -244,9 +245,11 @@ def study(
     explorations: Annotated[int, typer.Option(min=0, help="Explored apartments, with and without.")] = 20,
     steps: Annotated[int, typer.Option(min=1, help="Of an exploration, at most.")] = 1000,
     workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    ray: Ray = None,
 ) -> None:
     """Repeat paper C's figures: a filter by differential transforms, its cost, its use on board."""
     check_writable(out, _FILES)
+    who = workers_of(workers, ray)
     charts: dict[str, Figure] = {}
     result: dict[str, Any] = {
         "versions": versions(), "seed": seed, "R_m2_s": _MEASUREMENT, "Q": _PROCESS, "t_s": [_T0, _T1],
@@ -254,7 +257,7 @@ def study(
     result["covariance"], charts["figure_2.png"] = _figure_2()
     result["estimate"], charts["figure_3.png"] = _figure_3(seed, runs)
     result["work"], charts["work.png"] = _work()
-    result["odometry"], charts["odometry.png"] = _odometry(episodes, explorations, steps, workers)
+    result["odometry"], charts["odometry.png"] = _odometry(episodes, explorations, steps, who)
     out.mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         atomic_write(out / name, png(figure))

@@ -21,7 +21,7 @@ from slam.motion import move
 from slam.odometry.differential_transform import MODELS
 from slam.odometry.filters import OdometryFilter, OdometryFilterConfig
 from slam.types import Odometry
-from training.runs.campaign import run_all
+from training.runs.campaign import Workers, run_all
 from training.studies.exploring import exploring
 
 __all__ = [
@@ -149,7 +149,7 @@ def step_time_us(driven: Drives, config: OdometryFilterConfig) -> float:
 # ---- in rooms, with a backend that believes what it is given ---------------------------------------------------
 
 
-def explore(*, seed: int, episodes: int, steps: int, workers: int) -> list[Row]:
+def explore(*, seed: int, episodes: int, steps: int, workers: Workers) -> list[Row]:
     """Let the EKF explore apartments with and without the filter; return NEES and errors per noise and filter."""
     names = ("none", "differential-transform")
     jobs = [(noise, name, s, steps) for s in range(seed, seed + episodes) for noise in NOISES for name in names]

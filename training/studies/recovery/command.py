@@ -21,7 +21,7 @@ from training.figures.charts import png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Backends, MaxSteps, Seeds, Workers
+from training.runs.options import Backends, MaxSteps, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
 from training.studies.recovery.faults import FAULTS
 from training.studies.recovery.figures import draw_recovery, draw_reliability, false_alarms, reliability, sum_up
@@ -45,6 +45,7 @@ def study(
     seeds: Seeds = "10000:10049",
     max_steps: MaxSteps = 3000,
     workers: Workers = None,
+    ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/recovery"),
 ) -> None:
     """Make faults mid-episode: whether a belief is lost, knows it, and is right again; how true its health is."""
@@ -60,12 +61,13 @@ def study(
             where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}
             make_config(noise=noise, **where)  # type: ignore[arg-type]
         settings = {"version": installed_version(), "agent": agent, "noise": noise, "max_steps": max_steps}
+    who = workers_of(workers, ray)
     keep_settings(out, settings, FILES)
     jobs: list[Job] = [
         (fault, name, agent, place, noise, seed, max_steps or 3000)
         for seed in parse_seeds(seeds, most=_MOST_SEEDS) for fault in chosen for place in places for name in names
     ]  # fmt: skip
-    rows = resume(out / STORE, jobs, run_job, workers=workers, what="episodes")
+    rows = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     found = _figures(rows, names, chosen)
     found["config"] = settings | {"rooms": [Path(p).name for p in places], "seeds": seeds}
     atomic_write(out / "recovery.json", json.dumps(found, indent=1) + "\n")
