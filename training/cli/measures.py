@@ -36,7 +36,7 @@ def speed(
       mecanum speed
       mecanum speed --slam odometry --beams 180 --steps 3000 --json
       mecanum speed --peer navground
-      mecanum speed --envs 8
+      mecanum speed --envs 8 --peer navground
     """  # noqa: D301
     from mecanum_env.arguments import make_config
     from training.studies.peers import require
@@ -47,10 +47,8 @@ def speed(
         make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
         if peer is not None:
             require(peer)
-        if peer is not None and envs is not None:
-            raise ValueError("--envs and --peer are measured apart: leave one of them out")
     if envs is not None:
-        run_batch(envs, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json)
+        run_batch(envs, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json, peer=peer)
         return
     run(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed, as_json=as_json, peer=peer)
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -30,13 +31,16 @@ if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig
     from mecanum_env.rooms import FloorPlan
 
-__all__ = ["PEERS", "ROUNDS", "Drive", "compare", "peer_process", "peer_setup", "require"]
+__all__ = ["BATCHES", "PEERS", "ROUNDS", "Drive", "compare", "peer_batch", "peer_process", "peer_setup", "require"]
 
 PEERS: dict[str, tuple[str, ...]] = {"navground": ("navground", "navground-learning")}
 """Peers by name: the distributions that must be installed."""
 
 ROUNDS = 5
 """How often each side is measured; odd, so that the median is a round that took place."""
+
+BATCHES = ("sync", "async")
+"""Gymnasium's ways of stepping many environments at once."""
 
 _MAP_CELLS = 200  # the peer's map is a square around the robot, of this many cells a side
 _WARM_UP_STEPS = 50
@@ -146,6 +150,26 @@ def peer_process(
     The former: ``walls`` and ``discs`` (in the first room), and ``scan``, the ranges [m] that its lidar measures
     at the first start. The latter returns the peer's complete steps per second.
     """
+    with _own_process() as ask:
+        yield ask(_get_ready, setup, drives), lambda: float(ask(_drive_round))
+
+
+@contextmanager
+def peer_batch(setup: dict[str, Any], drives: Sequence[Drive]) -> Iterator[Callable[[], dict[str, float]]]:
+    """Give what steps one of the peer's environments a drive, all at once, by each of Gymnasium's two ways.
+
+    It returns the complete steps per second of all together, by way; the peer has no other way of its own that
+    goes without more packages.
+    """
+    with _own_process() as ask:
+        ask(_get_batch_ready, setup, drives)
+        yield lambda: {way: float(ask(_drive_batch, way)) for way in BATCHES}
+        ask(_close_batch)
+
+
+@contextmanager
+def _own_process() -> Iterator[Callable[..., Any]]:
+    """Give what calls a function in the peer's process."""
 
     def ask(what: Callable[..., Any], *load: Any) -> Any:
         try:
@@ -155,7 +179,7 @@ def peer_process(
 
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, initializer=start_worker) as pool:
-        yield ask(_get_ready, setup, drives), lambda: float(ask(_drive_round))
+        yield ask
 
 
 # ---- in the peer's process ---------------------------------------------------------------------------------
@@ -267,3 +291,38 @@ def _get_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> dict[str, Any]
 
 def _drive_round() -> float:
     return _drive(*_load)
+
+
+_batch: dict[str, Any] = {}  # of this process: vector environments, and what they drive
+
+
+def _get_batch_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> None:
+    from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+
+    os.dup2(2, 1)  # what libraries print goes to standard error
+    atexit.register(os._exit, 0)  # as above
+    make = partial(_navground_env, setup, drives)
+    _batch.update(sync=SyncVectorEnv([make] * len(drives)), drives=drives)
+    _batch["async"] = AsyncVectorEnv([make] * len(drives))
+    for way in BATCHES:
+        _drive_batch(way, steps=_WARM_UP_STEPS)
+
+
+def _drive_batch(way: str, steps: int | None = None) -> float:
+    """Return the steps per second of all environments together, with random actions."""
+    envs, drives = _batch[way], _batch["drives"]
+    steps = min(drive.steps for drive in drives) if steps is None else steps
+    envs.reset(seed=[drive.seed for drive in drives])
+    envs.action_space.seed(drives[0].seed)
+    actions = [envs.action_space.sample() for _ in range(steps)]
+    start = time.perf_counter()
+    for action in actions:
+        _, _, terminated, truncated, _ = envs.step(action)
+        if terminated.any() or truncated.any():
+            raise RuntimeError("navground ended an episode")
+    return steps * len(drives) / (time.perf_counter() - start)
+
+
+def _close_batch() -> None:
+    for way in BATCHES:
+        _batch.pop(way).close()
