@@ -18,9 +18,9 @@ from slam.grids.occupancy import OccupancyGrid
 
 __all__ = ["KeptBlocks"]
 
-# OpenCV's distances come from IPP on x86, which takes columns so many at a time (4 where it was tried, 16 at most):
-# how the last bit is rounded depends on where a column lies among them, counted from the left edge, and on the
-# columns left over at the right one.
+# OpenCV's distances come from IPP on x86, which takes columns so many at a time (4 where it was tried, 16 at
+# most): how the last bit is rounded depends on where a column lies among them, counted from the left edge, and on
+# the columns left over at the right one.
 _LANES = 16
 
 
