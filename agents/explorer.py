@@ -72,6 +72,7 @@ class Candidates:
     travel: TravelCosts
     frontiers: Frontiers
     cells: NDArray[np.int64]  # (m, 2) row, column of the view points
+    # See Explorer._costs_asked for those that are far away.
     costs: Array  # (m,) travel cost [weighted m], inf where out of reach or given up
     current: int | None  # the piece it is driving to now, if it is still there
 

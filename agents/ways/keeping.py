@@ -18,9 +18,10 @@ from slam.grids.occupancy import OccupancyGrid
 
 __all__ = ["KeptBlocks"]
 
-# OpenCV's distances come from IPP where there is one, which takes columns so many at a time: how the last bit is
-# rounded depends on where a column lies among them, counted from the left edge, and on the columns left over.
-_LANES = 4
+# OpenCV's distances come from IPP on x86, which takes columns so many at a time (4 where it was tried, 16 at
+# most): how the last bit is rounded depends on where a column lies among them, counted from the left edge, and on
+# the columns left over at the right one.
+_LANES = 16
 
 
 class KeptBlocks:
@@ -57,10 +58,8 @@ class KeptBlocks:
         extent = self._extent_of(grid, drawn, frame, robot, same)
         same &= extent.around(self._extent) == extent and (extent.col0 - self._extent.col0) % _LANES == 0
         before = self._extent if same else NOTHING
-        self._distance = (
-            carried(self._distance, self._frame, frame, before, np.inf) if frame != self._frame or not same
-            else self._distance
-        )  # fmt: skip
+        if frame != self._frame or not same:
+            self._distance = carried(self._distance, self._frame, frame, before, np.inf)
         self._frame, self._extent = frame, extent
         self._grid, self._revision, self._drawing = grid, grid.revision, grid.drawings
         drawn = drawn.within(extent) if same else extent
@@ -100,9 +99,9 @@ class KeptBlocks:
 
     @property
     def _reach(self) -> int:
-        """How many cells off a wall may matter; a chamfer distance is never less than its columns or rows."""
+        """How many cells off a wall may matter; a distance is never less than the columns or rows between."""
         assert self._grid is not None
-        return math.ceil(FAR_M / self._grid.resolution) + 2
+        return math.ceil(FAR_M / self._grid.resolution) + 2 + _LANES
 
     def _measure(self, box: Box) -> None:
         """Measure the distances in a box, from the walls within reach."""
