@@ -221,7 +221,7 @@ class OccupancyGrid:
         """Mark the disc around (x, y) [m] as a place where the robot's body has been."""
         x, y, radius = self._make_room_for(x, y, radius)
         mark_disc(self.visited, self.overview_sums, self._overview_shift, y - self._row0, x - self._col0, radius)
-        self._note_disc(x, y, radius)
+        self._note_drawn(*_box_of(x, y, radius))
 
     def integrate(
         self, sensor_pose: Array | tuple[float, float, float], scan: Scan,
@@ -273,9 +273,13 @@ class OccupancyGrid:
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
-        self._note_drawn(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
+        # One box of both: the body is where the scan was taken from.
+        row0, col0, row1, col1 = mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1
         if body is not None:
-            self._note_disc(body_x, body_y, radius)
+            low_row, low_col, high_row, high_col = _box_of(body_x, body_y, radius)
+            row0, col0 = min(row0, low_row), min(col0, low_col)
+            row1, col1 = max(row1, high_row), max(col1, high_col)
+        self._note_drawn(row0, col0, row1, col1)
 
     def _prepare_for(self, scan: Scan) -> None:
         """Make the tables and buffers for scans of this one's lidar, where the last one was of another."""
@@ -301,10 +305,6 @@ class OccupancyGrid:
         row, col, reach = math.floor(y), math.floor(x), math.ceil(radius) + 1
         self._grow(row - reach, col - reach, row + reach + 1, col + reach + 1)
         return x, y, radius
-
-    def _note_disc(self, x: float, y: float, radius: float) -> None:
-        """Take note that a disc was drawn, in cells of the lattice."""
-        self._note_drawn(int(y - radius) - 1, int(x - radius) - 1, int(y + radius) + 2, int(x + radius) + 2)
 
     def _note_drawn(self, row0: int, col0: int, row1: int, col1: int) -> None:
         """Take note that lattice cells [row0, row1) × [col0, col1) were drawn in."""
@@ -358,3 +358,8 @@ def _blank(shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Return a plane of zeros with some more behind it, which kernels may read: see ``_take_unsettled``."""
     size = shape[0] * shape[1]
     return np.zeros(size + WINDOW, np.uint8)[:size].reshape(shape)
+
+
+def _box_of(x: float, y: float, radius: float) -> tuple[int, int, int, int]:
+    """Return the box of cells that a disc lies in, all in cells of the lattice: first and last + 1 of both."""
+    return int(y - radius) - 1, int(x - radius) - 1, int(y + radius) + 2, int(x + radius) + 2
