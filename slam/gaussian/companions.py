@@ -85,7 +85,7 @@ class Companions:
         ``reset`` goes along with that of :func:`slam.invariant.invariant_update`.
         """
         if rows and len(self.mean):
-            _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows, reset)
+            _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows, self.own, reset)
 
     def add(self, n: int, gr: Array) -> None:
         """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""
@@ -109,7 +109,7 @@ class Companions:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _correct(
     mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
-    we: Array, rows: int, reset: bool,
+    we: Array, rows: int, own: int, reset: bool,
 ) -> None:  # fmt: skip
     """W_e = L⁻¹ H Cᵀ, e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
     states = mean.shape[0]
@@ -127,10 +127,16 @@ def _correct(
     solve(s, we, states, rows)
     add_combination(mean, states, s[:rows, rows], we)
     subtract(cross, states, n, we, w, rows)
-    for i in range(states):
-        for j in range(states):
+    for i in range(own):
+        for j in range(own):
             for k in range(rows):
                 cov[i, j] -= we[k, i] * we[k, j]
+    if states > own:  # they are many
+        joined = cov[own:]
+        subtract(joined, states - own, states, we[:, own:], we, rows)
+        for i in range(own):
+            for j in range(own, states):
+                cov[i, j] = cov[j, i]
     if reset:
         _reset(cross, n, w[rows : rows + SPARE_ROWS : 2])
 

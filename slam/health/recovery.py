@@ -139,7 +139,11 @@ class Recovery:
                 break
             count -= scans
             stage += 1
-        radius = config.radii_m[stage]
-        if count % config.every[stage] or (self._unopposed and math.isinf(radius)):
+        radius, every = config.radii_m[stage], config.every[stage]
+        if math.isinf(radius):
+            every *= 1 + relocaliser.places // config.places_each
+            if self._unopposed:
+                return None
+        if count % every:
             return None
         return relocaliser.find(scan, believed, radius)

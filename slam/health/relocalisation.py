@@ -51,6 +51,7 @@ class RelocalisationConfig:
     radii_m: tuple[float, ...] = (1.5, 4.0, math.inf)  # around the last known pose, one after the other …
     scans_each: tuple[int, ...] = (5, 15)  # … for so many scans, the last one until it is found
     every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
+    places_each: int = 60_000  # places of the lattice that take so long; of twice as many, half as often
     confirm: int = 3  # scans that a place must explain, one after the other
     unopposed: int = 30  # scans in a row that do not speak against where the wheels have it, to go on from there
     sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
@@ -66,7 +67,8 @@ class RelocalisationConfig:
             stages >= 1 and len(self.scans_each) == stages - 1 and len(self.every) == stages,
             "RelocalisationConfig needs one of every and, but for the last, of scans_each for each of radii_m",
         )
-        require(min(self.confirm, self.unopposed) >= 1, "RelocalisationConfig.confirm and unopposed must be ≥ 1")
+        for name in ("confirm", "unopposed", "places_each"):
+            require(getattr(self, name) >= 1, f"RelocalisationConfig.{name} must be at least 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +97,11 @@ class Relocaliser:
         self._field: LikelihoodField | None = None
         self._sharp_field: LikelihoodField
         self._field_of: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+    @property
+    def places(self) -> int:
+        """Number of the lattice's positions."""
+        return len(self._free)
 
     def find(self, scan: Scan, around: Array, radius_m: float) -> Place | None:
         """Return where within a radius of a pose ``(3,)`` a scan was taken, if that is beyond doubt."""
