@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import read_block, state_rows
 from slam.gaussian.lanes import aligned_zeros
-from slam.gaussian.low_rank import factor
+from slam.gaussian.low_rank import FEWEST_SAMPLES, factor
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
@@ -89,6 +89,7 @@ class CompressedEkfSlam(EkfSlam):
         self._free: list[int] = []  # those of landmarks that were dropped
         self._centre = (float(pose[0]), float(pose[1]))
         self._reach = 0.0  # how far the sensor sees [m]: lately, or as it says itself
+        self._rank = 0  # of the covariance of near and far, lately
         self._made_for = 0.0  # that, when the region was chosen
         self._v = aligned_zeros(0, len(self._x))  # V, its columns the map's own: zero where they are not far
 
@@ -227,8 +228,10 @@ class CompressedEkfSlam(EkfSlam):
             own = np.sqrt(np.diag(beside.cov))
             row_sigma = np.concatenate([np.sqrt(np.diag(rows[:, a])), np.where(own > 0.0, own, 1.0)])
             u, v = factor(
-                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance
-            )
+                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance,
+                max(FEWEST_SAMPLES, self._rank + self._rank // 4),
+            )  # fmt: skip
+            self._rank = len(v)
             self._v = aligned_zeros(len(v), rows.shape[1])
             self._v[:, b] = v[:, : len(b)]
             beside.join(u[:n].T, u[n:])

@@ -13,54 +13,76 @@ from numpy.typing import NDArray
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.tiles import product
 
-__all__ = ["factor"]
+__all__ = ["FEWEST_SAMPLES", "factor"]
 
 Array = NDArray[np.float64]
 
-_SAMPLES = 48  # sums of columns tried at first
+FEWEST_SAMPLES = 48
+"""Random sums of columns that are tried at first."""
 
 
-def factor(cov: Array, row_sigma: Array, column_sigma: Array, tolerance: float) -> tuple[Array, Array]:
+def factor(
+    cov: Array, row_sigma: Array, column_sigma: Array, tolerance: float, samples: int = FEWEST_SAMPLES
+) -> tuple[Array, Array]:
     """Return U ``(m, r)`` and V ``(r, n)`` with U V = ``cov`` ``(m, n)``, but for ``tolerance``.
 
     That bounds the root of the sum of squares of what is left of all correlations, covariances divided by σ's
-    ``(m,)`` and ``(n,)``. The rows' space is found from random sums of columns (Halko, Martinsson and Tropp 2011,
-    algorithm 4.1), the same ones every time.
+    ``(m,)`` and ``(n,)``. The columns' space is found from random sums of them (Halko, Martinsson and Tropp 2011,
+    algorithm 4.1), the same ones every time: ``samples``, and more where the rank turns out to be as high.
     """
     m, n = cov.shape
     scaled = aligned_zeros(m, n)
     scaled[:, :n] = cov / row_sigma[:, None]
-    basis, samples = np.eye(m), _SAMPLES
+    basis = np.eye(m)
     while samples < m:
         sums = np.random.default_rng(0).standard_normal((n, samples)) / column_sigma[:, None]
-        found = _orthonormal(product(scaled[:, :n], sums, samples)[:, :samples].T.copy(), tolerance)
-        if len(found) < samples:
-            basis = found.T
+        found = _orthonormal(product(scaled[:, :n], sums, samples)[:, :samples].copy(), tolerance)
+        if found.shape[1] < samples:
+            basis = found
             break
         samples *= 2
     return row_sigma[:, None] * basis, product(basis.T, scaled, n)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _orthonormal(rows: Array, tolerance: float) -> Array:
-    """Return orthonormal vectors that span rows ``(k, m)`` but for the tolerance, by pivoted Gram-Schmidt."""
-    count = rows.shape[0]
+def _orthonormal(columns: Array, tolerance: float) -> Array:
+    """Return orthonormal columns ``(m, r)`` that span those given but for the tolerance: pivoted Gram-Schmidt.
+
+    All columns go along a row at a time: so sums over rows are sums of vectors. Those given are overwritten.
+    """
+    m, count = columns.shape
+    out = np.empty((m, count))
+    squares, along = np.zeros(count), np.empty(count)
+    for j in range(m):
+        for i in range(count):
+            squares[i] += columns[j, i] * columns[j, i]
     found = 0
-    for k in range(count):
-        best, norm = k, 0.0
-        for i in range(k, count):
-            square = np.sqrt((rows[i] * rows[i]).sum())
-            if square > norm:
-                best, norm = i, square
+    while found < count:
+        best = np.argmax(squares)
+        norm = np.sqrt(squares[best])
         if norm <= tolerance:
             break
-        for j in range(rows.shape[1]):
-            rows[k, j], rows[best, j] = rows[best, j] / norm, rows[k, j]
+        new = columns[:, best] / norm
         for _ in range(2):  # the second time takes what rounding left
-            for i in range(k):
-                rows[k] -= (rows[k] * rows[i]).sum() * rows[i]
-            rows[k] /= np.sqrt((rows[k] * rows[k]).sum())
-        for i in range(k + 1, count):
-            rows[i] -= (rows[i] * rows[k]).sum() * rows[k]
+            along[:found] = 0.0
+            for j in range(m):
+                for i in range(found):
+                    along[i] += new[j] * out[j, i]
+            square = 0.0
+            for j in range(m):
+                for i in range(found):
+                    new[j] -= along[i] * out[j, i]
+                square += new[j] * new[j]
+            new /= np.sqrt(square)
+        out[:, found] = new
         found += 1
-    return rows[:found]
+        along[:] = 0.0
+        for j in range(m):
+            for i in range(count):
+                along[i] += new[j] * columns[j, i]
+        squares[:] = 0.0
+        for j in range(m):
+            for i in range(count):
+                columns[j, i] -= new[j] * along[i]
+                squares[i] += columns[j, i] * columns[j, i]
+    return out[:, :found].copy()
