@@ -183,3 +183,25 @@ def test_scans_of_rooms_give_the_full_filter_s_map(lines: bool) -> None:
     np.testing.assert_allclose(two.landmarks[order], one.landmarks[np.argsort(one.landmark_ids)], atol=1e-9)
     assert len(two.lines) == len(one.lines)
     np.testing.assert_array_equal(two.grid.log_odds, one.grid.log_odds)
+
+
+@pytest.mark.parametrize("name", ["compressed-ekf", "invariant-ekf"])
+def test_what_was_kept_of_the_map_stays_what_it_was(name: str) -> None:
+    """A doubtful scan: the belief before it is kept, another region is taken, and it comes back."""
+    backend = slam.make(name, config=REGIONS if name == "invariant-ekf" else {})
+    assert isinstance(backend, CompressedEkfSlam)
+    steps = through_the_grove(grove(8), (backend,), 8, 120)
+    for _ in range(60):
+        next(steps)
+    before, regions = backend.belief, backend._centre
+    before.settle()
+    backend.recovery.kept = backend._copy()
+    for _ in range(40):
+        next(steps)
+    assert backend._centre != regions and backend.landmark_count > len(before.landmarks)
+    backend._put_back(backend.recovery.kept)
+    after = backend.belief
+    assert sorted(after.landmark_ids) == sorted(before.landmark_ids)
+    one, two = (np.argsort(belief.landmark_ids) for belief in (before, after))
+    np.testing.assert_allclose(after.landmarks[two], before.landmarks[one], atol=1e-9)
+    np.testing.assert_allclose(after.landmark_cov[two], before.landmark_cov[one], atol=1e-9)

@@ -12,6 +12,10 @@ from mecanum_env.env import ExploreEnv
 from slam.ekf import EkfSlam
 from slam.geometry import compose, transform_points
 from slam.grids.occupancy import OccupancyGrid
+from slam.health.monitor import HealthConfig
+from slam.health.recovery import Recovery
+from slam.health.relocalisation import RelocalisationConfig, Relocaliser
+from slam.types import Scan
 from training.studies.recovery.faults import make_fault
 
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
@@ -128,3 +132,22 @@ def test_a_blind_lidar_is_no_loss() -> None:
         env.step(np.zeros(3, np.float32))
     assert env.backend.recovery.times_lost == 0
     assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) < 0.02
+
+
+def test_a_large_map_is_searched_as_rarer_as_it_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = driven("ekf", 60)
+    seen = env.scan
+    nowhere = Scan(np.full_like(seen.ranges, 0.7), seen.angle_min, seen.angle_increment, seen.range_max)
+    searched = []
+    for places_each in (10**6, 200):
+        count = [0]
+        monkeypatch.setattr(Relocaliser, "find", lambda *_, count=count: count.__setitem__(0, count[0] + 1))
+        config = RelocalisationConfig(places_each=places_each, radii_m=(math.inf,), scans_each=(), every=(2,))
+        recovery = Recovery(HealthConfig(), config, 0.2)
+        recovery.give_up()
+        for _ in range(60):
+            assert recovery.search(env.backend.grid, nowhere, env.backend.pose) is None
+        places = Relocaliser(config, env.backend.grid, 0.2).places
+        assert count[0] == math.ceil(60 / (2 * (1 + places // places_each)))
+        searched.append(count[0])
+    assert searched[0] == 30 > searched[1]
