@@ -62,6 +62,11 @@ class Belief:
             object.__delattr__(belief, name)
         return belief
 
+    @property
+    def has_whole_cov(self) -> bool:
+        """Whether there is a ``whole_cov``; asking for that itself may take long."""
+        return self._read is not None or self.whole_cov is not None
+
     def settle(self) -> None:
         """Read what was postponed."""
         if self._read is not None:

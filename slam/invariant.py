@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.compressed import Change, CompressedEkfConfig, CompressedEkfSlam
 from slam.gaussian.companions import Companions
-from slam.gaussian.joint_gaussian import state_rows, symmetric_block
+from slam.gaussian.joint_gaussian import state_rows
 from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate, product
@@ -115,10 +115,10 @@ class InvariantEkfSlam(CompressedEkfSlam):
         # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
         u, cross = np.zeros((3, size)), self._cross(3)
         u[:, far] = cross[:, far]
-        region = np.empty((self._n, self._n))
-        symmetric_block(self._p, region)
-        u[:, state_rows(self._near, robot=True)] = region[:3]
-        u = u[robot] + product(0.5 * region[np.ix_(robot, robot)], a, size)
+        region, pose_cov = self._p[:3, : self._n].copy(), self.pose_cov
+        region[:, :3] = pose_cov  # of which there was but the upper triangle
+        u[:, state_rows(self._near, robot=True)] = region
+        u = u[robot] + product(0.5 * pose_cov[np.ix_(robot, robot)], a, size)
         own = change.own.copy()
         own[:, :size] += product(self._beside.cross[: len(own), robot], a, size)[:, : own.shape[1]]
         return Change(x, np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -66,12 +67,25 @@ class ForesightConfig:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """A belief's landmarks, corners before walls, with their joint covariance."""
+    """A belief's landmarks, corners before walls, with their joint covariance, which is read when asked for."""
 
     x: Array  # (3 + 2m,) robot, then x, y [m] of corners and α [rad], r [m] of walls
-    cov: Array  # (3 + 2m, 3 + 2m)
     kinds: Array  # (m,) 0 for a corner, LINE for a wall
     ends: Array  # (m, 4) x1, y1, x2, y2 of walls [m]; zeros for corners
+    belief: Belief
+
+    @cached_property
+    def cov(self) -> Array:
+        """Joint covariance ``(3 + 2m, 3 + 2m)``."""
+        belief = self.belief
+        known = belief.whole_cov if belief.has_whole_cov else belief.joint_cov
+        if known is not None:
+            return np.array(known)
+        cov = np.zeros((len(self.x), len(self.x)))
+        cov[:3, :3] = belief.pose_cov
+        for i in range(len(belief.landmarks)):
+            cov[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = belief.landmark_cov[i]
+        return cov
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,20 +104,11 @@ def marks_of(belief: Belief) -> Marks:
     of which nothing is known then but where they are.
     """
     n = len(belief.landmarks)
-    walls = belief.lines if belief.whole_cov is not None else belief.lines[:0]
+    walls = belief.lines if belief.has_whole_cov else belief.lines[:0]
     ends = np.zeros((n + len(walls), 4))
     ends[n:] = belief.line_ends[: len(walls)]
     x = np.concatenate([belief.pose, belief.landmarks.ravel(), walls.ravel()])
-    if belief.whole_cov is not None:
-        cov = np.array(belief.whole_cov)
-    elif belief.joint_cov is not None:
-        cov = np.array(belief.joint_cov)
-    else:
-        cov = np.zeros((len(x), len(x)))
-        cov[:3, :3] = belief.pose_cov
-        for i in range(n):
-            cov[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = belief.landmark_cov[i]
-    return Marks(x, cov, np.repeat([0.0, float(LINE)], [n, len(walls)]), ends)
+    return Marks(x, np.repeat([0.0, float(LINE)], [n, len(walls)]), ends, belief)
 
 
 def d_optimality(cov: Array) -> float:

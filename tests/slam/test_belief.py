@@ -44,6 +44,7 @@ def test_a_belief_is_that_of_when_it_was_given(name: str) -> None:
 
 def test_its_covariances_agree_with_one_another() -> None:
     belief = _backend("invariant-ekf").belief
+    assert belief.has_whole_cov
     assert belief.joint_cov is not None and belief.whole_cov is not None
     np.testing.assert_array_equal(belief.joint_cov, belief.whole_cov[:9, :9])
     np.testing.assert_array_equal(belief.pose_cov, belief.joint_cov[:3, :3])
