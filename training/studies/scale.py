@@ -142,8 +142,8 @@ def study(
             raise BadInput(f"no such file: {plan}; give a ROS map (.yaml) or an image")
     keep_settings(out, {"version": installed_version(), "seed": seed, "minutes": minutes}, FILES)
     jobs: list[Job] = [(str(p), name, seed, minutes, str(out)) for p in plans for name in names]
-    for k, (plan, name, *_) in enumerate(jobs):  # each in a process of its own, so that its memory is
-        what = f"exploration {k + 1} of {len(jobs)}, {Path(plan).stem}, {name}"
+    for k, job in enumerate(jobs):  # each in a process of its own, so that its memory is
+        what = f"exploration {k + 1} of {len(jobs)}, {Path(job[0]).stem}, {job[1]}"
         rows = resume(out / STORE, jobs[: k + 1], explore, workers=1, what=what, apart=True)
     found = list(rows.values())
     atomic_write(out / "scale.json", json.dumps(found, indent=1) + "\n")
