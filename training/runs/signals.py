@@ -52,7 +52,10 @@ def heed_sigterm() -> Iterator[threading.Event]:
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
         came.set()
-        signal.raise_signal(signal.SIGINT)
+        handler = signal.getsignal(signal.SIGINT)
+        if not callable(handler):  # ignored, as a shell has it in the background: that is not said of SIGTERM
+            raise KeyboardInterrupt
+        handler(signal.SIGINT, frame)
 
     if threading.current_thread() is not threading.main_thread():
         yield came

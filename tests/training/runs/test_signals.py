@@ -1,0 +1,38 @@
+"""SIGTERM ends a run whatever became of Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from training.runs.signals import heed_sigterm, interrupt_flag
+
+
+@pytest.fixture(params=[signal.default_int_handler, signal.SIG_IGN, signal.SIG_DFL])
+def sigint(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Handle Ctrl-C as Python does, as a shell has it for what it starts in the background, and as the system."""
+    before = signal.signal(signal.SIGINT, request.param)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("sigint")
+def test_sigterm_interrupts() -> None:
+    with heed_sigterm() as came:
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1.0)
+        assert came.is_set()
+
+
+@pytest.mark.usefixtures("sigint")
+def test_sigterm_takes_effect_between_two_steps() -> None:
+    with heed_sigterm() as came, interrupt_flag() as interrupted:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.01)
+        assert came.is_set() and interrupted.is_set()
