@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import compose, inverse
+from slam.geometry import compose, inverse, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.health.evidence import Agreement, agreement, agrees
 from slam.health.monitor import HealthConfig, HealthMonitor
@@ -37,6 +37,9 @@ class _Trail:
     place: Place
     believed: Array  # (3,)
     scans: int = 1
+
+
+_ANOTHER_VIEW = (0.3, 0.3)  # [m, rad] from which on a place looks otherwise
 
 
 class Recovery:
@@ -89,6 +92,7 @@ class Recovery:
         self.times_lost += 1
         self.kept, self._relocaliser, self._trail = None, None, None
         self._searched = self._unopposed = 0
+        self._searched_from: Array | None = None  # where the wheels had it when all of the map was last searched
 
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
         """Look for the place of a scan; return it once several scans agree on it, else None.
@@ -141,9 +145,22 @@ class Recovery:
             stage += 1
         radius, every = config.radii_m[stage], config.every[stage]
         if math.isinf(radius):
-            every *= 1 + relocaliser.places // config.places_each
             if self._unopposed:
                 return None
+            every *= 1 + relocaliser.places // config.places_each
+            if self._searched_from is not None and not self._moved(believed, self._searched_from):
+                every *= config.standing  # the same view says the same again
         if count % every:
             return None
+        if math.isinf(radius):
+            self._searched_from = believed.copy()
         return relocaliser.find(scan, believed, radius)
+
+    @staticmethod
+    def _moved(now: Array, before: Array) -> bool:
+        """Tell whether the view from one pose ``(3,)`` is another than from the other."""
+        away, turned = (
+            math.hypot(now[0] - before[0], now[1] - before[1]),
+            abs(wrap_scalar(float(now[2] - before[2]))),
+        )
+        return away > _ANOTHER_VIEW[0] or turned > _ANOTHER_VIEW[1]

@@ -52,6 +52,7 @@ class RelocalisationConfig:
     scans_each: tuple[int, ...] = (5, 15)  # … for so many scans, the last one until it is found
     every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
     places_each: int = 60_000  # places of the lattice that take so long; of twice as many, half as often
+    standing: int = 8  # times as many scans between two searches of all of the map, where the robot has not moved
     confirm: int = 3  # scans that a place must explain, one after the other
     unopposed: int = 30  # scans in a row that do not speak against where the wheels have it, to go on from there
     sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
@@ -67,7 +68,7 @@ class RelocalisationConfig:
             stages >= 1 and len(self.scans_each) == stages - 1 and len(self.every) == stages,
             "RelocalisationConfig needs one of every and, but for the last, of scans_each for each of radii_m",
         )
-        for name in ("confirm", "unopposed", "places_each"):
+        for name in ("confirm", "unopposed", "places_each", "standing"):
             require(getattr(self, name) >= 1, f"RelocalisationConfig.{name} must be at least 1")
 
 

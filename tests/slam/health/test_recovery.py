@@ -134,20 +134,23 @@ def test_a_blind_lidar_is_no_loss() -> None:
     assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) < 0.02
 
 
-def test_a_large_map_is_searched_as_rarer_as_it_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_map_is_searched_more_rarely_and_so_is_one_from_where_nothing_is_new(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     env = driven("ekf", 60)
     seen = env.scan
     nowhere = Scan(np.full_like(seen.ranges, 0.7), seen.angle_min, seen.angle_increment, seen.range_max)
     searched = []
-    for places_each in (10**6, 200):
+    for places_each, turn in ((10**6, 0.4), (200, 0.4), (10**6, 0.0)):
         count = [0]
         monkeypatch.setattr(Relocaliser, "find", lambda *_, count=count: count.__setitem__(0, count[0] + 1))
         config = RelocalisationConfig(places_each=places_each, radii_m=(math.inf,), scans_each=(), every=(2,))
         recovery = Recovery(HealthConfig(), config, 0.2)
         recovery.give_up()
-        for _ in range(60):
-            assert recovery.search(env.backend.grid, nowhere, env.backend.pose) is None
-        places = Relocaliser(config, env.backend.grid, 0.2).places
-        assert count[0] == math.ceil(60 / (2 * (1 + places // places_each)))
+        for k in range(60):
+            believed = env.backend.pose + np.array([0.0, 0.0, k * turn])
+            assert recovery.search(env.backend.grid, nowhere, believed) is None
         searched.append(count[0])
-    assert searched[0] == 30 > searched[1]
+    places = Relocaliser(config, env.backend.grid, 0.2).places
+    assert searched == [30, math.ceil(60 / (2 * (1 + places // 200))), math.ceil(60 / (2 * config.standing))]
+    assert searched[1] < 30
