@@ -212,7 +212,9 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
                 answers.append((None, getattr(self._own, command)(*parts[0])))
             except Exception as error:  # the others' answers first
                 answers.append((error, None))
-            answers += [pipe.recv() for pipe in self._pipes]
+            for pipe in self._pipes:
+                told.attend(pipe)
+                answers.append(pipe.recv())
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self.close()
             raise RuntimeError("a worker process has ended; make the environments anew") from error

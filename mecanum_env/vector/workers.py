@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import select
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -15,10 +17,12 @@ from numpy.typing import NDArray
 
 from mecanum_env.vector.board import Board
 
-__all__ = ["CALL", "QUIT", "RESET", "SET", "STEP", "Share", "work"]
+__all__ = ["CALL", "QUIT", "RESET", "SET", "STEP", "Share", "attend", "work"]
 
 STEP, RESET, CALL, SET, QUIT = "step", "reset", "call", "set", "quit"
 """Commands, first of the tuples in the pipe; a worker answers each with (error or None, result)."""
+
+_ATTENTIVE_S = 0.5e-3  # one environment's step takes 0.1 ms
 
 Info = dict[str, Any]
 
@@ -111,6 +115,17 @@ class Share:
             env.close()
 
 
+def attend(pipe: Connection) -> None:
+    """Look at the pipe again and again for a moment, instead of sleeping: being woken takes up to 50 µs a step."""
+    if not hasattr(select, "poll"):  # Windows
+        return
+    look = select.poll()
+    look.register(pipe.fileno(), select.POLLIN)
+    patience = time.perf_counter() + _ATTENTIVE_S
+    while not look.poll(0) and time.perf_counter() < patience:
+        pass
+
+
 def work(
     pipe: Connection, make: Callable[[], gymnasium.Env[Any, Any]], board: Board, first: int, count: int,
     mode: AutoresetMode,
@@ -122,6 +137,7 @@ def work(
     share: Share | None = None
     try:
         while True:
+            attend(pipe)
             command, *given = pipe.recv()
             if command == QUIT:
                 break
