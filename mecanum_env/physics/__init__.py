@@ -1,4 +1,5 @@
 """The physics: the mecanum robot, the floor under its wheels, and the pymunk space it drives in.
 
-``world`` steps them together; ``robot`` is kinematics and dynamics, ``collisions`` contacts, ``floor`` what slips.
+``world`` steps them together; ``robot`` is kinematics and dynamics, ``collisions`` contacts, ``floor`` what slips;
+``fleet`` is several robots in one plan.
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from mecanum_env.config import RobotConfig
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
 
-__all__ = ["CONTACT_GAP_S", "Contacts", "add_robot", "build_space"]
+__all__ = ["CONTACT_GAP_S", "Contacts", "Touch", "add_robots", "build_space"]
 
 Array = NDArray[np.float64]
 
@@ -33,51 +34,73 @@ _SNAP_M = 2.0**-20  # about a micrometre; see build_space
 _STEEPEST = 2.0  # tangent of the angle, 63°, from the wall's normal beyond which a contact at a seam is dropped
 
 
-class Contacts:
-    """What pymunk reports of contacts within one physics step, and the events made of it.
+class Touch:
+    """What pymunk reports of a body's contacts in a space.
 
     Apart from :class:`World`, so that the space's callbacks do not tie world and space into a cycle.
     """
 
     def __init__(self) -> None:
-        self.touched = False
+        self.now = False  # within the last physics step
+        self.robot = False  # … another robot
+        self._pairs = 0  # of shapes that touch now
+        self._robots = 0
+
+    def begin(self, robot: bool) -> None:
+        """Note that the body begins to touch a shape, that of another robot or not."""
+        self.now = True
+        self._pairs += 1
+        if robot:
+            self.robot = True
+            self._robots += 1
+
+    def separate(self, robot: bool) -> None:
+        """Note that the body no longer touches a shape."""
+        self._pairs -= 1
+        self._robots -= robot
+
+    def close_step(self) -> None:
+        """Go on to the next physics step."""
+        self.now, self.robot = self._pairs > 0, self._robots > 0
+
+
+class Contacts:
+    """The events made of what is touched in one physics step after the other."""
+
+    def __init__(self) -> None:
         self.count = 0
+        self.with_robots = 0
         self.peak = 0.0
         self.total = 0.0
-        self._pairs = 0  # of shapes that touch now
         self._clear_for_s = math.inf
+        self._robot_touched = False  # in the event that lasts, or was the last
 
-    def begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        """Note that the robot begins to touch a shape."""
-        self.touched = True
-        self._pairs += 1
-
-    def separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        """Note that the robot no longer touches a shape."""
-        self._pairs -= 1
-
-    def close_step(self, dt: float, impulse: float) -> None:
+    def close_step(self, dt: float, impulse: float, touch: Touch) -> None:
         """Turn what was reported during a physics step of ``dt`` [s] into events.
 
         The impulse [N·s] is the net one: single shapes' push against each other where a wall has seams.
         """
-        if self.touched:
+        if touch.now:
             if self._clear_for_s >= CONTACT_GAP_S:
                 self.count += 1
                 self.peak = self.total = 0.0
+                self._robot_touched = False
+            if touch.robot and not self._robot_touched:
+                self.with_robots += 1
+                self._robot_touched = True
             self._clear_for_s = 0.0
             self.peak = max(self.peak, impulse)
             self.total += impulse
         else:
             self._clear_for_s += dt
-        self.touched = self._pairs > 0
+        touch.close_step()
 
     def pass_clear(self, duration: float) -> None:
         """Let time [s] go by in which nothing was touched."""
         self._clear_for_s += duration
 
 
-def build_space(plan: FloorPlan, contacts: Contacts) -> pymunk.Space:
+def build_space(plan: FloorPlan) -> pymunk.Space:
     """Return a space with every surface of the plan, always inserted in the plan's order."""
     space = pymunk.Space()
     space.collision_slop = _SLOP_M
@@ -97,7 +120,6 @@ def build_space(plan: FloorPlan, contacts: Contacts) -> pymunk.Space:
     for shape in shapes:
         shape.friction, shape.elasticity = _FRICTION, _ELASTICITY
     space.add(*shapes)
-    space.on_collision(_ROBOT, None, begin=contacts.begin, separate=contacts.separate)
     return space
 
 
@@ -138,10 +160,30 @@ def _point_key(point: Array) -> tuple[int, int]:
     return round(point[0] * 1e4), round(point[1] * 1e4)
 
 
-def add_robot(space: pymunk.Space, robot: RobotConfig) -> pymunk.Body:
-    """Add the robot's body, a box with its centre of mass in the middle, at the origin; return it."""
-    body = pymunk.Body(robot.mass_kg, robot.inertia_kg_m2)
-    shape = pymunk.Poly.create_box(body, (robot.length_m, robot.width_m))
-    shape.friction, shape.elasticity, shape.collision_type = _FRICTION, _ELASTICITY, _ROBOT
-    space.add(body, shape)
-    return body
+def add_robots(space: pymunk.Space, robots: Sequence[RobotConfig]) -> list[tuple[pymunk.Body, Touch]]:
+    """Add each robot's body, a box with its centre of mass in the middle, at the origin; return them."""
+    added: list[tuple[pymunk.Body, Touch]] = []
+    touches: dict[pymunk.Shape, Touch] = {}
+    for robot in robots:
+        body = pymunk.Body(robot.mass_kg, robot.inertia_kg_m2)
+        shape = pymunk.Poly.create_box(body, (robot.length_m, robot.width_m))
+        shape.friction, shape.elasticity, shape.collision_type = _FRICTION, _ELASTICITY, _ROBOT
+        space.add(body, shape)
+        touches[shape] = Touch()
+        added.append((body, touches[shape]))
+
+    def parties(arbiter: pymunk.Arbiter) -> tuple[Touch, bool]:
+        # Where two robots touch, pymunk calls twice, each robot's shape first once; a wall may come first.
+        first, other = arbiter.shapes
+        return touches[first if first in touches else other], first in touches and other in touches
+
+    def begin(arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        touch, robot = parties(arbiter)
+        touch.begin(robot)
+
+    def separate(arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
+        touch, robot = parties(arbiter)
+        touch.separate(robot)
+
+    space.on_collision(_ROBOT, None, begin=begin, separate=separate)
+    return added

@@ -14,12 +14,13 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pymunk
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
-from mecanum_env.physics.collisions import CONTACT_GAP_S, Contacts, add_robot, build_space
-from mecanum_env.physics.floor import build_floor
+from mecanum_env.physics.collisions import CONTACT_GAP_S, Contacts, Touch, add_robots, build_space
+from mecanum_env.physics.floor import Floor, build_floor
 from mecanum_env.physics.robot import (
     INCREMENTS,
     POSE,
@@ -38,7 +39,7 @@ from slam.geometry import wrap_scalar
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
 
-__all__ = ["CONTACT_GAP_S", "MAX_TRAVEL_M", "World"]
+__all__ = ["CONTACT_GAP_S", "MAX_TRAVEL_M", "World", "divide"]
 
 Array = NDArray[np.float64]
 
@@ -158,7 +159,7 @@ def _drive_clear(
 
 
 @lru_cache(maxsize=16)
-def _divide(step_s: float, physics_step_s: float) -> tuple[int, float, int]:
+def divide(step_s: float, physics_step_s: float) -> tuple[int, float, int]:
     """Return how many physics steps a control step has, their length [s], and the substeps of each."""
     steps = max(1, round(step_s / physics_step_s))
     dt = step_s / steps
@@ -180,6 +181,8 @@ class World:
     true_radii, true_lever
         The robot's true wheel radii ``(4,)`` [m] and lever [m], where they differ from the nominal ones
         (:class:`mecanum_env.sensing.sensors.WheelEncoders` draws them).
+    floor
+        The one that another robot of the same plan stands on; else it is drawn.
     shortcut
         Leave pymunk out while nothing can be touched. The path is the same without, only slower.
 
@@ -198,10 +201,11 @@ class World:
         *,
         true_radii: ArrayLike | None = None,
         true_lever: float | None = None,
+        floor: Floor | None = None,
         shortcut: bool = True,
     ) -> None:
         self.plan, self.robot, self.noise = plan, robot, noise
-        self.floor = build_floor(plan, noise, rng)
+        self.floor = build_floor(plan, noise, rng) if floor is None else floor
         self._rng = rng
         self._slips, self._slips_left = np.empty((_AHEAD, 4)), 0
         self._shortcut = shortcut
@@ -222,8 +226,8 @@ class World:
         self._work[POSE] = plan.start
         self._wrap_pose()
         self._contacts = Contacts()
-        self._space = build_space(plan, self._contacts)
-        self._body = add_robot(self._space, robot)
+        self._space = build_space(plan)
+        ((self._body, self._touch),) = add_robots(self._space, (robot,))
         self._body_is_behind = True
         self._forgotten = _PERSISTENCE  # pymunk's steps since it last found a contact
         self._check_start()
@@ -238,7 +242,7 @@ class World:
         free = self._touches_nothing()
         if not free:
             self._work[_STATE] = before
-            self._place_body()
+            self._body_is_behind = True
         self._wrap_pose()
         return free
 
@@ -248,7 +252,8 @@ class World:
         return self._fixed[_GRIP]
 
     def _touches_nothing(self) -> bool:
-        self._place_body()
+        self.place(self._body)
+        self._body_is_behind = False
         (shape,) = self._body.shapes
         shape.cache_bb()
         return not self._space.shape_query(shape)
@@ -270,71 +275,90 @@ class World:
         step_s, physics_step_s
             Length of the control step and of the physics steps it consists of [s].
         """
-        steps, dt, substeps = _divide(step_s, physics_step_s)
+        steps, dt, substeps = divide(step_s, physics_step_s)
+        clear = self._shortcut and self._forgotten >= _PERSISTENCE
+        done = self.begin(wheel_targets, (steps, dt, substeps), clear=clear)
+        if done < steps:
+            if self._body_is_behind:
+                self.place(self._body)
+                self._body_is_behind = False
+            for step in range(done, steps):
+                parts = self.push(self._body, dt, substeps)
+                for _ in range(parts):
+                    self._space.step(dt / parts)
+                self._forgotten = 0 if self.settle(self._body, self._touch, dt, step) else self._forgotten + parts
+            self._wrap_pose()
+
+    # ---- parts of a step, for many robots in one space -----------------------------------------------------
+
+    def begin(self, wheel_targets: ArrayLike, division: tuple[int, float, int], *, clear: bool) -> int:
+        """Begin a control step; return how many of its physics steps are done, as nothing can be touched in them.
+
+        ``division`` is what :func:`divide` returns; where it is not ``clear``, none is done.
+        """
+        steps, dt, substeps = division
         self._work[_TARGETS] = wheel_targets
         if self._slips_left == 0:
             self._rng.random(out=self._slips)  # even where slip is zero: the stream must not depend on it
             self._slips_left = _AHEAD
         self._work[_LOST] = self._slips[-self._slips_left]
         self._slips_left -= 1
-        clear = self._shortcut and self._forgotten >= _PERSISTENCE
         if len(self._readings) != steps:
             self._readings = np.zeros((steps, 4))
-        done = self._drive_clear(dt, substeps, steps if clear else 0)
+        floor = self.floor
+        done = _drive_clear(
+            self._work, self._fixed, floor.friction, floor.clearance, self._segments, self._circles, dt, substeps,
+            steps if clear else 0, self._readings,
+        )  # fmt: skip
         if done:
             self._body_is_behind = True
             self._contacts.pass_clear(done * dt)
-        if done < steps:
-            for step in range(done, steps):
-                self._drive_near(dt, substeps)
-                self._readings[step] = self._work[INCREMENTS]
-            self._wrap_pose()
+        return done
 
-    def _wrap_pose(self) -> None:
-        x, y, theta = self._work[POSE].tolist()
-        self._work[_WRAPPED] = x, y, wrap_scalar(theta)
-
-    def _drive_clear(self, dt: float, substeps: int, steps: int) -> int:
-        floor = self.floor
-        return _drive_clear(
-            self._work, self._fixed, floor.friction, floor.clearance, self._segments, self._circles, dt, substeps,
-            steps, self._readings,
-        )  # fmt: skip
-
-    def _drive_near(self, dt: float, substeps: int) -> None:
-        """Take one physics step through pymunk."""
-        if self._body_is_behind:
-            self._place_body()
-        state, body, contacts = self._work[_STATE], self._body, self._contacts
+    def push(self, body: pymunk.Body, dt: float, substeps: int) -> int:
+        """Give pymunk's body the mean velocity of its next physics step; return in how many parts to step."""
         _wheel_step(self._work, self._fixed, self.floor.friction, dt / substeps, substeps)
-        # Always the same number of parts: pymunk scales the impulses it starts from with the ratio of one step's
-        # length to the last one's, and a wall struck in a short step throws the robot back in a long one.
-        parts = max(1, math.ceil(self._fastest * dt / MAX_TRAVEL_M))
         dx, dy, turn = self._work[_MOTION].tolist()
         body.velocity = dx / dt, dy / dt
         body.angular_velocity = turn / dt
-        for _ in range(parts):
-            self._space.step(dt / parts)
+        # Always the same number of parts: pymunk scales the impulses it starts from with the ratio of one step's
+        # length to the last one's, and a wall struck in a short step throws the robot back in a long one.
+        return max(1, math.ceil(self._fastest * dt / MAX_TRAVEL_M))
+
+    def settle(self, body: pymunk.Body, touch: Touch, dt: float, step: int) -> bool:
+        """Take over where pymunk has brought the body in a physics step; tell whether anything was touched."""
+        state, touched = self._work[_STATE], touch.now
         x, y = body.position
         angle = body.angle
         state[0], state[1], state[2] = x, y, angle
-        self._forgotten += parts
         impulse = 0.0
-        if contacts.touched:
-            self._forgotten = 0
+        if touched:
             # The contact has the last word on the velocity; elsewhere it is the kernel's, at the step's end.
             vx, vy = body.velocity
             c, s = math.cos(angle), math.sin(angle)
             ahead, aside = c * vx + s * vy, c * vy - s * vx
             impulse = self.robot.mass_kg * math.hypot(ahead - state[3], aside - state[4])
             state[3], state[4], state[5] = ahead, aside, body.angular_velocity
-        contacts.close_step(dt, impulse)
+        self._contacts.close_step(dt, impulse, touch)
+        self._readings[step] = self._work[INCREMENTS]
+        return touched
 
-    def _place_body(self) -> None:
+    def leave_space(self) -> None:
+        """Take note that the robot was moved in another space than its own."""
+        self._body_is_behind = True
+        self._touch.now = self._touch.robot = False
+        self._forgotten = 0  # what its own space remembers is old
+        self._wrap_pose()
+
+    def place(self, body: pymunk.Body) -> None:
+        """Put a body of pymunk's where the robot is, at rest."""
         x, y, theta = self._work[POSE].tolist()
-        self._body.position = x, y
-        self._body.angle = theta
-        self._body_is_behind = False
+        body.position, body.angle = (x, y), theta
+        body.velocity, body.angular_velocity = (0.0, 0.0), 0.0
+
+    def _wrap_pose(self) -> None:
+        x, y, theta = self._work[POSE].tolist()
+        self._work[_WRAPPED] = x, y, wrap_scalar(theta)
 
     @property
     def pose(self) -> Array:
@@ -363,6 +387,16 @@ class World:
     def collisions(self) -> int:
         """Contacts so far: touching again within :data:`CONTACT_GAP_S`, or several things at once, is one."""
         return self._contacts.count
+
+    @property
+    def robot_collisions(self) -> int:
+        """Those of the contacts in which another robot was touched."""
+        return self._contacts.with_robots
+
+    @property
+    def fastest_m_s(self) -> float:
+        """Speed that no point of the body exceeds on its own [m/s]."""
+        return self._fastest
 
     @property
     def last_impulse(self) -> float:

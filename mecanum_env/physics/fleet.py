@@ -1,0 +1,106 @@
+"""Several robots in one plan: each alone where it can touch no other, in one pymunk space where two may touch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mecanum_env.physics.collisions import add_robots, build_space
+from mecanum_env.physics.world import World, divide
+from mecanum_env.rooms.floor_plan import FloorPlanError
+
+__all__ = ["Fleet", "body_outline"]
+
+Array = NDArray[np.float64]
+
+
+class Fleet:
+    """The robots of one floor plan, stepped together.
+
+    A robot that is too far from all others to touch one in a step is moved by its own :class:`World`, as though it
+    were alone: so one robot's path is the same, bit for bit. Those that are nearer move in lockstep in a space
+    that they share.
+
+    Parameters
+    ----------
+    worlds : sequence of World
+        One a robot, all of one plan; at least one.
+
+    Raises
+    ------
+    FloorPlanError
+        Where two robots overlap at their starts.
+    """
+
+    def __init__(self, worlds: Sequence[World]) -> None:
+        self.worlds = tuple(worlds)
+        robots = [world.robot for world in self.worlds]
+        self._space = build_space(self.worlds[0].plan)
+        self._bodies = add_robots(self._space, robots)
+        self._radii = np.array([robot.circumscribed_radius_m for robot in robots])
+        self._fastest = np.array([world.fastest_m_s for world in self.worlds])
+        self._check_starts()
+
+    def _check_starts(self) -> None:
+        for world, (body, _) in zip(self.worlds, self._bodies, strict=True):
+            world.place(body)
+        for k, (body, _) in enumerate(self._bodies):
+            (shape,) = body.shapes
+            shape.cache_bb()
+            if self._space.shape_query(shape):
+                at = ", ".join(f"{v:.2f}" for v in self.worlds[k].pose)
+                raise FloorPlanError(f"robot {k} touches something at its start ({at}); choose another")
+
+    def near_others(self, duration_s: float) -> NDArray[np.bool_]:
+        """Return which robots ``(n,)`` may touch another within a time [s]."""
+        xy = np.array([world.pose[:2] for world in self.worlds])
+        apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+        np.fill_diagonal(apart, np.inf)
+        # Twice the way: one that is hit is thrown back.
+        reach = self._radii + 2.0 * self._fastest * duration_s
+        return np.asarray((apart < reach[:, None] + reach[None]).any(axis=1))
+
+    def step(self, wheel_targets: Sequence[ArrayLike], step_s: float, physics_step_s: float) -> None:
+        """Drive every robot for one control step; arguments as in :meth:`World.step`, targets one a robot."""
+        near = self.near_others(step_s) if len(self.worlds) > 1 else np.zeros(1, np.bool_)
+        for world, targets, together in zip(self.worlds, wheel_targets, near.tolist(), strict=True):
+            if not together:
+                world.step(targets, step_s, physics_step_s)
+        if near.any():
+            self._step_together(np.flatnonzero(near).tolist(), wheel_targets, step_s, physics_step_s)
+
+    def _step_together(
+        self, near: list[int], wheel_targets: Sequence[ArrayLike], step_s: float, physics_step_s: float
+    ) -> None:
+        steps, dt, substeps = division = divide(step_s, physics_step_s)
+        for world, (body, touch) in zip(self.worlds, self._bodies, strict=True):
+            world.place(body)
+            touch.now = touch.robot = False
+        for k in near:
+            self.worlds[k].begin(wheel_targets[k], division, clear=False)
+        for step in range(steps):
+            parts = max(self.worlds[k].push(self._bodies[k][0], dt, substeps) for k in near)
+            for _ in range(parts):
+                self._space.step(dt / parts)
+            for k in near:
+                self.worlds[k].settle(*self._bodies[k], dt, step)
+        for k in near:
+            self.worlds[k].leave_space()
+
+    def outlines(self) -> Array:
+        """Return the sides of every body ``(n, 4, 4)``: x1, y1, x2, y2 in the world frame [m]."""
+        return np.array([
+            body_outline(world.pose, world.robot.length_m, world.robot.width_m) for world in self.worlds
+        ])  # fmt: skip
+
+
+def body_outline(pose: Array, length_m: float, width_m: float) -> Array:
+    """Return the four sides of a body at a pose ``(3,)`` as segments ``(4, 4)`` [m], counter-clockwise."""
+    x, y, theta = pose.tolist()
+    c, s = math.cos(theta), math.sin(theta)
+    ahead, aside = 0.5 * length_m * np.array([1, -1, -1, 1]), 0.5 * width_m * np.array([1, 1, -1, -1])
+    corners = np.column_stack([x + c * ahead - s * aside, y + s * ahead + c * aside])
+    return np.hstack([corners, np.roll(corners, -1, axis=0)])
