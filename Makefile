@@ -31,7 +31,7 @@ $(VENV)/core.stamp: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test.stamp: $(VENV)/core.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,human,video,ros,rerun,ray,parquet,docs]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,multi,human,video,ros,rerun,ray,parquet,docs]'
 	@touch $@
 
 $(OTHER).stamp: $(VENV)/test.stamp

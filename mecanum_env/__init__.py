@@ -12,9 +12,14 @@ In a process that has not imported it, ``gym.make("mecanum_env:mecanum_env/Explo
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
 
-__all__ = ["register_envs"]
+if TYPE_CHECKING:
+    from mecanum_env.team.parallel_env import ExploreParallelEnv
+
+__all__ = ["parallel_env", "register_envs"]
 
 MAX_EPISODE_STEPS = 3000
 
@@ -34,6 +39,13 @@ def register_envs() -> None:
     # An environment that needs an agent's machinery lives with the agents; its own time limit is in seconds.
     if "mecanum_env/ExploreFrontier-v0" not in gymnasium.registry:
         gymnasium.register("mecanum_env/ExploreFrontier-v0", entry_point="agents.frontier_env:ExploreFrontierEnv")
+
+
+def parallel_env(robots: int = 3, **settings: Any) -> ExploreParallelEnv:
+    """Return several robots as a PettingZoo environment (:mod:`mecanum_env.team`); needs the extra ``multi``."""
+    from mecanum_env.team.parallel_env import ExploreParallelEnv
+
+    return ExploreParallelEnv(robots=robots, **settings)
 
 
 register_envs()

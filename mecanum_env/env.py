@@ -19,6 +19,7 @@ from mecanum_env.arguments import make_backend, make_config
 from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
+from mecanum_env.physics.floor import Floor
 from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import World
 from mecanum_env.reward import StepOutcome, reward_terms
@@ -29,15 +30,18 @@ from mecanum_env.views.window import make_viewer
 from slam.belief import Belief
 from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
+from slam.grids.occupancy import OccupancyGrid
 from slam.odometry.filters import make_odometry_filter
 from slam.settings import unknown_name
-from slam.types import Odometry
+from slam.types import Odometry, Scan
 
 __all__ = ["ExploreEnv"]
 
 Array = NDArray[np.float64]
 
 ACTIONS = {"twist": 3, "wheels": 4}
+
+_NOTHING = Scan(np.zeros(0), 0.0, 0.0, 0.0)
 
 
 class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
@@ -103,73 +107,101 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         for key in options:
             if key not in ("floor_plan", "start_pose", "room_seed"):
                 raise unknown_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
-        # One generator per purpose, so that nothing an agent or a backend does changes another's draws.
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
+        room_seed = options.get("room_seed")
+        plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
+        self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
+        self._set_up(plan, episode_seed)
+        info = self._first_look()
+        self._viewer.show(self)
+        return self._observe(), info
+
+    def _set_up(self, plan: FloorPlan, episode_seed: int, floor: Floor | None = None) -> None:
+        """Place the robot in the plan, on the floor of another robot if there is one; nothing is sensed yet."""
+        # One generator per purpose, so that nothing an agent or a backend does changes another's draws.
         world_seed, sensor_seed = np.random.SeedSequence(episode_seed).spawn(2)
         world_rng = np.random.Generator(np.random.PCG64(world_seed))
         self._sensor_rng = noise_stream(sensor_seed)
-        room_seed = options.get("room_seed")
-        plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
         config = self.config
         self._encoders = WheelEncoders(config.robot, config.noise, world_rng)
         self._odometer = FilteredEncoders(self._encoders, self._filter) if self._filter else self._encoders
         world = World(
-            plan, config.robot, config.noise, world_rng,
+            plan, config.robot, config.noise, world_rng, floor=floor,
             true_radii=self._encoders.true_radii, true_lever=self._encoders.true_lever,
         )  # fmt: skip
+        ground = self._ground_truth(plan)
+        self._coverage = Coverage(ground)
+        self._start_backend(ground.in_start_frame(np.array(plan.start)), episode_seed)
+        self.truth = Truth(ground, world, EpisodeRecord(), _NOTHING)
+
+    def _ground_truth(self, plan: FloorPlan) -> GroundTruth:
+        config = self.config
         start = np.array(plan.start, dtype=np.float64)
-        ground = GroundTruth(
+        return GroundTruth(
             plan, start, robot=config.robot, lidar=config.lidar, resolution=config.grid_resolution_m
         )
-        self._coverage = Coverage(ground)
-        self.backend.reset((0.0, 0.0, 0.0), seed=episode_seed)
-        scan = self.lidar.scan(plan.segments, plan.circles, world.pose, self._sensor_rng)
-        self.truth = Truth(ground, world, EpisodeRecord(), scan)
-        self.scan = scan
+
+    def _start_backend(self, start: Array, seed: int) -> None:
+        """Have the backend start over at its start pose ``(3,)``, in its own frame."""
+        self.backend.reset(start, seed=seed)
+
+    def _first_look(self) -> dict[str, Any]:
+        """Take the first scan, and return the first info."""
+        backend, truth = self.backend, self.truth
+        true_pose = truth.ground.in_start_frame(np.array(truth.world.plan.start))
+        self.scan, mapped = self._look()
+        truth.scan = self.scan
         self._steps = 0
-        self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
-        self._odometry = Odometry((0.0, 0.0, 0.0), config.step_s)
+        self._odometry = Odometry((0.0, 0.0, 0.0), self.config.step_s)
         self._ready = True
         if self._knows_truth:
-            cast("TruthSlam", self.backend).give_pose(np.zeros(3))
-        self.backend.update(scan)
-        self._pose, self._pose_cov = self.backend.pose, self.backend.pose_cov
+            cast("TruthSlam", backend).give_pose(true_pose)
+        backend.update(mapped)
+        self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._remember()
-        info = self._info(self._coverage.update(self.backend.grid), np.zeros(3))
-        self._viewer.show(self)
-        return self._observe(), info
+        return self._info(self._coverage.update(backend.grid), true_pose)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step; see :mod:`mecanum_env.reward` for the reward."""
         if not self._ready:
             raise RuntimeError("call reset() before step()")
-        config, truth, backend = self.config, self.truth, self.backend
-        world, ground, plan = truth.world, truth.ground, truth.ground.plan
+        config, world = self.config, self.truth.world
         collisions = world.collisions
         world.step(self._to_wheels(action), config.step_s, config.physics_step_s)
-        odometry = self._odometer.odometry(world.wheel_readings, config.step_s, self._sensor_rng)
-        world_pose = world.pose
-        scan = self.lidar.scan(plan.segments, plan.circles, world_pose, self._sensor_rng)
-        self._odometry, self.scan, truth.scan = odometry, scan, scan
-        true_pose = ground.in_start_frame(world_pose)
-        backend.predict(odometry)
-        if self._knows_truth:
-            cast("TruthSlam", backend).give_pose(true_pose)
-        backend.update(scan)
-        self._pose, self._pose_cov = backend.pose, backend.pose_cov
-        self._steps += 1
-
-        coverage = self._coverage.update(backend.grid)
-        terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
-        info = self._info(coverage, true_pose)
-        info["reward_terms"] = terms
-        success = coverage >= config.coverage_target
+        info = self._perceive(collisions)
+        success = info["coverage"] >= config.coverage_target
         terminated = success or (config.terminate_on_collision and world.collisions > 0)
         if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
             info["is_success"] = bool(success)
             info["episode_metrics"] = self.episode_metrics()
         self._viewer.show(self)
-        return self._observe(), float(sum(terms.values())), bool(terminated), False, info
+        return self._observe(), float(sum(info["reward_terms"].values())), bool(terminated), False, info
+
+    def _perceive(self, collisions: int) -> dict[str, Any]:
+        """Sense what a step brought, believe it, and return its info; there were so many collisions before."""
+        config, truth, backend = self.config, self.truth, self.backend
+        world = truth.world
+        odometry = self._odometer.odometry(world.wheel_readings, config.step_s, self._sensor_rng)
+        self.scan, mapped = self._look()
+        self._odometry, truth.scan = odometry, self.scan
+        true_pose = truth.pose
+        backend.predict(odometry)
+        if self._knows_truth:
+            cast("TruthSlam", backend).give_pose(true_pose)
+        backend.update(mapped)
+        self._pose, self._pose_cov = backend.pose, backend.pose_cov
+        self._steps += 1
+        coverage = self._coverage.update(backend.grid)
+        terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
+        info = self._info(coverage, true_pose)
+        info["reward_terms"] = terms
+        return info
+
+    def _look(self) -> tuple[Scan, Scan]:
+        """Take a scan: as the agent sees it, and as it is mapped."""
+        plan = self.truth.ground.plan
+        scan = self.lidar.scan(plan.segments, plan.circles, self.truth.world.pose, self._sensor_rng)
+        return scan, scan
 
     def render(self) -> Any:
         """Return truth beside belief as an RGB image ``(h, w, 3)``; with ``"human"`` None: it is shown already."""
@@ -191,6 +223,11 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def belief(self) -> Belief:
         """What the robot knows; agents may use it."""
         return self.backend.belief
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map that the robot goes by."""
+        return self.backend.grid
 
     @property
     def odometry(self) -> Odometry:
@@ -278,6 +315,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return observe(
             self.config,
             self.backend,
+            self.grid,
             self.scan,
             pose=self._pose,
             pose_cov=self._pose_cov,

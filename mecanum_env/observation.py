@@ -75,6 +75,7 @@ def _map_frame(
 def observe(
     config: EnvConfig,
     backend: Backend,
+    grid: OccupancyGrid,
     scan: Scan,
     *,
     pose: Array,
@@ -86,6 +87,8 @@ def observe(
 
     Parameters
     ----------
+    grid : OccupancyGrid
+        The map that is shown: the backend's, or a team's.
     pose, pose_cov : Array
         The backend's mean ``(3,)`` and covariance ``(3, 3)``.
     twist : tuple
@@ -93,7 +96,7 @@ def observe(
     time_used : float
         Fraction of the episode's time used.
     """
-    grid, robot = backend.grid, config.robot
+    robot = config.robot
     row0, col0 = grid.lattice_origin
     vx, vy, omega = twist
     maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
 
-__all__ = ["Belief"]
+__all__ = ["Belief", "Teammate"]
 
 Array = NDArray[np.float64]
 
@@ -21,9 +21,22 @@ _POSTPONED = (
 )  # fmt: skip
 
 
+class Teammate(NamedTuple):
+    """Another robot, as the last that was heard or seen of it says."""
+
+    robot: int
+    pose: Array  # (3,) in the belief's frame
+    age_s: float  # since it was there
+    goal: Array | None = None  # (2,) where it said to go [m], in the belief's frame
+    radius_m: float = 0.35  # of the circle around its body
+
+
 @dataclass(frozen=True, slots=True, weakref_slot=True)
 class Belief:
-    """What a backend believes now, in the frame of its start. Arrays are copies; the grid is live."""
+    """What a backend believes now, in the frame of its start. Arrays are copies; the grid is live.
+
+    In a team the grid is of all that the robot knows, its own observations and what others told.
+    """
 
     pose: Array  # (3,) x [m], y [m], θ [rad]
     pose_cov: Array  # (3, 3)
@@ -39,6 +52,7 @@ class Belief:
     line_ends: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (k, 4) x1, y1, x2, y2 [m]
     health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)
+    teammates: tuple[Teammate, ...] = ()  # those of whom it knows where they are, by rising number
     _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array], Callable[[], Array]] | None = field(
         default=None, repr=False, compare=False
     )  # see postponed
@@ -61,6 +75,17 @@ class Belief:
         for name in _POSTPONED:
             object.__delattr__(belief, name)
         return belief
+
+    def in_team(self, grid: OccupancyGrid, teammates: tuple[Teammate, ...]) -> Belief:
+        """Return the belief with a team's map in place of its own, and the others."""
+        if self._read is None:
+            return replace(self, grid=grid, teammates=teammates)
+        names = _POSTPONED[:5]
+        return Belief.postponed(
+            lambda: {name: getattr(self, name) for name in names}, lambda: self.landmark_cov,
+            lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid, health=self.health,
+            teammates=teammates,
+        )  # fmt: skip
 
     @property
     def has_whole_cov(self) -> bool:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONCAVE", "CONVEX", "LINE", "Observations", "Odometry", "Scan"]
+__all__ = ["CONCAVE", "CONVEX", "LINE", "Observations", "Odometry", "Scan", "Sighting"]
 
 Array = NDArray[np.float64]
 
@@ -49,6 +49,14 @@ class Scan(NamedTuple):
     angle_increment: float  # [rad]
     range_max: float  # [m]
     range_min: float = 0.0  # [m]
+
+
+class Sighting(NamedTuple):
+    """Another robot, measured from this one: centre to centre, in this one's body frame."""
+
+    robot: int
+    measured: Array  # (3,) range [m], bearing [rad], the other's heading less one's own [rad]
+    cov: Array  # (3, 3)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,22 +15,38 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pymunk
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
+from mecanum_env.physics.clear_driving import (
+    CONSTANTS,
+    FIXED_SIZE,
+    GRIP,
+    HALF_X,
+    HALF_Y,
+    LOST,
+    MOTION,
+    RADII,
+    RASTER,
+    SLIP,
+    STATE,
+    TARGETS,
+    WHEELS_X,
+    WHEELS_Y,
+    WORK_SIZE,
+    WRAPPED,
+    drive_clear,
+    wheel_step,
+)
 from mecanum_env.physics.collisions import CONTACT_GAP_S, Contacts, Touch, add_robots, build_space
 from mecanum_env.physics.floor import Floor, build_floor
 from mecanum_env.physics.robot import (
     INCREMENTS,
     POSE,
-    STATE_SIZE,
     SUBSTEP_S,
     TWIST,
     WHEELS,
     dynamics_constants,
-    motor_constants,
-    turn_wheels,
     wheel_positions,
 )
 from mecanum_env.rooms.floor_plan import FloorPlanError
@@ -46,116 +62,8 @@ Array = NDArray[np.float64]
 MAX_TRAVEL_M = 0.005
 """pymunk's steps are cut so that the robot, at its limits, goes no further in one: hence no deeper into a wall."""
 
-_MARGIN_M = 1e-3  # nothing within it: no contact, whatever the rounding
 _AHEAD = 64  # control steps whose slip is drawn at once: a draw of four numbers takes 1.5 µs, of 256 two
 _PERSISTENCE = 4  # steps after which pymunk has forgotten a contact (its collision_persistence is 3)
-
-
-# What the kernels carry beside the state, in one array: each argument of a call takes 80 ns to unpack.
-_STATE = slice(0, STATE_SIZE)
-_TARGETS = slice(18, 22)  # commanded wheel speeds [rad/s]
-_LOST = slice(22, 26)  # this control step's slip of each wheel, as a share of twice the mean
-_GROUND_RADII = slice(26, 30)  # ``_RADII``, each less what is lost to slip [m]
-_MOTION = slice(30, 33)  # of the last physics step: displacement [m, m], rotation [rad]
-_MU = slice(33, 37)  # friction under each wheel
-_MOTOR = slice(37, 44)  # from :func:`mecanum_env.physics.robot.motor_constants`
-_UNDO = slice(44, 44 + STATE_SIZE)  # the state before the physics step
-_WRAPPED = slice(62, 65)  # the pose, its heading in [-π, π)
-_WORK_SIZE = 65
-# … and what stays the same for a whole episode.
-_RADII = slice(0, 4)  # [m]
-_CONSTANTS = slice(4, 14)  # from :func:`mecanum_env.physics.robot.dynamics_constants`
-_RASTER = slice(14, 17)  # the floor's: x, y of its corner [m], cells a metre
-_WHEELS_X, _WHEELS_Y = slice(17, 21), slice(21, 25)  # in the body frame [m]
-_HALF_X, _HALF_Y, _SLIP = 25, 26, 27
-_GRIP = slice(28, 32)  # share of the floor's friction that each wheel has
-_FIXED_SIZE = 32
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
-    """Run :func:`turn_wheels` over a physics step with the μ that the wheels stand on at its start."""
-    state, raster, mu, grip = work[_STATE], fixed[_RASTER], work[_MU], fixed[_GRIP]
-    wheels_x, wheels_y = fixed[_WHEELS_X], fixed[_WHEELS_Y]
-    c, s = math.cos(state[2]), math.sin(state[2])
-    rows, cols = friction.shape
-    for i in range(4):
-        x = state[0] + c * wheels_x[i] - s * wheels_y[i]
-        y = state[1] + s * wheels_x[i] + c * wheels_y[i]
-        col = min(max(int((x - raster[0]) * raster[2]), 0), cols - 1)
-        row = min(max(int((y - raster[1]) * raster[2]), 0), rows - 1)
-        mu[i] = friction[row, col] * grip[i]
-    turn_wheels(
-        state, work[_TARGETS], work[_GROUND_RADII], mu, fixed[_CONSTANTS], work[_MOTOR], h, substeps, work[_MOTION]
-    )
-
-
-@njit(cache=True, nogil=True)
-def _box_is_clear(
-    x: float, y: float, theta: float, half_x: float, half_y: float, segments: Array, circles: Array
-) -> bool:
-    """Tell whether no surface comes into a rectangle [m] about a pose (separating axes; exact)."""
-    c, s = math.cos(theta), math.sin(theta)
-    reach = half_x + half_y
-    for i in range(segments.shape[0]):
-        ax, ay, bx, by = segments[i, 0] - x, segments[i, 1] - y, segments[i, 2] - x, segments[i, 3] - y
-        if min(ax, bx) > reach or max(ax, bx) < -reach or min(ay, by) > reach or max(ay, by) < -reach:
-            continue
-        ax, ay = c * ax + s * ay, c * ay - s * ax
-        bx, by = c * bx + s * by, c * by - s * bx
-        if min(ax, bx) > half_x or max(ax, bx) < -half_x or min(ay, by) > half_y or max(ay, by) < -half_y:
-            continue
-        ex, ey = bx - ax, by - ay
-        if abs(ax * ey - ay * ex) <= half_x * abs(ey) + half_y * abs(ex):
-            return False
-    for i in range(circles.shape[0]):
-        dx, dy = circles[i, 0] - x, circles[i, 1] - y
-        outside_x = max(abs(c * dx + s * dy) - half_x, 0.0)
-        outside_y = max(abs(c * dy - s * dx) - half_y, 0.0)
-        if outside_x * outside_x + outside_y * outside_y <= circles[i, 2] * circles[i, 2]:
-            return False
-    return True
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _drive_clear(
-    work: Array, fixed: Array, friction: NDArray[np.float32], clearance: NDArray[np.float32], segments: Array,
-    circles: Array, dt: float, substeps: int, steps: int, readings: Array,
-) -> int:  # fmt: skip
-    """Run up to ``steps`` physics steps for as long as nothing can be touched in them.
-
-    pymunk looks for contacts each time it has moved the body. Where nothing is within a step's travel of the
-    body at the step's end, it would have found none. Returns the number of steps taken; the one in which
-    something may be touched is undone. What ``work`` holds of the control step is filled for whoever goes on.
-    """
-    state, undo, motion, wrapped = work[_STATE], work[_UNDO], work[_MOTION], work[_WRAPPED]
-    state[INCREMENTS] = 0.0
-    radii, ground_radii, lost = fixed[_RADII], work[_GROUND_RADII], work[_LOST]
-    for i in range(4):
-        ground_radii[i] = radii[i] * (1.0 - 2.0 * fixed[_SLIP] * lost[i])
-    h = dt / substeps
-    motor_constants(fixed[_CONSTANTS], h, work[_MOTOR])
-    raster, half_x, half_y = fixed[_RASTER], fixed[_HALF_X], fixed[_HALF_Y]
-    rows, cols = clearance.shape
-    circumscribed = math.sqrt(half_x * half_x + half_y * half_y)
-    for step in range(steps):
-        undo[:] = state
-        _wheel_step(work, fixed, friction, h, substeps)
-        # As pymunk does it: mean velocity first, then velocity times time.
-        x, y = state[0] + motion[0] / dt * dt, state[1] + motion[1] / dt * dt
-        theta = state[2] + motion[2] / dt * dt
-        travel = math.sqrt(motion[0] ** 2 + motion[1] ** 2) + abs(motion[2]) * circumscribed + _MARGIN_M
-        col = math.floor((x - raster[0]) * raster[2])
-        row = math.floor((y - raster[1]) * raster[2])
-        far = 0 <= row < rows and 0 <= col < cols and clearance[row, col] > circumscribed + travel
-        if not far and not _box_is_clear(x, y, theta, half_x + travel, half_y + travel, segments, circles):
-            state[:] = undo
-            steps = step
-            break
-        state[0], state[1], state[2] = x, y, theta
-        readings[step] = state[INCREMENTS]
-    wrapped[0], wrapped[1], wrapped[2] = state[0], state[1], wrap_scalar(state[2])
-    return steps
 
 
 @lru_cache(maxsize=16)
@@ -209,19 +117,19 @@ class World:
         self._rng = rng
         self._slips, self._slips_left = np.empty((_AHEAD, 4)), 0
         self._shortcut = shortcut
-        self._fixed = fixed = np.zeros(_FIXED_SIZE)
-        fixed[_RADII] = robot.wheel_radius_m if true_radii is None else true_radii
-        fixed[_CONSTANTS] = dynamics_constants(robot, lever_m=true_lever)
-        fixed[_RASTER] = self.floor.raster
-        fixed[_WHEELS_X], fixed[_WHEELS_Y] = wheel_positions(robot).T
-        fixed[_HALF_X], fixed[_HALF_Y], fixed[_SLIP] = 0.5 * robot.length_m, 0.5 * robot.width_m, noise.slip
+        self._fixed = fixed = np.zeros(FIXED_SIZE)
+        fixed[RADII] = robot.wheel_radius_m if true_radii is None else true_radii
+        fixed[CONSTANTS] = dynamics_constants(robot, lever_m=true_lever)
+        fixed[RASTER] = self.floor.raster
+        fixed[WHEELS_X], fixed[WHEELS_Y] = wheel_positions(robot).T
+        fixed[HALF_X], fixed[HALF_Y], fixed[SLIP] = 0.5 * robot.length_m, 0.5 * robot.width_m, noise.slip
         self._fastest = max(
             robot.max_speed_m_s, robot.max_turn_rate_rad_s * robot.circumscribed_radius_m
         )  # [m/s] of any point of the body
-        fixed[_GRIP] = 1.0
+        fixed[GRIP] = 1.0
         self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
-        self._work = np.zeros(_WORK_SIZE)
+        self._work = np.zeros(WORK_SIZE)
         self._readings = np.zeros((1, 4))
         self._work[POSE] = plan.start
         self._wrap_pose()
@@ -237,11 +145,11 @@ class World:
 
         Where it would touch something it stays where it is. For studies of what a belief makes of it.
         """
-        before = self._work[_STATE].copy()
+        before = self._work[STATE].copy()
         self._work[POSE], self._work[TWIST], self._work[WHEELS] = np.asarray(pose, np.float64), 0.0, 0.0
         free = self._touches_nothing()
         if not free:
-            self._work[_STATE] = before
+            self._work[STATE] = before
             self._body_is_behind = True
         self._wrap_pose()
         return free
@@ -249,7 +157,7 @@ class World:
     @property
     def grip(self) -> Array:
         """Share of the floor's friction that each wheel has ``(4,)``; a view, which studies may write to."""
-        return self._fixed[_GRIP]
+        return self._fixed[GRIP]
 
     def _touches_nothing(self) -> bool:
         self.place(self._body)
@@ -297,16 +205,16 @@ class World:
         ``division`` is what :func:`divide` returns; where it is not ``clear``, none is done.
         """
         steps, dt, substeps = division
-        self._work[_TARGETS] = wheel_targets
+        self._work[TARGETS] = wheel_targets
         if self._slips_left == 0:
             self._rng.random(out=self._slips)  # even where slip is zero: the stream must not depend on it
             self._slips_left = _AHEAD
-        self._work[_LOST] = self._slips[-self._slips_left]
+        self._work[LOST] = self._slips[-self._slips_left]
         self._slips_left -= 1
         if len(self._readings) != steps:
             self._readings = np.zeros((steps, 4))
         floor = self.floor
-        done = _drive_clear(
+        done = drive_clear(
             self._work, self._fixed, floor.friction, floor.clearance, self._segments, self._circles, dt, substeps,
             steps if clear else 0, self._readings,
         )  # fmt: skip
@@ -317,8 +225,8 @@ class World:
 
     def push(self, body: pymunk.Body, dt: float, substeps: int) -> int:
         """Give pymunk's body the mean velocity of its next physics step; return in how many parts to step."""
-        _wheel_step(self._work, self._fixed, self.floor.friction, dt / substeps, substeps)
-        dx, dy, turn = self._work[_MOTION].tolist()
+        wheel_step(self._work, self._fixed, self.floor.friction, dt / substeps, substeps)
+        dx, dy, turn = self._work[MOTION].tolist()
         body.velocity = dx / dt, dy / dt
         body.angular_velocity = turn / dt
         # Always the same number of parts: pymunk scales the impulses it starts from with the ratio of one step's
@@ -327,7 +235,7 @@ class World:
 
     def settle(self, body: pymunk.Body, touch: Touch, dt: float, step: int) -> bool:
         """Take over where pymunk has brought the body in a physics step; tell whether anything was touched."""
-        state, touched = self._work[_STATE], touch.now
+        state, touched = self._work[STATE], touch.now
         x, y = body.position
         angle = body.angle
         state[0], state[1], state[2] = x, y, angle
@@ -358,12 +266,12 @@ class World:
 
     def _wrap_pose(self) -> None:
         x, y, theta = self._work[POSE].tolist()
-        self._work[_WRAPPED] = x, y, wrap_scalar(theta)
+        self._work[WRAPPED] = x, y, wrap_scalar(theta)
 
     @property
     def pose(self) -> Array:
         """The robot's true pose ``(3,)`` in the world frame: x [m], y [m], θ [rad] in [-π, π)."""
-        return self._work[_WRAPPED].copy()
+        return self._work[WRAPPED].copy()
 
     @property
     def twist(self) -> Array:

@@ -1,0 +1,104 @@
+"""A frame of a team: the true plan with all robots, beside what each of them has mapped."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, WALL, Canvas, View, put_text, text_width
+from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned, with_margin
+from slam.geometry import compose, inverse, transform_points
+from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
+
+if TYPE_CHECKING:
+    from mecanum_env.team.team import Team
+
+__all__ = ["COLOURS", "render_team"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+COLOURS = (
+    (180, 119, 31), (14, 127, 255), (44, 160, 44), (40, 39, 214), (189, 103, 148), (75, 86, 140), (194, 119, 227),
+    (34, 189, 188),
+)  # fmt: skip
+"""Of the robots in turn, blue, green, red: Matplotlib's."""
+
+_SHAPE = (720, 1280)
+_PANEL = (620, 624)  # width, height
+_LEFT, _RIGHT, _TOP = 14, 646, 44
+_TINT = 0.45  # share of the robot's colour in what it has mapped
+
+
+def render_team(team: Team) -> Image:
+    """Return truth beside maps as an RGB image ``(720, 1280, 3)``, in the frame of the first robot's start.
+
+    Left: the plan, the robots and their true ways. Right: what is mapped, in the colour of whose map it is on;
+    where several have it, in all of theirs.
+    """
+    ground = team.ground
+    frame = np.empty((*_SHAPE, 3), np.uint8)
+    frame[:] = PAGE
+    width, height = _PANEL
+    view = View.fit(with_margin(extent_of_truth(ground)), width, height)
+    left = Canvas(frame[_TOP : _TOP + height, _LEFT : _LEFT + width], view)
+    right = Canvas(frame[_TOP : _TOP + height, _RIGHT : _RIGHT + width], view)
+    paint_plan(left, ground.plan, inverse(ground.start))
+    frames = [compose(inverse(ground.start), member.truth.ground.start) for member in team.members]
+    _paint_maps(right, [member.backend.grid for member in team.members], frames)
+    for member, placed in zip(team.members, frames, strict=True):
+        colour = COLOURS[member.number % len(COLOURS)]
+        record, robot = member.truth.record, member.config.robot
+        left.line(thinned(transform_points(placed, record.true_poses[:, :2]), view), colour, px=2)
+        left.robot(compose(placed, member.truth.pose), robot, colour)
+        right.line(thinned(transform_points(placed, record.estimates[:, :2]), view), colour, px=2)
+        right.robot(compose(placed, member.backend.pose), robot, colour)
+    _write(frame, team)
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _paint_maps(canvas: Canvas, grids: list[OccupancyGrid], frames: list[Array]) -> None:
+    """Paint each robot's free cells in its colour, and every wall."""
+    view = canvas.view
+    shape = (view.height, view.width)
+    tints, seen = np.zeros((*shape, 3)), np.zeros(shape)
+    walls = np.zeros(shape, np.bool_)
+    for number, (grid, placed) in enumerate(zip(grids, frames, strict=True)):
+        classes = grid.classes()
+        matrix = view.raster_matrix(grid.resolution, grid.origin, placed)
+        free, occupied = (
+            cv2.warpAffine((classes == what).astype(np.uint8), matrix, shape[::-1], flags=cv2.INTER_NEAREST) > 0
+            for what in (FREE, OCCUPIED)
+        )
+        tints[free] += COLOURS[number % len(COLOURS)]
+        seen += free
+        walls |= occupied
+    known = seen > 0
+    canvas.image[:] = UNSEEN
+    mean = tints[known] / seen[known][:, None]
+    canvas.image[known] = np.round(_TINT * mean + (1.0 - _TINT) * np.array(FLOOR)).astype(np.uint8)
+    canvas.image[walls] = WALL
+
+
+def _write(frame: Image, team: Team) -> None:
+    put_text(frame, "World", (_LEFT, 30), INK, size=19, bold=True)
+    put_text(frame, "Maps", (_RIGHT, 30), INK, size=19, bold=True)
+    height, width = _SHAPE
+    coverage = team.coverage_share
+    collisions = sum(member.truth.world.collisions for member in team.members)
+    entries = (
+        ("time", f"{team.time_s:.1f} s", 0),
+        ("coverage", f"{100.0 * coverage:.1f} %", 163),
+        ("robots", f"{len(team.members)}", 352),
+        ("collisions", f"{collisions}", 470),
+        ("communication", team.team.communication.model, 632),
+    )
+    for name, value, x in entries:
+        put_text(frame, name, (_LEFT + x, height - 24), INK, size=17)
+        at = _LEFT + x + text_width(name, size=17) + 9
+        put_text(frame, value, (at, height - 24), WALL, size=17, bold=True)
+    frame[height - 8 :] = UNSEEN
+    frame[height - 8 :, : round(width * min(max(coverage, 0.0), 1.0))] = COLOURS[0]

@@ -1,0 +1,235 @@
+"""A team of robots in one building: wiring alone, as :class:`mecanum_env.env.ExploreEnv` is of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env import rooms as room_registry
+from mecanum_env.arguments import make_config
+from mecanum_env.ground_truth import GroundTruth
+from mecanum_env.observation import Observation
+from mecanum_env.physics.fleet import Fleet
+from mecanum_env.rooms import FloorPlan
+from mecanum_env.team.communication import groups
+from mecanum_env.team.config import TeamConfig
+from mecanum_env.team.coverage import TeamCoverage
+from mecanum_env.team.member import Member
+from mecanum_env.team.starts import start_poses
+from slam.settings import from_mapping, require, unknown_name
+
+__all__ = ["Outcome", "Team"]
+
+Array = NDArray[np.float64]
+
+_OPTIONS = ("floor_plan", "start_poses", "room_seed")
+
+
+class Outcome(NamedTuple):
+    """What a step brought one robot."""
+
+    observation: Observation
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+
+class Team:
+    """Robots of one kind that explore one building.
+
+    Each has its own sensors, noise and belief; a team of one is :class:`mecanum_env.env.ExploreEnv`, bit for bit.
+
+    Parameters
+    ----------
+    robots : int, optional
+        How many; what ``team`` says if left out.
+    team : TeamConfig or mapping, optional
+        Starts, communication, sightings.
+    action : str
+        ``"twist"`` or ``"wheels"``.
+    floor_plan : FloorPlan or path, optional
+        Where to explore, instead of rooms that are drawn.
+    max_steps : int
+        After which the episode is truncated.
+    **settings
+        Of :func:`mecanum_env.arguments.make_config`; one robot is like the other.
+    """
+
+    def __init__(
+        self,
+        robots: int | None = None,
+        *,
+        team: TeamConfig | Mapping[str, Any] | None = None,
+        action: str = "twist",
+        floor_plan: str | Path | FloorPlan | None = None,
+        max_steps: int = 3000,
+        **settings: Any,
+    ) -> None:
+        require(max_steps >= 1, f"max_steps must be at least 1, got {max_steps}")
+        given = from_mapping(TeamConfig, team)
+        self.team = given if robots is None else replace(given, robots=robots)
+        self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
+        self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
+        self.max_steps = max_steps
+        self.members = tuple(
+            Member(k, self.team, action=action, config=self.config) for k in range(self.team.robots)
+        )
+        self._rng = np.random.default_rng()
+        self.active: list[int] = []
+        """Numbers of the robots that are still exploring; the others stand where they ended."""
+
+    # ---- an episode ----------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> list[tuple[Observation, dict[str, Any]]]:
+        """Start an episode; return each robot's observation and info.
+
+        ``options`` are ``floor_plan``, ``start_poses`` ``(robots, 3)`` in the plan's frame and ``room_seed``.
+        """
+        options = dict(options or {})
+        for key in options:
+            if key not in _OPTIONS:
+                raise unknown_name("reset option", key, _OPTIONS)
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        seed = int(self._rng.integers(2**31)) if seed is None else int(seed)
+        room_seed = options.get("room_seed")
+        plans = self._plans(options, seed, seed if room_seed is None else int(room_seed))
+        config, team = self.config, self.team
+        drawn = np.random.default_rng(np.random.SeedSequence([seed, 2])).standard_normal((team.robots, 3))
+        sigmas = np.array([team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad])
+        first = self.members[0]
+        for member, plan in zip(self.members, plans, strict=True):
+            k = member.number
+            shared = k > 0 and team.known_starts
+            member.place(
+                plan, seed if k == 0 else _seed_of(seed, k), floor=first.truth.world.floor if k > 0 else None,
+                ground=first.truth.ground if shared else None, start_error=sigmas * drawn[k],
+                step_limit=self.max_steps,
+            )  # fmt: skip
+        self.ground: GroundTruth = first.truth.ground
+        """The truth, in the frame of the first robot's start."""
+        self.fleet = Fleet([member.truth.world for member in self.members])
+        self.coverage = TeamCoverage(self.ground, [member.truth.ground for member in self.members])
+        self.active = list(range(team.robots))
+        self._steps, self._every = 0, max(1, round(team.communication.every_s / config.step_s))
+        self.groups = np.zeros(team.robots, np.int64)
+        for member in self.members:
+            member.join(self.fleet, self.ground)
+        infos = [member.first_look() for member in self.members]
+        self._communicate()
+        self._share(infos)
+        return [(member.observe(), info) for member, info in zip(self.members, infos, strict=True)]
+
+    def _plans(self, options: Mapping[str, Any], seed: int, room_seed: int) -> list[FloorPlan]:
+        """Return the plan with each robot's start."""
+        given = options.get("floor_plan", self._plan)
+        given = self.config.floor_plan if given is None else given
+        if isinstance(given, FloorPlan):
+            plan = given
+        elif given is not None:
+            plan = room_registry.load(given, seed=room_seed)
+        else:
+            plan = room_registry.make(self.config.rooms, seed=room_seed, config=self.config.rooms_config)
+        robots, robot = self.team.robots, self.config.robot
+        starts = options.get("start_poses")
+        if starts is None:
+            rng = np.random.default_rng(np.random.SeedSequence([seed, 3]))
+            starts = start_poses(plan, robot, robots, scattered=self.team.starts == "scattered", rng=rng)
+        starts = np.asarray(starts, dtype=np.float64)
+        if starts.shape != (robots, 3):
+            raise ValueError(f"start_poses must be {robots} poses x, y, θ; got shape {starts.shape}")
+        return [
+            plan if k == 0 and tuple(start) == tuple(plan.start)
+            else plan.with_start(start.tolist(), clearance_m=robot.inscribed_radius_m)
+            for k, start in enumerate(starts)
+        ]  # fmt: skip
+
+    def step(self, actions: Mapping[int, NDArray[np.float32]]) -> dict[int, Outcome]:
+        """Act for one control step; ``actions`` and what is returned are by the numbers of the active robots."""
+        if not self.active:
+            raise RuntimeError("call reset() before step()")
+        config, active = self.config, [self.members[k] for k in self.active]
+        targets: list[Array] = [np.zeros(4)] * len(self.members)  # who has ended stands still
+        for member in active:
+            targets[member.number] = member.wheel_targets(actions[member.number])
+        before = {member.number: member.truth.world.collisions for member in active}
+        self.fleet.step(targets, config.step_s, config.physics_step_s)
+        infos = [member.perceive(before[member.number]) for member in active]
+        self._steps += 1
+        self._communicate()
+        self._share(infos)
+        covered = self.coverage_share >= config.coverage_target
+        late = self._steps >= self.max_steps
+        outcomes = {}
+        for member, info in zip(active, infos, strict=True):
+            hit = config.terminate_on_collision and member.truth.world.collisions > 0
+            terminated = bool(covered or hit)
+            if terminated or late:
+                info["is_success"] = bool(covered)
+                info["episode_metrics"] = member.episode_metrics()
+            reward = float(sum(info["reward_terms"].values()))
+            outcomes[member.number] = Outcome(member.observe(), reward, terminated, late, info)
+        self.active = [k for k, outcome in outcomes.items() if not (outcome.terminated or outcome.truncated)]
+        return outcomes
+
+    # ---- parts of a step -----------------------------------------------------------------------------------
+
+    def _communicate(self) -> None:
+        """Have those that hear each other tell what they know."""
+        members = self.members
+        if len(members) == 1:
+            return
+        time_s = self._steps * self.config.step_s
+        for member in members:
+            member.knowledge.see(member.sightings, time_s)
+        places = np.array([member.truth.world.pose[:2] for member in members])
+        self.groups = groups(self.team.communication, places, self.ground.plan.segments)
+        due = self._steps % self._every == 0
+        for group in range(int(self.groups.max()) + 1):
+            hearing = [member.knowledge for member in members if self.groups[member.number] == group]
+            if len(hearing) == 1:
+                continue
+            if due:
+                for knowledge in hearing:
+                    knowledge.chart_now(time_s)
+            reports = {knowledge.robot: knowledge.report(time_s) for knowledge in hearing}
+            for knowledge in hearing:  # what they have heard of robots that are elsewhere
+                for robot, report in knowledge.heard.items():
+                    if robot not in reports or reports[robot].time_s < report.time_s:
+                        reports[robot] = report
+            for knowledge in hearing:
+                if knowledge.hear(reports):
+                    knowledge.merge()
+
+    def _share(self, infos: Sequence[dict[str, Any]]) -> None:
+        """Put what is the team's into the infos of the active robots."""
+        active = [self.members[k] for k in self.active]
+        if len(self.members) == 1:
+            self.coverage_share = infos[0]["coverage"]
+        else:
+            if self.coverage.each_step or self._steps % self._every == 0:
+                for member in active:
+                    self.coverage.update(member.number, member.own_coverage, member.backend.grid)
+            self.coverage_share = self.coverage.share
+        collisions = sum(member.truth.world.robot_collisions for member in self.members)
+        for info in infos:
+            info["team_coverage"] = self.coverage_share
+            info["robot_collisions"] = collisions
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time since the start [s]."""
+        return self._steps * self.config.step_s
+
+
+def _seed_of(seed: int, number: int) -> int:
+    """Return the seed of a robot's own noise."""
+    return int(np.random.SeedSequence([seed, 4, number]).generate_state(1)[0] & 0x7FFFFFFF)
