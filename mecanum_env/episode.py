@@ -53,6 +53,10 @@ class EpisodeRecord:
         self._last = x, y
         self._count += 1
 
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._count
+
     @property
     def _rows(self) -> Array:
         return np.array(self._numbers).reshape(-1, _COLUMNS)

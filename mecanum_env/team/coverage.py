@@ -41,6 +41,11 @@ class TeamCoverage:
         return self._covered / self._ground.mappable_cells
 
     @property
+    def layers(self) -> NDArray[np.bool_]:
+        """What each robot rightly has as free ``(robots, rows, cols)``, on the truth's raster; live."""
+        return self._layers
+
+    @property
     def each_step(self) -> bool:
         """Whether an update costs little: where frames differ, it goes over the whole map."""
         return self._shared

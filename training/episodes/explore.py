@@ -29,12 +29,14 @@ from training.runs.running import plain
 from training.runs.signals import interrupt_flag
 
 __all__ = [
+    "AGENT_DONE_AFTER_S",
     "ENDINGS",
     "EXTRAS",
     "FILES",
     "Episode",
     "Progress",
     "Witness",
+    "asked_for",
     "make_agent",
     "prepare",
     "run",
@@ -61,7 +63,9 @@ ENDINGS = {
 }
 """Why an episode ended: the word in ``metrics.json``, and what it means."""
 
-_DONE_AFTER_S = 2.0  # an agent without a goal for so long has nothing left to do
+AGENT_DONE_AFTER_S = 2.0
+"""An agent without a goal for so long has nothing left to do."""
+
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
 _RUN_KINDS = {"agent": (str,), "seed": (int,), "start": (list,), "max_steps": (int,)}
 
@@ -135,29 +139,14 @@ def prepare(
         In one line: which option, file or name is wrong, and what to do.
     """
     with bad_input():
-        past = _read_run_table(config) if config is not None else {}
-        if any(v is not None for v in (rooms, floor_plan, seed)):
-            # Other rooms: neither the start nor the step limit is meant for them.
-            past = {name: value for name, value in past.items() if name in _DEFAULTS}
-        given = {"agent": agent, "seed": seed, "start": start, "max_steps": max_steps}
-        run = _DEFAULTS | past | {name: value for name, value in given.items() if value is not None}
-        agents.check(run["agent"], KNOWN_MAP)
-        if run["agent"].endswith(".safetensors"):
-            run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
-        world = make_config(config=config, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan)
-        if rooms is not None and floor_plan is None:
-            world = replace(world, floor_plan=None)
-        elif world.floor_plan is not None:
-            world = replace(world, floor_plan=str(Path(world.floor_plan).absolute()))
-        if coverage_target is not None:
-            world = replace(world, coverage_target=coverage_target)
-        check_writable(out, [*FILES, *EXTRAS.values()])
-        plan = _make_plan(world, run["seed"])
-        # An agent maps all that it can reach; what counts as success is judged at the end.
-        limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
+        world, run, plan = asked_for(
+            out=out, files=[*FILES, *EXTRAS.values()], agent=agent, rooms=rooms, slam=slam, robot=robot,
+            noise=noise, seed=seed, floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,
+            coverage_target=coverage_target,
+        )  # fmt: skip
         wrapped = gymnasium.make(
             "mecanum_env:mecanum_env/Explore-v0", config=replace(world, coverage_target=1.0),
-            max_episode_steps=limit, disable_env_checker=True,
+            max_episode_steps=run["max_steps"], disable_env_checker=True,
         )  # fmt: skip
         placed = run.get("start")
         reset_options = {"floor_plan": plan} | ({"start_pose": tuple(placed)} if placed is not None else {})
@@ -166,8 +155,38 @@ def prepare(
         assert isinstance(env, ExploreEnv)
         explorer = make_agent(run["agent"], env)
         explorer.reset(env.belief, run["seed"])
-    run |= {"max_steps": limit}
     return Episode(env, wrapped, explorer, observation, world, run, out)
+
+
+def asked_for(
+    *, out: Path, files: Sequence[str], rooms: str | None, slam: str | None, robot: str | None, noise: str | None,
+    floor_plan: Path | None, config: Path | None, coverage_target: float | None, seed: int | None, **given: Any,
+) -> tuple[EnvConfig, dict[str, Any], FloorPlan]:  # fmt: skip
+    """Return the world that the options of :func:`prepare` ask for, ``config.toml``'s [run], and the plan.
+
+    An agent maps all that it can reach; what counts as success, the world's ``coverage_target``, is judged at
+    the end.
+    """
+    past = _read_run_table(config) if config is not None else {}
+    if any(v is not None for v in (rooms, floor_plan, seed)):
+        # Other rooms: neither the start nor the step limit is meant for them.
+        past = {name: value for name, value in past.items() if name in _DEFAULTS}
+    given |= {"seed": seed}
+    run = _DEFAULTS | past | {name: value for name, value in given.items() if value is not None}
+    agents.check(run["agent"], KNOWN_MAP)
+    if run["agent"].endswith(".safetensors"):
+        run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
+    world = make_config(config=config, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan)
+    if rooms is not None and floor_plan is None:
+        world = replace(world, floor_plan=None)
+    elif world.floor_plan is not None:
+        world = replace(world, floor_plan=str(Path(world.floor_plan).absolute()))
+    if coverage_target is not None:
+        world = replace(world, coverage_target=coverage_target)
+    check_writable(out, files)
+    plan = _make_plan(world, run["seed"])
+    limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
+    return world, run | {"max_steps": limit}, plan
 
 
 def make_agent(name: str, env: ExploreEnv) -> Agent:
@@ -199,7 +218,7 @@ def _read_run_table(path: Path) -> dict[str, Any]:
 def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ()) -> None:
     """Let the agent explore until it is done, the steps are used up, or Ctrl-C is pressed between two steps."""
     env, agent, step = episode.env, episode.agent, episode.wrapped.step
-    patience = math.ceil(_DONE_AFTER_S / episode.config.step_s)
+    patience = math.ceil(AGENT_DONE_AFTER_S / episode.config.step_s)
     observation, goal, idle, max_steps = episode.observation, agent.goal, 0, episode.run["max_steps"]
     for witness in witnesses:
         witness.take(env, goal)

@@ -89,6 +89,11 @@ class Recorder:
         self._map = _MapFollower()
         self._goal: Goal | None = None
 
+    @property
+    def rows(self) -> int:
+        """How often something was noted."""
+        return self._steps
+
     def take(self, env: ExploreEnv, goal: Goal | None) -> None:
         """Note the environment as it is now, and where the agent means to go."""
         step, self._steps = self._steps, self._steps + 1

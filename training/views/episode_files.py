@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import cv2
 import tomli_w
 
-from agents.base import Goal
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
-from training.episodes.explore import ENDINGS, EXTRAS, Episode
+from training.episodes.explore import ENDINGS, EXTRAS, FILES, Episode
 from training.episodes.recording import Recorder, Recording
+from training.episodes.team import FILES as TEAM_FILES
+from training.episodes.team import ROBOT_FILE, TeamEpisode
 from training.runs.running import versions, written_together
 from training.views.film import check_video
 from training.views.mcap_file import check_mcap, write_mcap
 from training.views.report_page import episode_page
 from training.views.rerun_file import check_rerun, write_rerun
 
-__all__ = ["Saver", "check_extras", "config_text", "write_episode"]
+__all__ = [
+    "PeriodicSaver", "Saver", "check_extras", "config_text", "leftovers", "place_of", "write_episode",
+    "write_landmarks",
+]  # fmt: skip
 
 
 def check_extras(extras: Collection[str]) -> None:
@@ -43,31 +47,38 @@ def write_episode(
     Of the extras those are written that need no more than the recording; the film, made while it ran, is moved to
     its place. Extras not asked for are taken away: they would be another episode's.
     """
-    with written_together(
-        episode.out, without=[file for extra, file in EXTRAS.items() if extra not in extras]
-    ) as folder:
+    asked = {file for extra, file in EXTRAS.items() if extra in extras}
+    with written_together(episode.out, without=leftovers(episode.out, {*FILES, *asked})) as folder:
         metrics = _write_into(folder, episode, recording, extras)
         if film is not None:
             film.replace(folder / EXTRAS["video"])
     return metrics
 
 
-class Saver:
+def leftovers(out: Path, kept: Collection[str]) -> list[str]:
+    """Return the files in a folder that episodes write, of one robot or of a team, but for those ``kept``."""
+    known = {*FILES, *EXTRAS.values(), *TEAM_FILES}
+    return [p.name for p in out.glob("*") if p.name not in kept and (p.name in known or ROBOT_FILE.fullmatch(p.name))]
+
+
+class PeriodicSaver:
     """A witness that writes what there is of an episode now and then: what kills the run takes little.
 
     Parameters
     ----------
-    episode, recorder
-        What is written: what the recorder has seen, so it comes first among the witnesses.
+    episode : Episode or TeamEpisode
+        What is written.
+    write : callable
+        Writes it.
     every_s
         Time between two writings [s]; more where one takes long, for it to take no more than a twentieth.
     """
 
-    def __init__(self, episode: Episode, recorder: Recorder, *, every_s: float = 60.0) -> None:
-        self._episode, self._recorder, self._every_s = episode, recorder, every_s
+    def __init__(self, episode: Episode | TeamEpisode, write: Callable[[], Any], every_s: float) -> None:
+        self._episode, self._write, self._every_s = episode, write, every_s
         self._due = time.monotonic() + every_s
 
-    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
+    def take(self, env: Any, goal: Any) -> None:
         """Write it if it is time."""
         began = time.monotonic()
         if began < self._due:
@@ -75,11 +86,18 @@ class Saver:
         episode, end = self._episode, self._episode.end
         episode.end = "running"
         try:
-            write_episode(episode, self._recorder.recording())
+            self._write()
         finally:
             episode.end = end
         took = time.monotonic() - began
         self._due = time.monotonic() + max(self._every_s, 20.0 * took)
+
+
+class Saver(PeriodicSaver):
+    """Of one robot; ``recorder`` has to have seen a step before this witness does, so it comes first."""
+
+    def __init__(self, episode: Episode, recorder: Recorder, *, every_s: float = 60.0) -> None:
+        super().__init__(episode, lambda: write_episode(episode, recorder.recording()), every_s)
 
 
 def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:
@@ -89,15 +107,9 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     write_map_server(folder / "map", belief.grid)
     write_tum(folder / "trajectory_true.tum", times, true_poses)
     write_tum(folder / "trajectory_estimate.tum", times, estimates)
-    seen, angles = env.backend.landmark_details()
-    write_landmark_map(
-        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
-        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
-        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
-        backend=episode.config.slam,
-    )  # fmt: skip
+    write_landmarks(folder / "landmarks.db", env)
     view = episode_view(env.truth.ground, belief)
-    robot, where = episode.config.robot, _place(episode)
+    robot, where = episode.config.robot, place_of(episode)
     who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
     pictures = {
         "map.png": draw_map(
@@ -126,13 +138,28 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     return metrics
 
 
-def config_text(episode: Episode) -> str:
+def write_landmarks(path: Path, env: ExploreEnv) -> None:
+    """Write the landmarks that a robot believes in."""
+    belief = env.backend.belief
+    seen, angles = env.backend.landmark_details()
+    write_landmark_map(
+        path, belief.landmarks, cov=belief.landmark_cov,
+        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
+        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
+        backend=env.config.slam,
+    )  # fmt: skip
+
+
+def config_text(episode: Episode | TeamEpisode) -> str:
     """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
     run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
+    if isinstance(episode, TeamEpisode):
+        run["team"] = to_mapping(episode.team.team)
     run["versions"] = versions()
     return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
 
 
-def _place(episode: Episode) -> str:
+def place_of(episode: Episode | TeamEpisode) -> str:
+    """Return where an episode was, in words."""
     plan = episode.config.floor_plan
     return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"

@@ -10,11 +10,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mecanum_env.team.picture import render_team
 from mecanum_env.views.render import render_frame
 from slam.formats import replacing
 from slam.geometry import compose, exp, inverse, log
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
     from agents.base import Goal
     from mecanum_env.config import EnvConfig
     from mecanum_env.env import ExploreEnv
+    from mecanum_env.team.team import Team
 
-__all__ = ["Camera", "Film", "check_video", "film", "film_episode", "filmed"]
+__all__ = ["Camera", "Film", "TeamCamera", "check_video", "film", "film_episode", "filmed", "filmed_team"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -79,6 +81,24 @@ class Camera:
         return count % self._speed == 0
 
 
+class TeamCamera:
+    """Makes the frames of a team's episode: a witness of :func:`training.episodes.team.run`."""
+
+    def __init__(self, write: Write) -> None:
+        self._write = write
+
+    def take(self, team: Team, goals: Sequence[Goal | None]) -> None:
+        """Film the team as it is after ``reset`` or a step."""
+        self._write(render_team(team))
+
+
+class _Takes(Protocol):
+    """A camera, of one robot or of a team."""
+
+    def take(self, filmed: Any, goal: Any, /) -> None:
+        """Film it as it is now."""
+
+
 @contextmanager
 def film_episode(
     path: str | Path, config: EnvConfig, *, speed: int = 1, substeps: bool = False
@@ -105,15 +125,15 @@ def film_episode(
 class Film:
     """A camera whose film may fail: then it films no more, and what it was told of the episode goes on."""
 
-    def __init__(self, path: Path, camera: Camera, stack: ExitStack) -> None:
+    def __init__(self, path: Path, camera: _Takes, stack: ExitStack) -> None:
         self._path, self._camera, self._open = path, camera, stack
         self.failure: OSError | None = None
 
-    def take(self, env: ExploreEnv, goal: Goal | None) -> None:
-        """Film the environment as it is after ``reset`` or a step."""
+    def take(self, filmed: Any, goal: Any) -> None:
+        """Film the environment, or the team, as it is after ``reset`` or a step."""
         if self.failure is None:
             try:
-                self._camera.take(env, goal)
+                self._camera.take(filmed, goal)
             except OSError as error:
                 self.failure = error
 
@@ -129,10 +149,22 @@ class Film:
 @contextmanager
 def filmed(out: Path, config: EnvConfig, substeps: bool) -> Iterator[Film]:
     """Give a :class:`Film` that is made in a folder within ``out``, which goes when the block ends."""
+    with _filming(out) as (path, stack):
+        yield Film(path, stack.enter_context(film_episode(path, config, substeps=substeps)), stack)
+
+
+@contextmanager
+def filmed_team(out: Path, config: EnvConfig) -> Iterator[Film]:
+    """Give the :class:`Film` of a team, a frame a step; as :func:`filmed`."""
+    with _filming(out) as (path, stack):
+        yield Film(path, TeamCamera(stack.enter_context(film(path, fps=1.0 / config.step_s))), stack)
+
+
+@contextmanager
+def _filming(out: Path) -> Iterator[tuple[Path, ExitStack]]:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder, ExitStack() as stack:
-        path = Path(folder) / "episode.mp4"
-        yield Film(path, stack.enter_context(film_episode(path, config, substeps=substeps)), stack)
+        yield Path(folder) / "episode.mp4", stack
 
 
 @contextmanager

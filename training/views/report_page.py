@@ -11,7 +11,7 @@ import base64
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,13 +30,18 @@ from training.episodes.recording import Recorded, Recording
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
+    from mecanum_env.config import EnvConfig
     from mecanum_env.env import ExploreEnv
+    from mecanum_env.ground_truth import GroundTruth
 
-__all__ = ["LOST", "NO_RETURN", "episode_page", "pack"]
+__all__ = [
+    "LOST", "NO_RETURN", "TRUTH_PX", "about_plan", "assets", "episode_page", "filled", "first_asked",
+    "metrics_table", "number", "pack", "tiles",
+]  # fmt: skip
 
 _ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = ("recording.js", "plan_views.js", "curves.js", "player.js")  # the last puts the others to work
-_TRUTH_PX = 1400  # of the true plan's longer side
+_SCRIPTS = ("recording.js", "plan_canvas.js", "curves.js", "episode.js", "player.js")  # the last puts the others to work
+TRUTH_PX = 1400  # of the true plan's longer side
 _MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
 _RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
 NO_RETURN, LOST = 253, 254  # … or is one of these
@@ -66,39 +71,49 @@ def episode_page(
         The effective configuration as TOML.
     """
     header, arrays = pack(recording)
-    view = episode_view(env.truth.ground, env.belief, longest_px=_TRUTH_PX)
-    robot, lidar = env.config.robot, env.config.lidar
-    header |= {
+    view = episode_view(env.truth.ground, env.belief, longest_px=TRUTH_PX)
+    header |= about_plan(env.config, env.truth.ground, view)
+    return filled("episode.html", header, arrays, {
+        "TITLE": escape(title),
+        "ENDING": escape(ending),
+        "TILES": tiles(first_asked(metrics)),
+        "METRICS": metrics_table(metrics),
+        "COMMAND": escape(command),
+        "CONFIG": escape(config),
+        "SCRIPT": assets(_SCRIPTS),
+    })  # fmt: skip
+
+
+def about_plan(config: EnvConfig, ground: GroundTruth, view: View) -> dict[str, Any]:
+    """Return what a header says of the robot and of the true plan, drawn in a view."""
+    robot = config.robot
+    return {
         "robot": {
             "length": robot.length_m, "width": robot.width_m, "wheel": robot.wheel_radius_m,
             "wheels": wheel_positions(robot).tolist(),
         },
-        "lidar": {"offset": lidar.offset_m},
-        "truth": {"left": view.left, "top": view.top, "scale": view.scale, "png": _truth_png(env, view)},
-        "target": env.config.coverage_target,
+        "lidar": {"offset": config.lidar.offset_m},
+        "truth": {"left": view.left, "top": view.top, "scale": view.scale, "png": _truth_png(ground, view)},
+        "target": config.coverage_target,
     }  # fmt: skip
-    parts = {
-        "TITLE": escape(title),
-        "ENDING": escape(ending),
-        "STYLE": STYLE + _asset("episode.css"),
-        "TILES": _tiles(metrics),
-        "METRICS": _metrics_table(metrics),
-        "COMMAND": escape(command),
-        "CONFIG": escape(config),
+
+
+def filled(template: str, header: Mapping[str, Any], arrays: Arrays, parts: Mapping[str, str]) -> str:
+    """Return a page of ``assets/`` with its parts in their places, the style and the data among them."""
+    parts = dict(parts) | {
+        "STYLE": STYLE + assets(["episode.css"]),
         "HEADER": json.dumps(header).replace("</", "<\\/"),
         "DATA": _deflated(header["arrays"], arrays),
-        "SCRIPT": "".join(map(_asset, _SCRIPTS)),
     }
-    page = _asset("episode.html")
-    before, *pieces = page.split("{{")
+    before, *pieces = assets([template]).split("{{")
     return before + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces))
 
 
 # ---- the data --------------------------------------------------------------------------------------------------
 
 
-def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
-    """Return what the page replays: a header that JSON can hold, and arrays of numbers.
+def pack(recording: Recording, *, robots: int = 1) -> tuple[dict[str, Any], Arrays]:
+    """Return what the page replays: a header that JSON can hold, and arrays of numbers; fewer where for many robots.
 
     ``header["arrays"]`` lists name, type and length of the arrays in their order. What was noted now and then has
     its steps in ``*_step`` and how many values belong to each in ``*_count``.
@@ -111,8 +126,8 @@ def pack(recording: Recording) -> tuple[dict[str, Any], Arrays]:
     - ``map_gap``: how far each changed cell lies behind the one before it, row by row over the rectangle
       ``map``; ``map_class`` what it is now.
     """
-    landmarks = _thinned(recording.landmarks, _MOST_LANDMARKS)
-    scans = _thinned(recording.scans, _MOST_SCANS)
+    landmarks = _thinned(recording.landmarks, _MOST_LANDMARKS // robots)
+    scans = _thinned(recording.scans, _MOST_SCANS // robots)
     row0, col0, row1, col1 = recording.bounds()
     gaps, classes, counts = _map_changes(recording.map_changes, (row0, col0), col1 - col0)
     covs = recording.pose_covs
@@ -217,41 +232,49 @@ def _map_changes(
 # ---- the page --------------------------------------------------------------------------------------------------
 
 
-def _truth_png(env: ExploreEnv, view: View) -> str:
+def _truth_png(ground: GroundTruth, view: View) -> str:
     image = np.empty((view.height, view.width, 3), np.uint8)
-    ground = env.truth.ground
     paint_plan(Canvas(image, view), ground.plan, inverse(ground.start))
     return base64.b64encode(cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 6])[1].tobytes()).decode()
 
 
-def _asset(name: str) -> str:
-    return (_ASSETS / name).read_text("utf-8")
+def assets(names: Sequence[str]) -> str:
+    """Return files of ``assets/``, one after the other."""
+    return "".join((_ASSETS / name).read_text("utf-8") for name in names)
 
 
-def _tiles(metrics: Mapping[str, Any]) -> str:
-    """Return what one asks first."""
-    anees = metrics["anees"]
-    tiles = [
-        ("coverage", _number(metrics["coverage"], 100.0, 1), "%"),
-        ("time", _number(metrics["time_s"], 1.0, 1), "s"),
-        ("to 95 %", _number(metrics["time_to_95_s"], 1.0, 1), "s"),
-        ("path", _number(metrics["path_length_m"], 1.0, 1), "m"),
+Tile = tuple[str, str, str]  # what it is, its figure, its unit
+
+
+def first_asked(metrics: Mapping[str, Any]) -> list[Tile]:
+    """Return the tiles of what one asks first."""
+    return [
+        ("coverage", number(metrics["coverage"], 100.0, 1), "%"),
+        ("time", number(metrics["time_s"], 1.0, 1), "s"),
+        ("to 95 %", number(metrics["time_to_95_s"], 1.0, 1), "s"),
+        ("path", number(metrics["path_length_m"], 1.0, 1), "m"),
         ("collisions", str(metrics["collisions"]), ""),
-        ("ATE", _number(metrics["ate_rmse_m"], 100.0, 1), "cm"),
-        ("NEES / 3", _number(anees, 1.0, 2), ""),
-        ("walls, IoU", _number(metrics["map_iou"], 1.0, 3), ""),
+        ("ATE", number(metrics["ate_rmse_m"], 100.0, 1), "cm"),
+        ("NEES / 3", number(metrics["anees"], 1.0, 2), ""),
+        ("walls, IoU", number(metrics["map_iou"], 1.0, 3), ""),
     ]
+
+
+def tiles(shown: Sequence[Tile]) -> str:
+    """Return tiles as HTML."""
     return "".join(
         f"<div><dt>{name}</dt><dd>{value}<small>{'' if value == '–' else unit}</small></dd></div>"
-        for name, value, unit in tiles
+        for name, value, unit in shown
     )
 
 
-def _number(value: float | None, factor: float, digits: int) -> str:
+def number(value: float | None, factor: float, digits: int) -> str:
+    """Return a figure in the unit shown; a dash where there is none."""
     return "–" if value is None else f"{factor * value:.{digits}f}"
 
 
-def _metrics_table(metrics: Mapping[str, Any]) -> str:
+def metrics_table(metrics: Mapping[str, Any]) -> str:
+    """Return every metric that is a number or a word, as rows of a table."""
     rows = []
     for name, value in metrics.items():
         if name in _WALL_CLOCK:

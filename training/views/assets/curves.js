@@ -1,35 +1,7 @@
 "use strict";
-// Coverage, errors and consistency over time; `pick` is told the row that was pointed at.
-function openCurves(header, { data, poseEllipse }, pick) {
+// What is measured, over time; `pick` is told the row that was pointed at. A curve has `values`, or several `lines`.
+function openCurves(header, curves, pick) {
   const n = header.rows, step = header.step_s;
-  const series = (f) => Float32Array.from({ length: n }, (_, k) => f(k));
-  const turned = (a) => Math.atan2(Math.sin(a), Math.cos(a));
-  const curves = [
-    {
-      name: "coverage", unit: "%", digits: 1, colour: "--link", least: 100, goal: 100 * header.target,
-      values: series((k) => 100 * data.coverage[k]),
-    },
-    {
-      name: "position error and 3σ", unit: "cm", digits: 1, colour: "--believed",
-      values: series((k) => 100 * Math.hypot(data.true[3 * k] - data.estimate[3 * k], data.true[3 * k + 1] - data.estimate[3 * k + 1])),
-      band: series((k) => 300 * poseEllipse(k)[0]),
-    },
-    {
-      name: "heading error and 3σ", unit: "mrad", digits: 2, colour: "--believed", signed: true,
-      values: series((k) => 1e3 * turned(data.estimate[3 * k + 2] - data.true[3 * k + 2])),
-      band: series((k) => 3e3 * Math.sqrt(data.cov[4 * k + 3])),
-    },
-    {
-      // The start is known by definition.
-      name: "NEES / 3, ideally 1 on average", unit: "", digits: 2, colour: "--landmark", goal: 1,
-      values: series((k) => (k ? data.nees[k] / 3 : NaN)),
-    },
-    {
-      name: "health of the belief", unit: "", digits: 2, colour: "--link", least: 1, goal: 1,
-      values: series((k) => data.health[k]),
-    },
-  ];
-
   for (const curve of curves) {
     const figure = document.createElement("figure");
     figure.innerHTML = `<figcaption><span>${curve.name}${curve.unit ? ` [${curve.unit}]` : ""}</span><output></output></figcaption><canvas></canvas>`;
@@ -39,7 +11,8 @@ function openCurves(header, { data, poseEllipse }, pick) {
     curve.canvas.setAttribute("aria-label", `${curve.name} over time`);
     curve.output = figure.querySelector("output");
     let top = curve.least || 0;
-    for (const values of [curve.values, curve.band || []]) {
+    curve.lines ??= [curve];
+    for (const values of [...curve.lines.map((line) => line.values), curve.band || []]) {
       // A rare spike would flatten all else: the top is what all but the highest half per cent stay below.
       const sorted = Float32Array.from(values).map(Math.abs).filter(Number.isFinite).sort();
       if (sorted.length) top = Math.max(top, sorted[Math.min(sorted.length - 1, Math.floor(0.995 * sorted.length))] * 1.05);
@@ -61,7 +34,7 @@ function openCurves(header, { data, poseEllipse }, pick) {
 
   function drawCurve(curve, k) {
     const { c, w, h, ratio } = fitted(curve.canvas, 132);
-    const style = getComputedStyle(document.documentElement), tone = (name) => style.getPropertyValue(name).trim();
+    const style = getComputedStyle(document.documentElement), tone = (name) => (name.startsWith("#") ? name : style.getPropertyValue(name).trim());
     c.clearRect(0, 0, w, h);
     c.scale(ratio, ratio);
     const width = w / ratio, height = h / ratio, left = 38, right = width - 8, top = 6, bottom = height - 18;
@@ -112,16 +85,18 @@ function openCurves(header, { data, poseEllipse }, pick) {
       c.stroke();
       c.setLineDash([]);
     }
-    c.beginPath();
-    for (const [row, value] of peaks(curve.values)) c.lineTo(x(row), y(value));
-    Object.assign(c, { strokeStyle: tone(curve.colour), lineWidth: 1.6, lineJoin: "round" });
-    c.stroke();
+    for (const line of curve.lines) {
+      c.beginPath();
+      for (const [row, value] of peaks(line.values)) c.lineTo(x(row), y(value));
+      Object.assign(c, { strokeStyle: tone(line.colour), lineWidth: line.width ?? 1.6, lineJoin: "round" });
+      c.stroke();
+    }
     Object.assign(c, { strokeStyle: tone("--goal"), lineWidth: 1.5 });
     c.beginPath();
     c.moveTo(x(k), top);
     c.lineTo(x(k), bottom);
     c.stroke();
-    const value = curve.values[k];
+    const value = curve.lines.at(-1).values[k]; // drawn last, over the others
     const band = curve.band ? ` of ${curve.signed ? "±" : ""}${curve.band[k].toFixed(curve.digits)}` : "";
     curve.output.textContent = Number.isFinite(value) ? `${value.toFixed(curve.digits)}${band}` : "–";
   }
@@ -131,4 +106,13 @@ function openCurves(header, { data, poseEllipse }, pick) {
       for (const curve of curves) drawCurve(curve, k);
     },
   };
+}
+
+function positionError(data, k) {
+  return Math.hypot(data.true[3 * k] - data.estimate[3 * k], data.true[3 * k + 1] - data.estimate[3 * k + 1]);
+}
+
+function headingError(data, k) {
+  const off = data.estimate[3 * k + 2] - data.true[3 * k + 2];
+  return Math.atan2(Math.sin(off), Math.cos(off));
 }

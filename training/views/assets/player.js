@@ -16,7 +16,7 @@
   let k = 0, playing = false, exact = 0, last = 0, due = false;
   const parts = [
     await openViews(header, recording, redraw),
-    openCurves(header, recording, (row) => { pause(); seek(row); }),
+    openCurves(header, curvesOf(header, recording), (row) => { pause(); seek(row); }),
   ];
 
   // Collisions, red below the slider.

@@ -1,25 +1,26 @@
 "use strict";
-// What is replayed. Everything is in the start frame, in metres, y upwards; `k` is a row.
-async function openRecording(header, text) {
-  const data = await unpack(text);
+// The arrays of a page, by name.
+async function unpack(listed, text) {
+  const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
+  const buffer = await new Response(stream).arrayBuffer();
+  const kinds = {
+    float32: Float32Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
+  };
+  const arrays = {};
+  let at = 0;
+  for (const [name, kind, size] of listed) {
+    arrays[name] = new kinds[kind](buffer, at, size);
+    at += Math.ceil(arrays[name].byteLength / 4) * 4;
+  }
+  return arrays;
+}
+
+// What is replayed of a robot. Everything is in its start frame, in metres, y upwards; `k` is a row. `shades` are
+// the colours of the map's unknown, free and occupied cells: alpha, blue, green, red.
+function recordingOf(header, data, shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 }) {
   const goalAt = offsets(data.goal_count), landmarkAt = offsets(data.landmark_count);
   const landmarks = data.landmark.length / 5;
-
-  async function unpack(text) {
-    const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
-    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-    const buffer = await new Response(stream).arrayBuffer();
-    const kinds = {
-      float32: Float32Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
-    };
-    const arrays = {};
-    let at = 0;
-    for (const [name, kind, size] of header.arrays) {
-      arrays[name] = new kinds[kind](buffer, at, size);
-      at += Math.ceil(arrays[name].byteLength / 4) * 4;
-    }
-    return arrays;
-  }
 
   // The last note at or before row k; -1 where there is none yet.
   function noted(steps, k) {
@@ -77,7 +78,6 @@ async function openRecording(header, text) {
     const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d");
     const image = context.createImageData(cols, rows), pixels = new Uint32Array(image.data.buffer);
     const classes = new Uint8Array(rows * cols); // 0 unknown, 1 free, 101 occupied
-    const shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 };
     let done = 0, cell = 0, edge = null;
     function clear() {
       done = cell = 0;

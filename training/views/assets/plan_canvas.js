@@ -14,9 +14,10 @@ function fitted(canvas, height) {
   return { c, w, h, ratio };
 }
 
-// World and belief, side by side; `redraw` is called where what they show of the plan has changed.
-async function openViews(header, { data, scanAt, wayAt, landmarksAt, poseEllipse, map }, redraw) {
-  const layers = { scan: true, landmarks: true, frontiers: true, goal: true, paths: true, follow: false };
+// World and belief, side by side, and what is drawn on them; `redraw` is called where what they show has changed.
+async function openCanvases(header, redraw) {
+  const layers = {};
+  for (const input of document.querySelectorAll("[data-layer]")) layers[input.dataset.layer] = input.checked;
   const truth = new Image();
   truth.src = "data:image/png;base64," + header.truth.png;
   await truth.decode();
@@ -83,7 +84,12 @@ async function openViews(header, { data, scanAt, wayAt, landmarksAt, poseEllipse
     c.restore();
   }
 
-  function scan(c, k, px) {
+  function plan(c) {
+    image(c, truth, box.x, box.y, box.w, box.h, true);
+  }
+
+  // What the lidar of a recording saw, from where it truly was.
+  function scan(c, { data, scanAt }, k, px, colour) {
     const { row, ranges } = scanAt(k);
     const [x, y, theta] = [data.true[3 * row], data.true[3 * row + 1], data.true[3 * row + 2]];
     const sx = x + header.lidar.offset * Math.cos(theta), sy = y + header.lidar.offset * Math.sin(theta);
@@ -99,7 +105,7 @@ async function openViews(header, { data, scanAt, wayAt, landmarksAt, poseEllipse
     c.closePath();
     c.fillStyle = `rgba(${colours.beam},.28)`;
     c.fill();
-    c.fillStyle = colours.truth;
+    c.fillStyle = colour;
     for (const [hx, hy] of hits) c.fillRect(hx - 1.2 * px, hy - 1.2 * px, 2.4 * px, 2.4 * px);
   }
 
@@ -110,50 +116,19 @@ async function openViews(header, { data, scanAt, wayAt, landmarksAt, poseEllipse
     c.stroke();
   }
 
-  function drawWorld(k) {
-    const { c, px } = begin(canvases[0], data.true, k);
-    image(c, truth, box.x, box.y, box.w, box.h, true);
-    if (layers.scan) scan(c, k, px);
-    if (layers.paths) path(c, data.true, k, colours.truth, px);
-    robot(c, data.true, k, colours.goal);
-  }
-
-  function drawBelief(k) {
-    const { c, px } = begin(canvases[1], data.estimate, k);
+  function map(c, { map }, header, k, canvas) {
     const m = header.map, left = m.col0 * m.resolution, top = (m.row0 + m.rows) * m.resolution;
     map.show(k);
-    image(c, map.canvas, left, top, m.cols * m.resolution, m.rows * m.resolution, canvases[1].scale * m.resolution < 2);
-    if (layers.frontiers) {
-      c.save();
-      c.translate(left, top);
-      c.scale(m.resolution, -m.resolution);
-      c.fillStyle = colours.frontier;
-      c.fill(map.frontiers());
-      c.restore();
-    }
-    if (layers.landmarks) drawLandmarks(c, k, px);
-    if (layers.paths) path(c, data.estimate, k, colours.believed, px);
-    if (layers.goal) drawGoal(c, k, px);
-    robot(c, data.estimate, k, colours.believed);
-    const [a, b, angle] = poseEllipse(k);
-    Object.assign(c, { strokeStyle: colours.landmark, lineWidth: 2 * px });
-    ellipse(c, data.estimate[3 * k], data.estimate[3 * k + 1], 3 * a, 3 * b, angle, 1.5 * px);
+    image(c, map.canvas, left, top, m.cols * m.resolution, m.rows * m.resolution, canvas.scale * m.resolution < 2);
+    return { left, top };
   }
 
-  function drawLandmarks(c, k, px) {
-    Object.assign(c, { strokeStyle: colours.landmark, fillStyle: colours.landmark, lineWidth: 1.2 * px });
-    for (const [x, y, a, b, angle] of landmarksAt(k)) {
-      c.fillRect(x - 1.5 * px, y - 1.5 * px, 3 * px, 3 * px);
-      ellipse(c, x, y, 3 * a, 3 * b, angle, 2 * px);
-    }
-  }
-
-  function drawGoal(c, k, px) {
-    const way = wayAt(k), last = way.length - 2;
+  function goal(c, way, px, colour) {
+    const last = way.length - 2;
     if (last < 0) return;
     c.beginPath();
     for (let j = 0; j <= last; j += 2) c.lineTo(way[j], way[j + 1]);
-    Object.assign(c, { strokeStyle: colours.goal, fillStyle: colours.goal, lineWidth: 2 * px });
+    Object.assign(c, { strokeStyle: colour, fillStyle: colour, lineWidth: 2 * px });
     c.stroke();
     c.beginPath();
     c.arc(way[last], way[last + 1], 4.5 * px, 0, 2 * Math.PI);
@@ -225,10 +200,5 @@ async function openViews(header, { data, scanAt, wayAt, landmarksAt, poseEllipse
     });
   }
 
-  return {
-    draw(k) {
-      drawWorld(k);
-      drawBelief(k);
-    },
-  };
+  return { layers, canvases, begin, plan, path, robot, scan, ellipse, map, goal };
 }

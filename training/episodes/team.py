@@ -1,0 +1,196 @@
+"""``mecanum explore --robots N``: one episode of a team, as ``explore`` has it of one robot."""
+
+from __future__ import annotations
+
+import math
+import re
+import statistics
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from agents.base import Agent, Goal
+from mecanum_env.config import EnvConfig
+from mecanum_env.team.config import TeamConfig
+from mecanum_env.team.team import Team
+from slam.settings import from_mapping
+from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Progress, asked_for, make_agent
+from training.episodes.team_log import TeamLog, team_metrics
+from training.runs.config_files import read_config
+from training.runs.errors import bad_input
+from training.runs.running import plain
+from training.runs.signals import interrupt_flag
+
+__all__ = [
+    "FILES", "ROBOT_FILE", "TeamEpisode", "TeamWitness", "files_of", "prepare", "read_team", "run", "tell_goal",
+]  # fmt: skip
+
+FILES = ("map.pgm", "map.yaml", "team.png", "config.toml", "report.html", "metrics.json")
+"""What an episode of a team writes, beside :func:`files_of` each robot, ``metrics.json`` last."""
+
+# An episode with several agents ends as the one does that did worst.
+_WORST_FIRST = ("stuck", "unreachable", "covered", "returned")
+
+
+ROBOT_FILE = re.compile(r"(trajectory_(true|estimate)|landmarks|map)_robot_\d+\.(tum|db|pgm|yaml)")
+"""What the names of :func:`files_of` look like."""
+
+
+def files_of(robot: int) -> tuple[str, ...]:
+    """Return what an episode writes of one robot."""
+    kinds = ("trajectory_true", "tum"), ("trajectory_estimate", "tum"), ("landmarks", "db"), ("map", "pgm")
+    return tuple(f"{kind}_robot_{robot}.{ending}" for kind, ending in (*kinds, ("map", "yaml")))
+
+
+class TeamWitness(Protocol):
+    """Sees a team's start and every step of it."""
+
+    def take(self, team: Team, goals: Sequence[Goal | None]) -> None:
+        """Take down the team as it is now, and where each of its robots means to go."""
+
+
+@dataclass(eq=False)
+class TeamEpisode:
+    """An episode of a team: prepared, then run, then written."""
+
+    team: Team
+    agents: tuple[Agent, ...]
+    observations: list[Mapping[str, Any]]
+    config: EnvConfig  # with the coverage that counts as success
+    run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
+    out: Path
+    log: TeamLog = field(default_factory=TeamLog)
+    end: str = "time"  # a word of ENDINGS
+    interrupted: bool = False
+    wall_time_s: float = 0.0
+    decisions_ms: list[float] = field(default_factory=list)
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the contents of ``metrics.json``."""
+        setting = self.team.team
+        metrics = {
+            "robots": setting.robots,
+            "communication": setting.communication.model,
+            "starts": setting.starts,
+            "known_starts": setting.known_starts,
+            **team_metrics(self.team, self.log),
+            "decision_ms_median": statistics.median(self.decisions_ms) if self.decisions_ms else None,
+            "agent": self.run["agent"],
+            "slam": self.config.slam,
+            "rooms": self.config.rooms if self.config.floor_plan is None else None,
+            "floor_plan": self.config.floor_plan,
+            "seed": self.run["seed"],
+            "end": self.end,
+            "interrupted": self.interrupted,
+            "wall_time_s": round(self.wall_time_s, 3),
+        }
+        metrics["success"] = bool(metrics["coverage"] >= self.config.coverage_target)
+        robots = [{key: plain(value) for key, value in robot.items()} for robot in metrics.pop("per_robot")]
+        return {key: plain(value) for key, value in metrics.items()} | {"per_robot": robots}
+
+
+def read_team(config: Path | None, given: Mapping[str, Any]) -> TeamConfig:
+    """Return the team that a config file's [run] table names, with what is ``given`` before it.
+
+    ``given`` has settings of :class:`TeamConfig`, those of its ``communication`` as a mapping, and None for what
+    the file or the default decides.
+
+    Raises
+    ------
+    BadInput
+        In one line: what is wrong, and what is allowed.
+    """
+    with bad_input():
+        past = read_config(config, {"team": (dict,)})[1].get("team", {}) if config is not None else {}
+        settings = dict(past)
+        for name, value in given.items():
+            if isinstance(value, Mapping):
+                known = {key: v for key, v in value.items() if v is not None}
+                settings[name] = dict(settings.get(name, {})) | known
+            elif value is not None:
+                settings[name] = value
+        if "robots" not in settings:
+            settings["robots"] = 1
+        return from_mapping(TeamConfig, settings)
+
+
+def prepare(
+    team: TeamConfig, *, out: Path, agent: str | None = None, rooms: str | None = None, slam: str | None = None,
+    robot: str | None = None, noise: str | None = None, seed: int | None = None, floor_plan: Path | None = None,
+    start: tuple[float, float, float] | None = None, config: Path | None = None, max_steps: int | None = None,
+    coverage_target: float | None = None,
+) -> TeamEpisode:  # fmt: skip
+    """Check everything that can be checked, and place the robots; nothing is written.
+
+    As :func:`training.episodes.explore.prepare`; ``start`` is the first robot's, ``agent`` drives each of them.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, and what to do.
+    """
+    with bad_input():
+        files = [*FILES, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
+        world, run, plan = asked_for(
+            out=out, files=files, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed,
+            floor_plan=floor_plan, start=start, config=config, max_steps=max_steps, coverage_target=coverage_target,
+        )  # fmt: skip
+        if run.get("start") is not None:
+            plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)
+        robots = Team(team=team, config=replace(world, coverage_target=1.0), max_steps=run["max_steps"])
+        found = robots.reset(seed=run["seed"], options={"floor_plan": plan})
+        explorers = tuple(make_agent(run["agent"], member) for member in robots.members)
+        for k, (explorer, member) in enumerate(zip(explorers, robots.members, strict=True)):
+            explorer.reset(member.belief, run["seed"] + k)
+    return TeamEpisode(robots, explorers, [observation for observation, _ in found], world, run, out)
+
+
+def tell_goal(team: Team, robot: int, goal: Goal | None) -> None:
+    """Have a robot tell the others where it goes."""
+    team.members[robot].knowledge.goal = None if goal is None else np.array(goal.pose[:2], np.float64)
+
+
+def run(episode: TeamEpisode, progress: Progress, witnesses: Iterable[TeamWitness] = ()) -> None:
+    """Let the robots explore until all are done, the steps are used up, or Ctrl-C is pressed between two steps."""
+    team, agents, observations = episode.team, episode.agents, episode.observations
+    patience = math.ceil(AGENT_DONE_AFTER_S / episode.config.step_s)
+    goals = [agent.goal for agent in agents]
+    watching = [episode.log, *witnesses]
+    idle, max_steps = 0, episode.run["max_steps"]
+    for witness in watching:
+        witness.take(team, goals)
+    began = time.perf_counter()
+    with interrupt_flag() as interrupted:
+        for steps in range(1, max_steps + 1):
+            actions = {}
+            for k in team.active:
+                agent = agents[k]
+                asked = time.perf_counter()
+                actions[k] = agent.act(observations[k], team.members[k].belief)
+                if agent.goal is not goals[k]:
+                    episode.decisions_ms.append(1e3 * (time.perf_counter() - asked))
+                    goals[k] = agent.goal
+                    tell_goal(team, k, agent.goal)
+            outcomes = team.step(actions)
+            for k, outcome in outcomes.items():
+                observations[k] = outcome.observation
+            for witness in watching:
+                witness.take(team, goals)
+            progress(coverage=team.coverage_share, time_s=team.time_s, steps=steps, max_steps=max_steps)
+            idle = idle + 1 if all(goals[k] is None for k in outcomes) else 0
+            if interrupted.is_set():
+                episode.end, episode.interrupted = "interrupted", True
+            elif not team.active and not any(outcome.truncated for outcome in outcomes.values()):
+                covered = any(outcome.info["is_success"] for outcome in outcomes.values())
+                episode.end = "covered" if covered else "collision"
+            elif idle >= patience:
+                statuses = {agents[k].status for k in outcomes}
+                episode.end = next((word for word in _WORST_FIRST if word in statuses), min(statuses))
+            elif team.active:
+                continue
+            break
+    episode.wall_time_s = time.perf_counter() - began

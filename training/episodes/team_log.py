@@ -1,0 +1,159 @@
+"""What a team's episode amounts to: coverage of all together, who saw what first, contacts, and its metrics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Goal
+from mecanum_env.episode import score_map
+from mecanum_env.team.team import Team
+from slam.geometry import compose, inverse
+from slam.metrics import measures
+from slam.teams.merged_grid import Chart, MergedGrid
+
+__all__ = ["TeamLog", "frames_in_first", "team_map", "team_metrics"]
+
+Array = NDArray[np.float64]
+
+_FIRST_EVERY_S = 1.0  # what several see for the first time within so long is shared between them
+_SUMS = ("path_length_m", "collisions", "relocalisations", "landmarks", "lost_s")
+_MEANS = ("corner_mean_m", "final_position_error_m", "final_heading_error_rad", "anees", "health_mean")
+
+
+class TeamLog:
+    """Notes a team's episode: :meth:`take` after ``reset`` and after every step."""
+
+    def __init__(self) -> None:
+        self._times: list[float] = []
+        self._coverage: list[float] = []
+        self._groups: list[NDArray[np.int64]] = []
+        self._collisions: list[int] = []
+        self._robot_collisions: list[int] = []
+
+    def take(self, team: Team, goals: Sequence[Goal | None]) -> None:
+        """Note the team as it is now."""
+        worlds = team.fleet.worlds
+        if not self._times:
+            self._team = team
+            self._first = np.zeros(len(worlds))
+            self._found = np.zeros(team.ground.mappable.shape, np.bool_)
+            self._every = max(1, round(_FIRST_EVERY_S / team.config.step_s))
+        if len(self._times) % self._every == 0:
+            self._note_first()
+        self._times.append(team.time_s)
+        self._coverage.append(team.coverage_share)
+        self._groups.append(team.groups)
+        self._collisions.append(sum(world.collisions for world in worlds))
+        self._robot_collisions.append(sum(world.robot_collisions for world in worlds))
+
+    def _note_first(self) -> None:
+        layers = self._team.coverage.layers
+        counts = layers.sum(axis=0)
+        new = (counts > 0) & ~self._found
+        self._found |= new
+        self._first += (layers[:, new] / counts[new]).sum(axis=1)
+
+    @property
+    def times(self) -> Array:
+        """Simulated time of each row ``(n,)`` [s]."""
+        return np.array(self._times)
+
+    @property
+    def coverage(self) -> Array:
+        """The team's coverage ``(n,)``."""
+        return np.array(self._coverage)
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """Of each robot the number of the group that it is heard in ``(n, robots)``."""
+        return np.array(self._groups)
+
+    @property
+    def collisions(self) -> NDArray[np.int32]:
+        """Contacts of all robots so far ``(n,)``."""
+        return np.array(self._collisions, np.int32)
+
+    @property
+    def robot_collisions(self) -> NDArray[np.int32]:
+        """Those of the contacts in which robots touched each other ``(n,)``, counted for each of the two."""
+        return np.array(self._robot_collisions, np.int32)
+
+    @property
+    def first_shares(self) -> Array:
+        """Of what the team has mapped, the share that each robot had first ``(robots,)``; they sum up to 1."""
+        self._note_first()
+        return np.asarray(self._first / max(self._first.sum(), 1.0))
+
+
+def frames_in_first(team: Team) -> list[Array]:
+    """Return the true poses ``(3,)`` of the frames of the robots' beliefs in that of the first robot."""
+    back = inverse(team.ground.start)
+    return [compose(back, member.truth.ground.start) for member in team.members]
+
+
+def team_map(team: Team) -> tuple[MergedGrid, list[int]]:
+    """Return the robots' own maps put together in the first one's frame, and the robots that are in it.
+
+    Left out are those of whom the first does not know where their frame is.
+    """
+    first, *others = team.members
+    frames = first.knowledge.frames
+    known = [member for member in others if member.number in frames]
+    merged = MergedGrid(first.backend.grid)
+    merged.take({m.number: (Chart.of(m.backend.grid), frames[m.number]) for m in known})
+    merged.follow()
+    return merged, [0, *(member.number for member in known)]
+
+
+def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
+    """Return the metrics of the team under the names that one robot's have, and ``per_robot``.
+
+    Coverage and times are the team's, the map is :func:`team_map`; ways, contacts, landmarks and time lost are
+    summed up, ATE is over all robots' poses, and other errors, NEES and health are means over the robots.
+    """
+    times, coverage = log.times, log.coverage
+    merged, together = team_map(team)
+    first = team.members[0]
+    score = score_map(first.truth.ground, first.backend.belief.in_team(merged, ()))
+    robots = [dict(member.episode_metrics()) for member in team.members]
+    sums = {name: sum(robot[name] for robot in robots) for name in _SUMS}
+    means = {name: _mean([robot[name] for robot in robots]) for name in _MEANS}
+    corners = [robot["corner_max_m"] for robot in robots if robot["corner_max_m"] is not None]
+    weights = [robot["steps"] + 1 for robot in robots]
+    squares = [robot["ate_rmse_m"] ** 2 for robot in robots]
+    levels = {f"time_to_{100 * level:.0f}_s": level for level in (0.5, 0.9, 0.95, 0.99)}
+    found: dict[str, Any] = {
+        "coverage": float(coverage[-1]),
+        "time_s": round(float(times[-1]), 6),
+        "steps": len(times) - 1,
+        "path_length_m": sums["path_length_m"],
+        "collisions": sums["collisions"],
+        "robot_collisions": int(log.robot_collisions[-1]),
+        **{name: measures.time_to(coverage, times, level=level) for name, level in levels.items()},
+        "map_robots": together,
+        "map_iou": score.iou,
+        "map_precision": score.precision,
+        "map_recall": score.recall,
+        "corner_mean_m": means["corner_mean_m"],
+        "corner_max_m": max(corners, default=None),
+        "ate_rmse_m": math.sqrt(float(np.average(squares, weights=weights))),
+        **{name: means[name] for name in _MEANS[1:]},
+        **{name: sums[name] for name in _SUMS[2:]},
+    }
+    extra = zip(team.members, log.first_shares.tolist(), frames_in_first(team), strict=True)
+    found["per_robot"] = [
+        {"robot": k, "first_share": share, "robot_collisions": member.truth.world.robot_collisions,
+         "frame": [round(float(v), 9) for v in frame], **robot}
+        for k, ((member, share, frame), robot) in enumerate(zip(extra, robots, strict=True))
+    ]  # fmt: skip
+    return found
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

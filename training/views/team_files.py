@@ -1,0 +1,68 @@
+"""What a team's episode leaves behind: the map of all, each robot's trajectories, map and landmarks, the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from mecanum_env.team.picture import render_team
+from slam.formats import atomic_write, write_map_server, write_tum
+from training.episodes.explore import ENDINGS, EXTRAS
+from training.episodes.recording import Recording
+from training.episodes.team import FILES, TeamEpisode, files_of
+from training.episodes.team_log import team_map
+from training.episodes.team_recording import TeamRecorder
+from training.runs.running import written_together
+from training.views.episode_files import PeriodicSaver, config_text, leftovers, place_of, write_landmarks
+from training.views.team_page import team_page
+
+__all__ = ["TeamSaver", "write_team_episode"]
+
+
+def write_team_episode(
+    episode: TeamEpisode, recordings: Sequence[Recording], *, film: Path | None = None
+) -> dict[str, Any]:
+    """Write every file of a team's episode and return its metrics; those of another episode are taken away."""
+    kept = {*FILES, *(name for member in episode.team.members for name in files_of(member.number))}
+    if film is not None:
+        kept.add(EXTRAS["video"])
+    with written_together(episode.out, without=leftovers(episode.out, kept)) as folder:
+        metrics = _write_into(folder, episode, recordings)
+        if film is not None:
+            film.replace(folder / EXTRAS["video"])
+    return metrics
+
+
+class TeamSaver(PeriodicSaver):
+    """Of a team; ``recorder`` comes before this witness."""
+
+    def __init__(self, episode: TeamEpisode, recorder: TeamRecorder, *, every_s: float = 60.0) -> None:
+        super().__init__(episode, lambda: write_team_episode(episode, recorder.recordings()), every_s)
+
+
+def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recording]) -> dict[str, Any]:
+    team = episode.team
+    write_map_server(folder / "map", team_map(team)[0])
+    for member in team.members:
+        k, record = member.number, member.truth.record
+        write_tum(folder / f"trajectory_true_robot_{k}.tum", record.times, record.true_poses)
+        write_tum(folder / f"trajectory_estimate_robot_{k}.tum", record.times, record.estimates)
+        write_landmarks(folder / f"landmarks_robot_{k}.db", member)
+        write_map_server(folder / f"map_robot_{k}", member.grid)
+    picture = cv2.cvtColor(render_team(team), cv2.COLOR_RGB2BGR)
+    atomic_write(folder / "team.png", cv2.imencode(".png", picture)[1].tobytes())
+    config, metrics = config_text(episode), episode.metrics()
+    atomic_write(folder / "config.toml", config)
+    who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
+    page = team_page(
+        episode, recordings, metrics=metrics, config=config,
+        title=f"{place_of(episode)}: {team.team.robots} robots, {who} on {episode.config.slam}",
+        ending=f"{episode.end}: {ENDINGS[episode.end]}", command="mecanum explore --config config.toml --out again",
+    )  # fmt: skip
+    atomic_write(folder / "report.html", page)
+    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    return metrics
