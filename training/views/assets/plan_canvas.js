@@ -89,7 +89,7 @@ async function openCanvases(header, redraw) {
   }
 
   // What the lidar of a recording saw, from where it truly was.
-  function scan(c, { data, scanAt }, k, px, colour) {
+  function scan(c, { header: own, data, scanAt }, k, px, colour) {
     const { row, ranges } = scanAt(k);
     const [x, y, theta] = [data.true[3 * row], data.true[3 * row + 1], data.true[3 * row + 2]];
     const sx = x + header.lidar.offset * Math.cos(theta), sy = y + header.lidar.offset * Math.sin(theta);
@@ -98,7 +98,7 @@ async function openCanvases(header, redraw) {
     const hits = [];
     ranges.forEach((range, b) => {
       if (Number.isNaN(range)) return;
-      const angle = theta + header.angle_min + b * header.angle_increment, far = Math.min(range, header.range_max);
+      const angle = theta + own.angle_min + b * own.angle_increment, far = Math.min(range, own.range_max);
       c.lineTo(sx + far * Math.cos(angle), sy + far * Math.sin(angle));
       if (Number.isFinite(range)) hits.push([sx + far * Math.cos(angle), sy + far * Math.sin(angle)]);
     });
@@ -116,10 +116,11 @@ async function openCanvases(header, redraw) {
     c.stroke();
   }
 
-  function map(c, { map }, header, k, canvas) {
+  // One of the map's pictures, on a canvas of the page.
+  function map(c, { map }, header, k, canvas, picture = 0) {
     const m = header.map, left = m.col0 * m.resolution, top = (m.row0 + m.rows) * m.resolution;
     map.show(k);
-    image(c, map.canvas, left, top, m.cols * m.resolution, m.rows * m.resolution, canvas.scale * m.resolution < 2);
+    image(c, map.canvases[picture], left, top, m.cols * m.resolution, m.rows * m.resolution, canvas.scale * m.resolution < 2);
     return { left, top };
   }
 

@@ -16,9 +16,9 @@ async function unpack(listed, text) {
   return arrays;
 }
 
-// What is replayed of a robot. Everything is in its start frame, in metres, y upwards; `k` is a row. `shades` are
-// the colours of the map's unknown, free and occupied cells: alpha, blue, green, red.
-function recordingOf(header, data, shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 }) {
+// What is replayed of a robot. Everything is in its start frame, in metres, y upwards; `k` is a row. Of the map
+// there is a picture for each of `shades`, the colours of unknown, free and occupied cells: alpha, blue, green, red.
+function recordingOf(header, data, shades = [{ 0: 0xffe4e1de, 1: 0xffffffff, 101: 0xff4a3e36 }]) {
   const goalAt = offsets(data.goal_count), landmarkAt = offsets(data.landmark_count);
   const landmarks = data.landmark.length / 5;
 
@@ -75,14 +75,17 @@ function recordingOf(header, data, shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101:
   // the beginning where time has run backwards.
   const map = (() => {
     const { rows, cols } = header.map;
-    const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d");
-    const image = context.createImageData(cols, rows), pixels = new Uint32Array(image.data.buffer);
+    const pictures = shades.map((shade) => {
+      const canvas = new OffscreenCanvas(cols, rows), context = canvas.getContext("2d");
+      const image = context.createImageData(cols, rows);
+      return { shade, canvas, context, image, pixels: new Uint32Array(image.data.buffer) };
+    });
     const classes = new Uint8Array(rows * cols); // 0 unknown, 1 free, 101 occupied
     let done = 0, cell = 0, edge = null;
     function clear() {
       done = cell = 0;
       classes.fill(0);
-      pixels.fill(shades[0]);
+      for (const { pixels, shade } of pictures) pixels.fill(shade[0]);
     }
     function show(k) {
       const upTo = noted(data.map_step, k) + 1;
@@ -94,10 +97,11 @@ function recordingOf(header, data, shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101:
           index += data.map_gap[cell];
           classes[index] = data.map_class[cell];
           const row = Math.floor(index / cols);
-          pixels[(rows - 1 - row) * cols + (index - row * cols)] = shades[classes[index]];
+          const pixel = (rows - 1 - row) * cols + (index - row * cols);
+          for (const { pixels, shade } of pictures) pixels[pixel] = shade[classes[index]];
         }
       }
-      context.putImageData(image, 0, 0);
+      for (const { context, image } of pictures) context.putImageData(image, 0, 0);
       edge = null;
     }
     // Free cells beside unknown ones, as a path of squares on a canvas whose unit is the cell.
@@ -114,8 +118,8 @@ function recordingOf(header, data, shades = { 0: 0xffe4e1de, 1: 0xffffffff, 101:
       return path;
     }
     clear();
-    return { canvas, show, frontiers, classes };
+    return { canvases: pictures.map(({ canvas }) => canvas), show, frontiers, classes };
   })();
 
-  return { data, scanAt, wayAt, landmarksAt, poseEllipse, map };
+  return { header, data, scanAt, wayAt, landmarksAt, poseEllipse, map };
 }

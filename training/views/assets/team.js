@@ -3,18 +3,18 @@
 // A robot's recording is in the frame of its own belief; `frame` is where that truly lies in the first robot's.
 async function openRecording(header, text) {
   const arrays = await unpack(header.arrays, text);
-  const robots = header.robots.map((robot, i) => {
+  const robots = header.robots.map((robot) => {
     const data = {};
     for (const [name] of robot.arrays) data[name.slice(name.indexOf(".") + 1)] = arrays[name];
-    return { ...recordingOf(robot, data, shadesOf(robot.colour)), header: robot, number: i };
+    return recordingOf(robot, data, shadesOf(robot.colour));
   });
   return { data: arrays, robots };
 }
 
-// Of the robot's colour as much as the pictures of a team have; unknown cells let the others' maps through.
+// Free cells in as much of the robot's colour as the pictures of a team have, and walls, which lie above all of them.
 function shadesOf(colour) {
   const [red, green, blue] = [1, 3, 5].map((i) => Math.round(0.45 * parseInt(colour.slice(i, i + 2), 16) + 0.55 * 255));
-  return { 0: 0, 1: (0xff000000 | (blue << 16) | (green << 8) | red) >>> 0, 101: 0xff4a3e36 };
+  return [{ 0: 0, 1: (0xff000000 | (blue << 16) | (green << 8) | red) >>> 0, 101: 0 }, { 0: 0, 1: 0, 101: 0xff4a3e36 }];
 }
 
 async function openViews(header, { data, robots }, redraw) {
@@ -70,17 +70,27 @@ async function openViews(header, { data, robots }, redraw) {
     each(c, robots, (robot) => draw.robot(c, robot.data.true, rowOf(robot, k), robot.header.colour));
   }
 
+  // Where several have a place, the mean of their colours: sums of shares, laid on until they cover.
+  const sums = new OffscreenCanvas(1, 1);
+  function maps(c, shown, k) {
+    const canvas = canvases[1], n = shown.length;
+    Object.assign(sums, { width: canvas.width, height: canvas.height });
+    const s = sums.getContext("2d");
+    s.setTransform(c.getTransform());
+    Object.assign(s, { globalCompositeOperation: "lighter", globalAlpha: 1 / n });
+    each(s, shown, (robot) => draw.map(s, robot, robot.header, k, canvas, 0));
+    c.save();
+    c.setTransform(1, 0, 0, 1, 0, 0);
+    for (let i = 0; i < (n > 1 ? 3 * n : 1); i++) c.drawImage(sums, 0, 0);
+    c.restore();
+    each(c, shown, (robot) => draw.map(c, robot, robot.header, k, canvas, 1));
+  }
+
   function drawMaps(k) {
     const shown = chosen.value === "" ? robots : [followed()];
     const { data: { estimate: poses } } = followed();
     const { c, px } = draw.begin(canvases[1], placed(followed(), poses, rowOf(followed(), k)), 0);
-    c.save();
-    c.setTransform(1, 0, 0, 1, 0, 0);
-    c.clearRect(0, 0, canvases[1].width, canvases[1].height); // the page's grey, below, is what nobody knows
-    c.restore();
-    c.globalCompositeOperation = "multiply";
-    each(c, shown, (robot) => draw.map(c, robot, robot.header, k, canvases[1]));
-    c.globalCompositeOperation = "source-over";
+    maps(c, shown, k);
     if (layers.landmarks) each(c, shown, (robot) => landmarks(c, robot, k, px));
     if (layers.paths) each(c, shown, (robot) => draw.path(c, robot.data.estimate, rowOf(robot, k), robot.header.colour, px));
     if (layers.goal) each(c, shown, (robot) => draw.goal(c, robot.wayAt(k), px, robot.header.colour));
@@ -115,7 +125,7 @@ function curvesOf(header, { data, robots }) {
     data.group.subarray(count * k, count * (k + 1)).filter((group) => group === g).length));
   return [
     {
-      name: "coverage: the team, and each robot’s own map", unit: "%", digits: 1, least: 100, goal: 100 * header.target,
+      name: "coverage: team, own maps", unit: "%", digits: 1, least: 100, goal: 100 * header.target,
       lines: [
         ...ofEach((own, k) => 100 * own.coverage[k]),
         { colour: "--ink", width: 2.4, values: series((k) => 100 * data.coverage[k]) },
@@ -126,6 +136,6 @@ function curvesOf(header, { data, robots }) {
       name: "NEES / 3 of each, ideally 1 on average", unit: "", digits: 2, goal: 1,
       lines: ofEach((own, k) => (k ? own.nees[k] / 3 : NaN)),
     },
-    { name: "robots in the largest group that hear each other", unit: "", digits: 0, colour: "--link", least: count, values: series(largest) },
+    { name: "robots in the largest group in touch", unit: "", digits: 0, colour: "--link", least: count, values: series(largest) },
   ];
 }
