@@ -45,13 +45,25 @@ def explore(
         bool, typer.Option("--mcap", help="Also write episode.mcap, ROS 2 messages for Foxglove and RViz.")
     ] = False,
     rerun: Annotated[bool, typer.Option("--rerun", help="Also write episode.rrd, for Rerun.")] = False,
+    robots: Annotated[
+        int | None, typer.Option(min=1, max=64, help="How many explore together.  [default: 1]")
+    ] = None,
+    communication: opt.Communication = None,
+    range_m: Annotated[
+        float | None, typer.Option("--range", help="How far robots hear each other in the open, m.  [default: 10]")
+    ] = None,
+    starts: opt.Starts = None,
+    unknown_starts: Annotated[
+        bool, typer.Option("--unknown-starts", help="No robot knows where the others start.")
+    ] = False,
     as_json: opt.Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
 
     Writes into --out: map.png, truth.png, map.pgm + map.yaml (ROS map_server), trajectory_true.tum and
     trajectory_estimate.tum, landmarks.db (SQLite), config.toml, metrics.json and report.html, which replays the
-    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came.
+    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came. Several robots write trajectories,
+    landmarks and a map each, and one map, page and film of all (docs/how-to/teams.md).
 
     \b
     Examples:
@@ -61,23 +73,42 @@ def explore(
       mecanum explore --config out/seed3/config.toml --out out/again
       mecanum explore --rooms rectangular --noise slippery --json
       mecanum explore --agent brisk-tour --video --mcap
+      mecanum explore --robots 3 --communication range --range 8 --out out/team
     """  # noqa: D301
     pose = _parse_start(start)
     if coverage_target is not None and not 0 < coverage_target <= 1:
         raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
+    asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
+    extras = [name for name, wanted in asked.items() if wanted]
+    given: dict[str, Any] = {
+        "out": out, "agent": agent, "rooms": rooms, "slam": slam, "robot": robot, "noise": noise, "seed": seed,
+        "floor_plan": floor_plan, "start": pose, "config": config, "max_steps": max_steps,
+        "coverage_target": coverage_target,
+    }  # fmt: skip
+    from training.episodes.team import read_team
+
+    about = {"--communication": communication, "--range": range_m, "--starts": starts}
+    team = read_team(config, {
+        "robots": robots, "communication": {"model": communication, "range_m": range_m}, "starts": starts,
+        "known_starts": False if unknown_starts else None,
+    })  # fmt: skip
+    if team.robots > 1:
+        single = {"--video-substeps": video_substeps, "--mcap": mcap, "--rerun": rerun}
+        _refuse([name for name, wanted in single.items() if wanted], "is for one robot; leave it out")
+        from training.cli.explore_team import explore_team
+
+        explore_team(team, given, video=video, as_json=as_json)
+        return
+    names = [name for name, value in about.items() if value is not None]
+    _refuse(names + ["--unknown-starts"] * unknown_starts, "is for several robots; give --robots 2 or more")
     from training.episodes import explore as task
     from training.episodes.recording import Recorder
     from training.runs.signals import interrupt_flag
     from training.views.episode_files import Saver, check_extras, write_episode
     from training.views.film import filmed
 
-    asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
-    extras = [name for name, wanted in asked.items() if wanted]
     check_extras(extras)
-    episode, recorder = task.prepare(
-        out=out, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed, floor_plan=floor_plan,
-        start=pose, config=config, max_steps=max_steps, coverage_target=coverage_target,
-    ), Recorder()  # fmt: skip
+    episode, recorder = task.prepare(**given), Recorder()
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
         witnesses: list[task.Witness] = [recorder, Saver(episode, recorder)]
@@ -103,6 +134,11 @@ def explore(
         raise OSError(f"{one_line(film.failure)}; all but the film is in {out}")
     if episode.interrupted or late.is_set():
         raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
+
+
+def _refuse(options: Sequence[str], why: str) -> None:
+    if options:
+        raise BadInput(f"{options[0]} {why}")
 
 
 def _parse_start(text: str | None) -> tuple[float, float, float] | None:

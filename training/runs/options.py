@@ -15,13 +15,18 @@ if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
 
 __all__ = [
-    "Backends", "Command", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Ray", "Robot",
-    "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Workers", "whole_numbers", "workers_of",
+    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Ray",
+    "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts", "Workers", "whole_numbers",
+    "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
 
 Backends = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
+Communication = Annotated[
+    str | None,
+    typer.Option(help="Who hears whom: unlimited, range, line-of-sight, walls or none.  [default: unlimited]"),
+]
 ConfigFile = Annotated[
     Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
 ]
@@ -51,6 +56,9 @@ RoomSeedOrNone = Annotated[
 Seed = Annotated[int, typer.Option(min=0)]
 Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
 Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
+Starts = Annotated[
+    str | None, typer.Option(help="Where several robots start: together or scattered.  [default: together]")
+]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
 
 
