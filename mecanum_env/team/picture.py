@@ -16,7 +16,7 @@ from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 if TYPE_CHECKING:
     from mecanum_env.team.team import Team
 
-__all__ = ["COLOURS", "render_team"]
+__all__ = ["COLOURS", "draw_maps", "render_team"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -47,17 +47,33 @@ def render_team(team: Team) -> Image:
     left = Canvas(frame[_TOP : _TOP + height, _LEFT : _LEFT + width], view)
     right = Canvas(frame[_TOP : _TOP + height, _RIGHT : _RIGHT + width], view)
     paint_plan(left, ground.plan, inverse(ground.start))
-    frames = [compose(inverse(ground.start), member.truth.ground.start) for member in team.members]
-    _paint_maps(right, [member.backend.grid for member in team.members], frames)
-    for member, placed in zip(team.members, frames, strict=True):
+    for member, placed in zip(team.members, team.frames, strict=True):
         colour = COLOURS[member.number % len(COLOURS)]
-        record, robot = member.truth.record, member.config.robot
+        record = member.truth.record
         left.line(thinned(transform_points(placed, record.true_poses[:, :2]), view), colour, px=2)
-        left.robot(compose(placed, member.truth.pose), robot, colour)
-        right.line(thinned(transform_points(placed, record.estimates[:, :2]), view), colour, px=2)
-        right.robot(compose(placed, member.backend.pose), robot, colour)
+        left.robot(compose(placed, member.truth.pose), member.config.robot, colour)
+    _paint_believed(right, team)
     _write(frame, team)
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def draw_maps(team: Team, *, longest_px: int) -> Image:
+    """Return what is mapped, as on the right of :func:`render_team`: blue, green, red ``(h, w, 3)``."""
+    view = View.around(with_margin(extent_of_truth(team.ground)), longest_px=longest_px)
+    image = np.empty((view.height, view.width, 3), np.uint8)
+    _paint_believed(Canvas(image, view), team)
+    return image
+
+
+def _paint_believed(canvas: Canvas, team: Team) -> None:
+    """Paint the robots' maps, and where each believes that it is and was."""
+    frames = team.frames
+    _paint_maps(canvas, [member.backend.grid for member in team.members], frames)
+    for member, placed in zip(team.members, frames, strict=True):
+        colour = COLOURS[member.number % len(COLOURS)]
+        path = transform_points(placed, member.truth.record.estimates[:, :2])
+        canvas.line(thinned(path, canvas.view), colour, px=2)
+        canvas.robot(compose(placed, member.backend.pose), member.config.robot, colour)
 
 
 def _paint_maps(canvas: Canvas, grids: list[OccupancyGrid], frames: list[Array]) -> None:

@@ -21,6 +21,7 @@ from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.coverage import TeamCoverage
 from mecanum_env.team.member import Member
 from mecanum_env.team.starts import start_poses
+from slam.geometry import compose, inverse
 from slam.settings import from_mapping, require, unknown_name
 
 __all__ = ["Outcome", "Team"]
@@ -223,6 +224,12 @@ class Team:
         for info in infos:
             info["team_coverage"] = self.coverage_share
             info["robot_collisions"] = collisions
+
+    @property
+    def frames(self) -> list[Array]:
+        """The true poses ``(3,)`` of the frames of the robots' beliefs in that of the first robot."""
+        back = inverse(self.ground.start)
+        return [compose(back, member.truth.ground.start) for member in self.members]
 
     @property
     def time_s(self) -> float:

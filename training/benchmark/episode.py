@@ -21,7 +21,8 @@ __all__ = ["CURVE_POINTS", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "Episod
 
 Array = NDArray[np.float64]
 Curve = NDArray[np.float32]
-Key = tuple[str, str, int, str, str]  # suite, place, seed, agent, backend
+Key = tuple[str, str, int, str, str] | tuple[str, str, int, str, str, int, str]
+"""Suite, place, seed, agent, backend; of a team also the number of its robots and its communication."""
 
 CURVE_POINTS = 128
 """Points of a curve: coverage at so many times (or ways), evenly spaced from the episode's start to its end."""

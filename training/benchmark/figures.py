@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -89,13 +89,20 @@ COMPARED = tuple(m for m in METRICS if m.centre == "iqm" and m.better)
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """The episodes of one agent on one backend in one suite, by place and seed."""
+    """The episodes of one agent on one backend in one suite, by place and seed; of so many robots."""
 
     suite: str
     agent: str
     slam: str
     keys: tuple[Key, ...]
     rows: tuple[EpisodeRow, ...]
+    robots: int = 1
+    communication: str = ""  # of a team
+
+    @property
+    def who(self) -> tuple[str, str, int, str]:
+        """What tells it from the suite's other groups."""
+        return self.agent, self.slam, self.robots, self.communication
 
     @property
     def strata(self) -> tuple[str, ...]:
@@ -108,7 +115,7 @@ class Group:
 
     def consistency(self) -> dict[str, Any]:
         """Return ``nees_over_3_mean``, ``nees_band_95`` and ``fraction_in_band`` over all episodes' seconds."""
-        return consistency_figures([row.nees for row in self.rows])
+        return consistency_figures([own for row in self.rows for own in row.nees.reshape(self.robots, -1)])
 
     def values(self, metric: Metric) -> Array:
         """Return every episode's value ``(n,)``, nan where it has none."""
@@ -125,27 +132,24 @@ class Figure:
 
 def group_rows(rows: Sequence[tuple[Key, EpisodeRow]]) -> list[Group]:
     """Return the groups of rows, in the order in which their first rows come."""
-    members: dict[tuple[str, str, str], list[tuple[Key, EpisodeRow]]] = {}
+    members: dict[tuple[Any, ...], list[tuple[Key, EpisodeRow]]] = {}
     for key, row in rows:
-        members.setdefault((key[0], key[3], key[4]), []).append((key, row))
-    return [
-        Group(
-            suite=suite, agent=agent, slam=slam, keys=tuple(k for k, _ in found), rows=tuple(r for _, r in found)
-        )
-        for (suite, agent, slam), found in members.items()
-    ]
+        members.setdefault((key[0], *key[3:]), []).append((key, row))
+    groups = []
+    for (suite, agent, slam, *team), found in members.items():
+        robots, communication = team or (1, "")
+        groups.append(Group(
+            suite=suite, agent=agent, slam=slam, keys=tuple(k for k, _ in found), rows=tuple(r for _, r in found),
+            robots=robots, communication=communication,
+        ))  # fmt: skip
+    return groups
 
 
 def merged(groups: Sequence[Group], *, suite: str) -> Group:
     """Return one agent's episodes of several suites as those of one, with each suite's places as its strata."""
     pairs = [(key, row) for group in groups for key, row in zip(group.keys, group.rows, strict=True)]
-    return Group(
-        suite=suite,
-        agent=groups[0].agent,
-        slam=groups[0].slam,
-        keys=tuple((suite, f"{key[0]}/{key[1]}", *key[2:]) for key, _ in pairs),
-        rows=tuple(row for _, row in pairs),
-    )
+    keys = [(suite, f"{key[0]}/{key[1]}", *key[2:]) for key, _ in pairs]
+    return replace(groups[0], suite=suite, keys=tuple(keys), rows=tuple(row for _, row in pairs))
 
 
 def figures(group: Group) -> dict[str, Figure]:

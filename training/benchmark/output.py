@@ -12,11 +12,15 @@ from slam.formats import atomic_write
 from training.benchmark import tables
 from training.benchmark.figures import Figure, Group, comparisons, figures, merged
 from training.benchmark.suites import SLIPPERY
+from training.benchmark.team_figures import Scaling, scaling_of, scaling_table, scalings_as_json
 from training.figures.statistics import Comparison, Interval
 from training.figures.tables import csv_table
 from training.runs.running import plain
 
-__all__ = ["FILES", "KEY_COLUMNS", "Entry", "Report", "as_json", "centres", "markdown", "table", "write_tables"]
+__all__ = [
+    "FILES", "KEY_COLUMNS", "TEAM_COLUMNS", "Entry", "Report", "as_json", "centres", "markdown", "table",
+    "write_tables",
+]  # fmt: skip
 
 FILES = (
     "results.sqlite",
@@ -31,6 +35,7 @@ FILES = (
 
 _WHO_COLUMNS = ("suite", "agent", "slam")
 KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
+TEAM_COLUMNS = ("robots", "communication")  # behind those, where there are teams
 # What a terminal has room for.
 _COLUMNS = (
     "reached_95", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
@@ -61,22 +66,30 @@ class Report:
     @classmethod
     def of(cls, groups: Sequence[Group], *, baseline: str | None, config: dict[str, Any]) -> Report:
         """Work out every table of the groups."""
-        several = len({group.slam for group in groups}) > 1
+        names = _names(groups)
         entries = []
         for group, base in _with_baseline(groups, baseline):
             entries.append(Entry(
                 group,
-                f"{group.agent}@{group.slam}" if several else group.agent,
+                names[group.who],
                 figures(group),
                 comparisons(group, base) if base is not None and base is not group else {},
             ))  # fmt: skip
         overall: dict[str, dict[str, dict[str, Comparison]]] = {}
-        names = {(entry.group.agent, entry.group.slam): entry.name for entry in entries}
         for group, base in _with_baseline(_all_suites(groups), baseline):
             if base is not None and base is not group:
                 found = overall.setdefault(group.suite, {})
-                found[names[group.agent, group.slam]] = comparisons(group, base)
+                found[names[group.who]] = comparisons(group, base)
         return cls(tuple(entries), overall, baseline, config)
+
+    @property
+    def has_teams(self) -> bool:
+        """Whether any of the episodes had several robots."""
+        return any(entry.group.robots > 1 for entry in self.entries)
+
+    def scalings(self, suite: str) -> list[Scaling]:
+        """Return a suite's figures by the number of robots; none where no episode had several."""
+        return scaling_of([entry.group for entry in self.entries], suite=suite) if self.has_teams else []
 
     def suites(self) -> dict[str, list[Entry]]:
         """Return the entries by suite."""
@@ -86,9 +99,21 @@ class Report:
         return found
 
 
+def _names(groups: Sequence[Group]) -> dict[tuple[str, str, int, str], str]:
+    """Return what each group is called: by its agent, and by what else there are several of."""
+    several = len({group.slam for group in groups}) > 1
+    said = len({group.communication for group in groups if group.communication}) > 1
+    return {
+        group.who: (f"{group.agent}@{group.slam}" if several else group.agent)
+        + (f" ×{group.robots}" if group.robots > 1 else "")
+        + (f" {group.communication}" if said and group.communication else "")
+        for group in groups
+    }
+
+
 def _with_baseline(groups: Sequence[Group], baseline: str | None) -> list[tuple[Group, Group | None]]:
-    bases = {(g.suite, g.slam): g for g in groups if g.agent == baseline}
-    return [(group, bases.get((group.suite, group.slam))) for group in groups]
+    bases = {(g.suite, *g.who[1:]): g for g in groups if g.agent == baseline}
+    return [(group, bases.get((group.suite, *group.who[1:]))) for group in groups]
 
 
 def _all_suites(groups: Sequence[Group]) -> list[Group]:
@@ -97,8 +122,8 @@ def _all_suites(groups: Sequence[Group]) -> list[Group]:
     for name, slippery in (("all-nominal", False), ("all-slippery", True)):
         parts = [group for group in groups if group.suite.endswith(SLIPPERY) == slippery]
         suites = {group.suite for group in parts}
-        for who in dict.fromkeys((group.agent, group.slam) for group in parts):
-            own = [group for group in parts if (group.agent, group.slam) == who]
+        for who in dict.fromkeys(group.who for group in parts):
+            own = [group for group in parts if group.who == who]
             if len(own) == len(suites) > 1:
                 found.append(merged(own, suite=name))
     return found
@@ -111,6 +136,8 @@ def as_json(report: Report) -> dict[str, Any]:
     """Return suite → agent → metric → figures, and ``comparison``, ``ends``, ``consistency``, ``config`` beside.
 
     ``comparison`` also has all nominal and all slippery suites together, each place counting the same.
+
+    ``teams`` has, where there are some, the figures by the number of robots.
 
     ``low`` and ``high`` are the limits of ``value``, the figure in the tables: the IQM, but the mean for shares
     and the ratio of two sums for collisions a way. null is what is not defined, or infinite: never reached.
@@ -128,29 +155,41 @@ def as_json(report: Report) -> dict[str, Any]:
             against[suite] = found
     for suite, by_name in report.overall.items():
         against[suite] = {name: _compared(found) for name, found in by_name.items()}
+    teams = {suite: scalings_as_json(report.scalings(suite)) for suite in report.suites()}
     return out | {
         "comparison": against, "ends": ends, "consistency": consistency, "config": report.config,
+        **({"teams": teams} if report.has_teams else {}),
     }  # fmt: skip
 
 
 def write_tables(out: Path, report: Report) -> None:
     """Write ``episodes.csv``, ``summary.csv``, ``comparison.csv`` and ``summary.json``."""
     found = as_json(report)
+    teams = TEAM_COLUMNS if report.has_teams else ()
     episodes = [
-        dict(zip(KEY_COLUMNS, key, strict=True)) | row.metrics
+        dict(zip(KEY_COLUMNS, key, strict=False)) | _team(entry.group, teams) | row.metrics
         for entry in report.entries
         for key, row in zip(entry.group.keys, entry.group.rows, strict=True)
     ]
     summary = [
-        {"suite": e.group.suite, "agent": e.group.agent, "slam": e.group.slam, "metric": key} | figure
+        {"suite": e.group.suite} | _who(e.group, teams) | {"metric": key} | figure
         for e in report.entries
         for key, figure in _figures(e).items()
     ]
-    atomic_write(out / "episodes.csv", csv_table(episodes, KEY_COLUMNS))
-    atomic_write(out / "summary.csv", csv_table(summary, _WHO_COLUMNS))
-    atomic_write(out / "comparison.csv", csv_table(_comparison(report, found["comparison"]), _WHO_COLUMNS))
+    atomic_write(out / "episodes.csv", csv_table(episodes, (*KEY_COLUMNS, *teams)))
+    atomic_write(out / "summary.csv", csv_table(summary, (*_WHO_COLUMNS, *teams)))
+    compared = _comparison(report, found["comparison"], teams)
+    atomic_write(out / "comparison.csv", csv_table(compared, (*_WHO_COLUMNS, *teams)))
     text = json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False)
     atomic_write(out / "summary.json", text + "\n")
+
+
+def _team(group: Group, columns: Sequence[str]) -> dict[str, Any]:
+    return {name: getattr(group, name) for name in columns}
+
+
+def _who(group: Group, teams: Sequence[str]) -> dict[str, Any]:
+    return {"agent": group.agent, "slam": group.slam} | _team(group, teams)
 
 
 def _figures(entry: Entry) -> dict[str, dict[str, Any]]:
@@ -183,13 +222,12 @@ def _interval(found: Interval) -> dict[str, Any]:
     return _plain({"value": found.value, "low": found.low, "high": found.high})
 
 
-def _comparison(report: Report, found: dict[str, Any]) -> list[dict[str, Any]]:
+def _comparison(report: Report, found: dict[str, Any], teams: Sequence[str]) -> list[dict[str, Any]]:
     """Return the rows of ``comparison.csv``: of each suite, agent and metric."""
-    rows = []
+    rows, groups = [], {entry.name: entry.group for entry in report.entries}
     for suite, by_name in found.items():
         for name, against in by_name.items():
-            agent, _, slam = name.partition("@")
-            who = {"suite": suite, "agent": agent, "slam": slam or report.entries[0].group.slam}
+            who = {"suite": suite} | _who(groups[name], teams)
             for key, c in against.items():
                 row: dict[str, Any] = who | {"baseline": report.baseline, "metric": key, "n": c["n"]}
                 for part in ("difference", "ratio", "probability_of_improvement"):
@@ -211,6 +249,8 @@ def table(report: Report) -> str:
         against = {entry.name: entry.against for entry in entries if entry.against}
         if against:
             parts += [tables.text(tables.against_table(against, report.baseline)), ""]
+        if scalings := report.scalings(suite):
+            parts += [tables.text(scaling_table(scalings)), ""]
     parts.append("IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts")
     return "\n".join(parts)
 
@@ -229,6 +269,7 @@ def markdown(report: Report) -> str:
         against = {entry.name: entry.against for entry in entries if entry.against}
         parts += [f"## {suite}\n", tables.markdown(main)]
         parts += [_against(against, report.baseline)] if against else []
+        parts += [tables.markdown(scaling_table(scalings))] if (scalings := report.scalings(suite)) else []
     return "\n".join(parts)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.formats import atomic_write
-from training.benchmark.output import KEY_COLUMNS, Report
+from training.benchmark.output import KEY_COLUMNS, TEAM_COLUMNS, Report
 from training.runs.errors import needs_extra
 
 __all__ = ["FILE", "require", "write_parquet"]
@@ -30,8 +30,11 @@ def write_parquet(out: Path, report: Report) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    pairs = [pair for entry in report.entries for pair in zip(entry.group.keys, entry.group.rows, strict=True)]
+    groups = [entry.group for entry in report.entries]
+    pairs = [pair for group in groups for pair in zip(group.keys, group.rows, strict=True)]
     columns = {name: pa.array([key[k] for key, _ in pairs]) for k, name in enumerate(KEY_COLUMNS)}
+    for name in TEAM_COLUMNS if report.has_teams else ():
+        columns[name] = pa.array([getattr(group, name) for group in groups for _ in group.rows])
     for name in dict.fromkeys(name for _, row in pairs for name in row.metrics):
         values = [row.metrics.get(name) for _, row in pairs]
         columns[name] = pa.array(values, _type(pa, values))

@@ -15,6 +15,8 @@ from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
 from training.benchmark.output import Entry, Report, centres
 from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent
+from training.benchmark.team_chart import scaling_chart
+from training.benchmark.team_figures import scaling_table
 from training.episodes.explore import ENDINGS
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.figures.page_style import STYLE
@@ -85,6 +87,7 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
             report.baseline,
             "on the same episodes",
         ),
+        _teams(report, name),
         _charts(entries, colours),
         "<h3>How the episodes ended</h3>",
         _ends_table(entries),
@@ -144,6 +147,21 @@ def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
         "<h3>Coverage against time and way</h3>"
         f'<p class="soft">Median, and the middle half of the episodes.</p><nav>{legend}</nav>'
         f'<div class="charts">{"".join(charts)}</div>'
+    )
+
+
+def _teams(report: Report, suite: str) -> str:
+    scalings = report.scalings(suite)
+    if not scalings:
+        return ""
+    legend = "".join(f"<span>{_key(k)}{escape(s.name)}</span>" for k, s in enumerate(scalings))
+    return (
+        "<h3>Several robots</h3>"
+        '<p class="soft">Time until the team has mapped 95 %, with its interval; dashed, the time of one robot '
+        "over their number. Against one robot: on the same episodes. A contact of two robots counts for both. "
+        "NEES / 3 is over all robots.</p>"
+        f'<nav>{legend}</nav><div class="charts">{scaling_chart(scalings)}</div>'
+        + tables.html(scaling_table(scalings))
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,16 @@ import agents
 import slam
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
+from mecanum_env.team.config import TeamConfig
 from slam.formats import atomic_write
 from slam.settings import to_mapping, unknown_name
 from training.benchmark import store as benchmark_store
 from training.benchmark import suites
-from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, run_job
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import SPLITS, Place, Suite
+from training.benchmark.team_episode import TeamJob, run_any_job
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
@@ -37,6 +39,7 @@ __all__ = ["BenchmarkPlan", "EpisodesFailed", "benchmark"]
 DEFAULT_BASELINE = "nearest-frontier"
 _MOST_SEEDS = 10_000
 _EPISODE = "training.benchmark.episode"  # the code that makes a row, with all that it imports
+_TEAM_EPISODE = "training.benchmark.team_episode"
 
 
 class EpisodesFailed(Exception):
@@ -64,11 +67,13 @@ class BenchmarkPlan:
     seeds: tuple[int, ...] | None  # None: the split's
     baseline: str | None  # the agent that the others are compared with
     max_steps: int | None
+    teams: tuple[TeamConfig | None, ...] = (None,)  # None: one robot alone
 
     @classmethod
     def parse(
         cls, *, suite: str | None, agents: str, slam: str | None, split: str = "test", seeds: str | None = None,
         baseline: str | None = None, floor_plans: Path | None = None, max_steps: int | None = None,
+        teams: tuple[TeamConfig | None, ...] = (None,),
     ) -> BenchmarkPlan:  # fmt: skip
         """Check options as typed; :class:`BadInput` says what is allowed."""
         with bad_input():
@@ -86,7 +91,7 @@ class BenchmarkPlan:
             baseline = DEFAULT_BASELINE
         return cls(
             suites=which, agents=names, backends=backends, split=split, seeds=chosen, baseline=baseline,
-            max_steps=max_steps,
+            max_steps=max_steps, teams=teams,
         )  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
@@ -99,20 +104,21 @@ class BenchmarkPlan:
         """Every episode; all agents get to a seed before any gets to the next."""
         seeds = {suite.name: self.seeds or tuple(suite.seeds(self.split)) for suite in self.suites}
         found = [
-            (rank, EpisodeJob(
-                suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend, noise=suite.noise,
+            (rank, _job(
+                team, suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend, noise=suite.noise,
                 rooms=place.rooms, floor_plan=place.floor_plan, max_steps=self.max_steps,
             ))
             for suite in self.suites
             for place in suite.places
             for backend in self.backends
             for agent in self.agents
+            for team in self.teams
             for rank, seed in enumerate(seeds[suite.name])
         ]  # fmt: skip
         return tuple(job for _, job in sorted(found, key=lambda pair: pair[0]))
 
-    def made_by(self) -> dict[tuple[str, str, str, str], str]:
-        """Return suite, place, agent, backend → digest of all that such rows are made by but the seed.
+    def made_by(self) -> dict[Key, str]:
+        """Return the key of each job → digest of all that its row is made by but the seed.
 
         Raises
         ------
@@ -122,17 +128,19 @@ class BenchmarkPlan:
         made = {name: _behind_agent(name) for name in self.agents}
         modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
         common = json.dumps(self.settings(), sort_keys=True)
-        out = {}
-        for agent in self.agents:
-            for backend in self.backends:
-                module, policy = made[agent]
-                code = code_digest(_EPISODE, module, modules_of_backends[backend])
-                for suite in self.suites:
-                    config = _config_text(suite, backend)
-                    for place in suite.places:
-                        parts = (code, policy, common, config, place.name, place.digest)
-                        out[suite.name, place.name, agent, backend] = short_digest(p.encode() for p in parts)
-        return out
+        places = {(suite.name, place.name): place for suite in self.suites for place in suite.places}
+        configs = {(s.name, backend): _config_text(s, backend) for s in self.suites for backend in self.backends}
+
+        @cache
+        def digest(suite: str, place: str, agent: str, backend: str, team: TeamConfig | None) -> str:
+            module, policy = made[agent]
+            code = code_digest(_EPISODE if team is None else _TEAM_EPISODE, module, modules_of_backends[backend])
+            parts = (code, policy, common, configs[suite, backend], place, places[suite, place].digest)
+            extra = () if team is None else (json.dumps(to_mapping(team), sort_keys=True),)
+            return short_digest(part.encode() for part in (*parts, *extra))
+
+        teams = ((job, job.team if isinstance(job, TeamJob) else None) for job in self.jobs)
+        return {job.key: digest(job.suite, job.place, job.agent, job.slam, team) for job, team in teams}
 
     def config_text(self) -> str:
         """Return the effective configuration of the first suite and backend as TOML; [run] has what varies."""
@@ -149,6 +157,8 @@ class BenchmarkPlan:
         }  # fmt: skip
         if self.baseline is not None:
             run["baseline"] = self.baseline
+        if teams := [to_mapping(team) for team in self.teams if team is not None]:
+            run["teams"] = teams
         return _config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
 
 
@@ -175,11 +185,11 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
             if isinstance(result, EpisodeFailure):
                 failures.append((job, result.message))
             else:
-                store.add(job, result, made_by=made_by[job.suite, job.place, job.agent, job.slam])
+                store.add(job, result, made_by=made_by[job.key])
 
         # Even one worker is a process of its own: the libraries' threads, and with them the roundings, are the
         # same in any number of workers.
-        run_all(missing, run_job, workers=workers, keep=keep, what="episodes", apart=True)
+        run_all(missing, run_any_job, workers=workers, keep=keep, what="episodes", apart=True)
         groups = _groups(plan, store)
     report = Report.of(groups, baseline=plan.baseline, config=_described(plan))
     write_tables(out, report)
@@ -195,11 +205,11 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
 
 
 def _missing(
-    plan: BenchmarkPlan, store: benchmark_store.Store, made_by: dict[tuple[str, str, str, str], str], out: Path
+    plan: BenchmarkPlan, store: benchmark_store.Store, made_by: dict[Key, str], out: Path
 ) -> list[EpisodeJob]:
     there, missing = store.made_by(), []
     for job in plan.jobs:
-        wanted = made_by[job.suite, job.place, job.agent, job.slam]
+        wanted = made_by[job.key]
         if job.key not in there:
             missing.append(job)
         elif there[job.key] != wanted:
@@ -214,6 +224,10 @@ def _groups(plan: BenchmarkPlan, store: benchmark_store.Store) -> list[Group]:
     order = {s.name: k for k, s in enumerate(plan.suites)}
     jobs = sorted(plan.jobs, key=lambda job: order[job.suite])  # stable: agents as they were given, then seeds
     return group_rows(list(store.rows(job.key for job in jobs)))
+
+
+def _job(team: TeamConfig | None, **about: Any) -> EpisodeJob:
+    return EpisodeJob(**about) if team is None else TeamJob(team=team, **about)
 
 
 def _agent_names(text: str) -> tuple[str, ...]:
@@ -247,6 +261,7 @@ def _config_text(suite: Suite, backend: str) -> str:
 
 def _described(plan: BenchmarkPlan) -> dict[str, Any]:
     seeds: Sequence[int] | None = plan.seeds
+    teams = [to_mapping(team) for team in plan.teams if team is not None]
     return {
         "suites": [suite.name for suite in plan.suites],
         "agents": list(plan.agents),
@@ -254,5 +269,6 @@ def _described(plan: BenchmarkPlan) -> dict[str, Any]:
         "split": plan.split if seeds is None else None,
         "seeds": {s.name: list(seeds or s.seeds(plan.split)) for s in plan.suites},
         "baseline": plan.baseline,
+        **({"teams": teams} if teams else {}),
         **plan.settings(),
     }

@@ -36,7 +36,14 @@ CREATE TABLE IF NOT EXISTS episodes (
     PRIMARY KEY (suite, place, seed, agent, slam)
 ) STRICT
 """
-_KEY = "suite, place, seed, agent, slam"
+# Rows of teams, in a table of their own: a store of single robots stays as it was.
+_TEAM_SCHEMA = (
+    _SCHEMA.replace("episodes (", "team_episodes (")
+    .replace("    made_by", "    robots INTEGER NOT NULL,\n    communication TEXT NOT NULL,\n    made_by", 1)
+    .replace("agent, slam)", "agent, slam, robots, communication)")
+)
+_TABLES = {5: "episodes", 7: "team_episodes"}  # by the length of their keys
+_KEYS = {5: "suite, place, seed, agent, slam", 7: "suite, place, seed, agent, slam, robots, communication"}
 _CURVES = ("coverage_by_time", "coverage_by_path", "nees")
 
 
@@ -71,29 +78,43 @@ class Store:
         """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same."""
         metrics = json.dumps(row.metrics, ensure_ascii=False, allow_nan=False)
         curves = [np.asarray(getattr(row, name), "<f4").tobytes() for name in _CURVES]
+        values = (*job.key, made_by, metrics, *curves, row.thumbnail)
+        marks = ", ".join("?" * len(values))
         with self._blaming_the_file():
-            self._connection.execute(
-                "INSERT OR IGNORE INTO episodes VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-                (*job.key, made_by, metrics, *curves, row.thumbnail),
-            )
+            if len(job.key) == 7:
+                self._connection.execute(_TEAM_SCHEMA)
+            self._connection.execute(f"INSERT OR IGNORE INTO {_TABLES[len(job.key)]} VALUES ({marks})", values)
 
     def made_by(self) -> dict[Key, str]:
         """Return what every row was made by."""
+        found: dict[Key, str] = {}
         with self._blaming_the_file():
-            rows = self._connection.execute(f"SELECT {_KEY}, made_by FROM episodes").fetchall()
-        return {tuple(row[:5]): row[5] for row in rows}
+            for size in self._sizes():
+                rows = self._connection.execute(f"SELECT {_KEYS[size]}, made_by FROM {_TABLES[size]}").fetchall()
+                found |= {tuple(row[:-1]): row[-1] for row in rows}
+        return found
 
     def rows(self, keys: Iterable[Key]) -> Iterator[tuple[Key, EpisodeRow]]:
         """Yield the rows of keys that there are, in the order of the keys."""
         columns = ("metrics", *_CURVES, "thumbnail")
-        query = f"SELECT {', '.join(columns)} FROM episodes WHERE ({_KEY}) = (?, ?, ?, ?, ?)"
+        with self._blaming_the_file():
+            sizes = self._sizes()
         for key in keys:
+            if (size := len(key)) not in sizes:
+                continue
+            marks = ", ".join("?" * size)
+            query = f"SELECT {', '.join(columns)} FROM {_TABLES[size]} WHERE ({_KEYS[size]}) = ({marks})"
             with self._blaming_the_file():
                 found = self._connection.execute(query, key).fetchone()
                 if found is not None:
                     row = _decode(dict(zip(columns, found, strict=True)))
             if found is not None:
                 yield key, row
+
+    def _sizes(self) -> list[int]:
+        """Return the lengths of keys for which there is a table."""
+        found = self._connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchall()
+        return [size for size, table in _TABLES.items() if (table,) in found]
 
     def _check(self) -> None:
         application, version = (

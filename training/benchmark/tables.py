@@ -15,8 +15,8 @@ from training.figures.statistics import NONE, Comparison, Interval
 from training.figures.tables import markdown_table, text_table
 
 __all__ = [
-    "AGAINST", "BY_KEY", "HEADLINE", "Cell", "Table", "against_table", "figures_table", "html", "markdown",
-    "overview", "ranked", "shown", "text",
+    "AGAINST", "BY_KEY", "HEADLINE", "Cell", "Table", "against_table", "change", "figure", "figures_table", "html",
+    "markdown", "overview", "ranked", "shown", "text",
 ]  # fmt: skip
 
 BY_KEY = {metric.key: metric for metric in METRICS}
@@ -69,13 +69,14 @@ def shown(metric: Metric, value: float) -> str:
     return "∞" if math.isinf(value) else f"{metric.scale * value:.{metric.digits}f}"
 
 
-def _figure(metric: Metric, found: Interval, *, limits: bool = True) -> Cell:
+def figure(metric: Metric, found: Interval, *, limits: bool = True) -> Cell:
+    """Return the cell of a figure, with the limits of its interval."""
     if math.isnan(found.low) or not limits:
         return Cell(shown(metric, found.value))
     return Cell(shown(metric, found.value), shown(metric, found.low), shown(metric, found.high))
 
 
-def _change(metric: Metric, ratio: Interval, note: str = "") -> Cell:
+def change(metric: Metric, ratio: Interval, note: str = "") -> Cell:
     """Return by how much a ratio differs from one, with a tone where its interval excludes that."""
     if math.isnan(ratio.value):
         return Cell("–", note=note)
@@ -128,7 +129,7 @@ def figures_table(
         cells = [Cell(str(episodes[name]))] if episodes else []
         for metric in shown_metrics:
             key = metric.key
-            cell = _figure(metric, figures.get(key, NONE), limits=limits is None or key in limits)
+            cell = figure(metric, figures.get(key, NONE), limits=limits is None or key in limits)
             cells.append(_toned(replace(cell, note=notes[name][key] if notes else ""), name, best[key]))
         rows.append((name, tuple(cells)))
     return Table(("agent", *(["episodes"] if episodes else []), *map(_heading, shown_metrics)), tuple(rows))
@@ -142,7 +143,7 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
         for key in AGAINST:
             share = _plain(_share(against[key].probability))
             note = "" if math.isnan(against[key].probability.value) else f"better in {share}"
-            cells.append(_change(BY_KEY[key], against[key].ratio, note))
+            cells.append(change(BY_KEY[key], against[key].ratio, note))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))
     labels = [BY_KEY[key].label for key in AGAINST]
@@ -172,11 +173,11 @@ def overview(
         rows = []
         for name in sorted(times, key=lambda name: _mean([time.value for time in times[name]])):
             cells = [
-                _toned(_figure(metric, time, limits=limits), name, least)
+                _toned(figure(metric, time, limits=limits), name, least)
                 for time, least in zip(times[name], best, strict=True)
             ]
             if ratios:
-                cells.append(_change(metric, ratios[name]) if name in ratios else Cell(""))
+                cells.append(change(metric, ratios[name]) if name in ratios else Cell(""))
             rows.append((name, tuple(cells)))
         tables.append(Table(("agent", *columns, *([f"against {baseline}"] if ratios else [])), tuple(rows)))
     return tables
@@ -206,7 +207,7 @@ def _toned(cell: Cell, name: str, best: str | None) -> Cell:
 
 
 def _is_bound(name: str) -> bool:
-    return name.split("@")[0] == KNOWN_MAP
+    return name.replace("@", " ").split(" ")[0] == KNOWN_MAP
 
 
 # ---- printers --------------------------------------------------------------------------------------------------

@@ -42,6 +42,13 @@ def benchmark(
         str | None,
         typer.Option(help="Agent to compare the others with.  [default: nearest-frontier, if it is one of them]"),
     ] = None,
+    robots: Annotated[
+        str, typer.Option(help="How many robots explore together; several numbers, separated by commas.")
+    ] = "1",
+    communication: opt.Communication = None,
+    range_m: opt.Range = None,
+    starts: opt.Starts = None,
+    unknown_starts: opt.UnknownStarts = False,
     protocol: Annotated[
         str | None,
         typer.Option(help="dungeons: the published path-length protocol on --maps, instead of suites."),
@@ -77,6 +84,7 @@ def benchmark(
       mecanum benchmark --suite all --split validation --out out/validation --json
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
       mecanum benchmark --suite all --ray 10.0.0.5:6379 --out out/cluster --parquet
+      mecanum benchmark --robots 1,2,3,5 --communication range,none --agents brisk-tour --out out/teams --report
       mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
     """  # noqa: D301
     who = opt.workers_of(workers, ray)
@@ -84,7 +92,9 @@ def benchmark(
         suites_only = {
             "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
             "--baseline": baseline, "--max-steps": max_steps, "--report": report or None,
-            "--parquet": parquet or None,
+            "--parquet": parquet or None, "--robots": None if robots == "1" else robots,
+            "--communication": communication, "--range": range_m, "--starts": starts,
+            "--unknown-starts": unknown_starts or None,
         }  # fmt: skip
         _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
         assert maps is not None
@@ -101,10 +111,14 @@ def benchmark(
     from training.benchmark.output import as_json as as_mapping
     from training.benchmark.parquet import require, write_parquet
     from training.benchmark.report import write_report
+    from training.benchmark.teams import teams_of
 
     plan = task.BenchmarkPlan.parse(
         suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
         floor_plans=floor_plans, max_steps=max_steps,
+        teams=teams_of(
+            robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+        ),
     )  # fmt: skip
     if parquet:
         require()

@@ -49,21 +49,17 @@ def explore(
         int | None, typer.Option(min=1, max=64, help="How many explore together.  [default: 1]")
     ] = None,
     communication: opt.Communication = None,
-    range_m: Annotated[
-        float | None, typer.Option("--range", help="How far robots hear each other in the open, m.  [default: 10]")
-    ] = None,
+    range_m: opt.Range = None,
     starts: opt.Starts = None,
-    unknown_starts: Annotated[
-        bool, typer.Option("--unknown-starts", help="No robot knows where the others start.")
-    ] = False,
+    unknown_starts: opt.UnknownStarts = False,
     as_json: opt.Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
 
     Writes into --out: map.png, truth.png, map.pgm + map.yaml (ROS map_server), trajectory_true.tum and
     trajectory_estimate.tum, landmarks.db (SQLite), config.toml, metrics.json and report.html, which replays the
-    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came. Several robots write trajectories,
-    landmarks and a map each, and one map, page and film of all (docs/how-to/teams.md).
+    episode in a browser. Ctrl-C ends the episode and keeps it as far as it came. Several robots write
+    trajectories, landmarks and a map each, and one map, page and film of all (docs/how-to/teams.md).
 
     \b
     Examples:
@@ -87,7 +83,6 @@ def explore(
     }  # fmt: skip
     from training.episodes.team import read_team
 
-    about = {"--communication": communication, "--range": range_m, "--starts": starts}
     team = read_team(config, {
         "robots": robots, "communication": {"model": communication, "range_m": range_m}, "starts": starts,
         "known_starts": False if unknown_starts else None,
@@ -99,8 +94,9 @@ def explore(
 
         explore_team(team, given, video=video, as_json=as_json)
         return
-    names = [name for name, value in about.items() if value is not None]
-    _refuse(names + ["--unknown-starts"] * unknown_starts, "is for several robots; give --robots 2 or more")
+    opt.refuse_team_options(
+        communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+    )
     from training.episodes import explore as task
     from training.episodes.recording import Recorder
     from training.runs.signals import interrupt_flag

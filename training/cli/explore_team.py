@@ -64,8 +64,8 @@ def _summary(metrics: dict[str, Any], files: str) -> str:
         ("path", f"{metrics['path_length_m']:.1f} m in all, {metrics['collisions']} collisions, {touching}"),
         ("map", f"wall IoU {'-' if iou is None else f'{iou:.3f}'}; ATE {ate:.1f} cm"),
         *(
-            (f"robot {robot['robot']}", f"{robot['path_length_m']:.1f} m, {robot['collisions']} collisions, own map "
-             f"{100.0 * robot['coverage']:.1f} %, saw {100.0 * robot['first_share']:.1f} % first")
+            (f"robot {robot['robot']}", f"{robot['path_length_m']:.1f} m, {robot['collisions']} collisions, own "
+             f"map {100.0 * robot['coverage']:.1f} %, saw {100.0 * robot['first_share']:.1f} % first")
             for robot in metrics["per_robot"]
         ),
         ("files", files),

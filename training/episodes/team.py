@@ -137,7 +137,8 @@ def prepare(
         files = [*FILES, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
         world, run, plan = asked_for(
             out=out, files=files, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed,
-            floor_plan=floor_plan, start=start, config=config, max_steps=max_steps, coverage_target=coverage_target,
+            floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,
+            coverage_target=coverage_target,
         )  # fmt: skip
         if run.get("start") is not None:
             plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)

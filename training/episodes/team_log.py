@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from mecanum_env.episode import score_map
 from mecanum_env.team.team import Team
-from slam.geometry import compose, inverse
 from slam.metrics import measures
 from slam.teams.merged_grid import Chart, MergedGrid
 
-__all__ = ["TeamLog", "frames_in_first", "team_map", "team_metrics"]
+__all__ = ["TeamLog", "team_map", "team_metrics"]
 
 Array = NDArray[np.float64]
 
@@ -90,12 +89,6 @@ class TeamLog:
         return np.asarray(self._first / max(self._first.sum(), 1.0))
 
 
-def frames_in_first(team: Team) -> list[Array]:
-    """Return the true poses ``(3,)`` of the frames of the robots' beliefs in that of the first robot."""
-    back = inverse(team.ground.start)
-    return [compose(back, member.truth.ground.start) for member in team.members]
-
-
 def team_map(team: Team) -> tuple[MergedGrid, list[int]]:
     """Return the robots' own maps put together in the first one's frame, and the robots that are in it.
 
@@ -120,7 +113,7 @@ def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
     merged, together = team_map(team)
     first = team.members[0]
     score = score_map(first.truth.ground, first.backend.belief.in_team(merged, ()))
-    robots = [dict(member.episode_metrics()) for member in team.members]
+    robots: list[dict[str, Any]] = [dict(member.episode_metrics()) for member in team.members]
     sums = {name: sum(robot[name] for robot in robots) for name in _SUMS}
     means = {name: _mean([robot[name] for robot in robots]) for name in _MEANS}
     corners = [robot["corner_max_m"] for robot in robots if robot["corner_max_m"] is not None]
@@ -145,7 +138,7 @@ def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
         **{name: means[name] for name in _MEANS[1:]},
         **{name: sums[name] for name in _SUMS[2:]},
     }
-    extra = zip(team.members, log.first_shares.tolist(), frames_in_first(team), strict=True)
+    extra = zip(team.members, log.first_shares.tolist(), team.frames, strict=True)
     found["per_robot"] = [
         {"robot": k, "first_share": share, "robot_collisions": member.truth.world.robot_collisions,
          "frame": [round(float(v), 9) for v in frame], **robot}

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
 
 __all__ = [
-    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out", "Ray",
-    "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts", "Workers", "whole_numbers",
-    "workers_of",
+    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out",
+    "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts",
+    "UnknownStarts", "Workers", "refuse_team_options", "whole_numbers", "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
@@ -47,6 +47,9 @@ Ray = Annotated[
         "command; also without an address, unless RAY_ADDRESS has one). See docs/how-to/cluster.md.",
     ),
 ]
+Range = Annotated[
+    float | None, typer.Option("--range", help="How far robots hear each other in the open, m.  [default: 10]")
+]
 Robot = Annotated[str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")]
 Rooms = Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")]
 RoomSeed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
@@ -59,6 +62,7 @@ Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invaria
 Starts = Annotated[
     str | None, typer.Option(help="Where several robots start: together or scattered.  [default: together]")
 ]
+UnknownStarts = Annotated[bool, typer.Option("--unknown-starts", help="No robot knows where the others start.")]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
 
 
@@ -92,3 +96,16 @@ def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
         if low <= numbers[0] and numbers[-1] <= high:
             return numbers
     raise BadInput(f"{option} {text!r} must be whole numbers in {low} … {high}, for instance 25,50,100")
+
+
+def refuse_team_options(
+    *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool
+) -> None:
+    """Raise :class:`BadInput` for an option of several robots where there is one."""
+    given = {
+        "--communication": communication, "--range": range_m, "--starts": starts,
+        "--unknown-starts": unknown_starts or None,
+    }  # fmt: skip
+    for name, value in given.items():
+        if value is not None:
+            raise BadInput(f"{name} is for several robots; give --robots 2 or more")

@@ -58,7 +58,8 @@ def write_episode(
 def leftovers(out: Path, kept: Collection[str]) -> list[str]:
     """Return the files in a folder that episodes write, of one robot or of a team, but for those ``kept``."""
     known = {*FILES, *EXTRAS.values(), *TEAM_FILES}
-    return [p.name for p in out.glob("*") if p.name not in kept and (p.name in known or ROBOT_FILE.fullmatch(p.name))]
+    names = {path.name for path in out.glob("*")} - set(kept)
+    return sorted(name for name in names if name in known or ROBOT_FILE.fullmatch(name))
 
 
 class PeriodicSaver:

@@ -40,7 +40,8 @@ __all__ = [
 ]  # fmt: skip
 
 _ASSETS = Path(__file__).parent / "assets"
-_SCRIPTS = ("recording.js", "plan_canvas.js", "curves.js", "episode.js", "player.js")  # the last puts the others to work
+# The last puts the others to work.
+_SCRIPTS = ("recording.js", "plan_canvas.js", "curves.js", "episode.js", "player.js")
 TRUTH_PX = 1400  # of the true plan's longer side
 _MOST_SCANS, _MOST_LANDMARKS = 3000, 240  # notes that are shown: longer episodes show every second, third, …
 _RANGE_STEPS = 252  # a range is told in so many parts of the lidar's reach …
@@ -113,7 +114,7 @@ def filled(template: str, header: Mapping[str, Any], arrays: Arrays, parts: Mapp
 
 
 def pack(recording: Recording, *, robots: int = 1) -> tuple[dict[str, Any], Arrays]:
-    """Return what the page replays: a header that JSON can hold, and arrays of numbers; fewer where for many robots.
+    """Return what a page of so many robots replays of one: a header that JSON can hold, and arrays of numbers.
 
     ``header["arrays"]`` lists name, type and length of the arrays in their order. What was noted now and then has
     its steps in ``*_step`` and how many values belong to each in ``*_count``.

@@ -1,4 +1,4 @@
-"""What a team's episode leaves behind: the map of all, each robot's trajectories, map and landmarks, the report."""
+"""What a team's episode leaves behind: the map of all, each robot's trajectories, map, landmarks; its report."""
 
 from __future__ import annotations
 
@@ -61,7 +61,8 @@ def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recordi
     page = team_page(
         episode, recordings, metrics=metrics, config=config,
         title=f"{place_of(episode)}: {team.team.robots} robots, {who} on {episode.config.slam}",
-        ending=f"{episode.end}: {ENDINGS[episode.end]}", command="mecanum explore --config config.toml --out again",
+        ending=f"{episode.end}: {ENDINGS[episode.end]}",
+        command="mecanum explore --config config.toml --out again",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
     atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")

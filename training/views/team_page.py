@@ -7,13 +7,13 @@ from html import escape
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mecanum_env.team.picture import COLOURS
 from mecanum_env.views.canvas import View
 from mecanum_env.views.paint import extent_of_truth, with_margin
 from training.episodes.recording import Recording
 from training.episodes.team import TeamEpisode
-from training.episodes.team_log import frames_in_first
 from training.views.report_page import (
     TRUTH_PX,
     about_plan,
@@ -47,13 +47,13 @@ def team_page(
     """Return the page; parameters as of :func:`training.views.report_page.episode_page`."""
     team, log = episode.team, episode.log
     n = len(recordings)
-    arrays = {
+    arrays: dict[str, NDArray[Any]] = {
         "coverage": log.coverage.astype(np.float32),
         "collisions": np.minimum(log.collisions, 65535).astype(np.uint16),
         "group": log.groups.astype(np.uint8),
     }
     robots = []
-    for k, (recording, frame) in enumerate(zip(recordings, frames_in_first(team), strict=True)):
+    for k, (recording, frame) in enumerate(zip(recordings, team.frames, strict=True)):
         header, own = pack(recording, robots=n)
         header["arrays"] = [[f"{k}.{name}", kind, size] for name, kind, size in header["arrays"]]
         arrays |= {f"{k}.{name}": values for name, values in own.items()}
