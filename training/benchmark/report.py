@@ -14,8 +14,7 @@ from slam.formats import atomic_write
 from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
 from training.benchmark.output import Entry, Report, centres
-from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent
-from training.benchmark.team_chart import scaling_chart
+from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent, scaling_charts
 from training.benchmark.team_figures import scaling_table
 from training.episodes.explore import ENDINGS
 from training.episodes.known_map import NAME as KNOWN_MAP
@@ -157,10 +156,10 @@ def _teams(report: Report, suite: str) -> str:
     legend = "".join(f"<span>{_key(k)}{escape(s.name)}</span>" for k, s in enumerate(scalings))
     return (
         "<h3>Several robots</h3>"
-        '<p class="soft">Time until the team has mapped 95 %, with its interval; dashed, the time of one robot '
-        "over their number. Against one robot: on the same episodes. A contact of two robots counts for both. "
-        "NEES / 3 is over all robots.</p>"
-        f'<nav>{legend}</nav><div class="charts">{scaling_chart(scalings)}</div>'
+        '<p class="soft">Time until the team has mapped 95 %, with its interval; dashed, what there would be if '
+        "so many robots were so many times as fast. Against one robot: on the same episodes. A contact of two robots "
+        "counts for both. NEES / 3 is over all robots.</p>"
+        f'<nav>{legend}</nav><div class="charts">{scaling_charts(scalings)}</div>'
         + tables.html(scaling_table(scalings))
     )
 

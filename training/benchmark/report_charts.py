@@ -1,8 +1,9 @@
-"""Coverage curves over many episodes, as SVG that takes its colours from the page."""
+"""Coverage curves over many episodes, and what more robots bring, as SVG that takes its colours from the page."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Literal
@@ -12,11 +13,14 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from training.benchmark.figures import Group
+from training.benchmark.team_figures import Scaling
+from training.figures.statistics import Interval
 
-__all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent"]
+__all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts"]
 
 Array = NDArray[np.float64]
 Along = Literal["time_s", "path_length_m"]
+Line = tuple[str, list[tuple[int, Interval]]]  # name, and its figure for each number of robots
 
 COLOURS = 8
 """Colours that the page has (``--c0``, …); beyond them the lines are dashed."""
@@ -26,6 +30,7 @@ _CURVES = {"time_s": "coverage_by_time", "path_length_m": "coverage_by_path"}
 _LABELS = {"time_s": "time [s]", "path_length_m": "way [m]"}
 _WIDTH, _HEIGHT = 480, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 24, 40  # margins
+_APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,3 +126,75 @@ def _polyline(x: Array, y: Array, last: float) -> str:
 
 def _outline(b: Band, last: float) -> str:
     return f"M{_polyline(b.x, b.high, last)}L{_polyline(b.x[::-1], b.low[::-1], last)}Z"
+
+
+# ---- several robots --------------------------------------------------------------------------------------------
+
+
+def scaling_charts(scalings: Sequence[Scaling]) -> str:
+    """Return two ``<svg>`` elements: the times with their intervals, and how many times as fast as one robot.
+
+    Dashed is what there would be if so many robots were so many times as fast.
+    """
+    times: list[Line] = [(s.name, list(zip(s.robots, s.time, strict=True))) for s in scalings]
+    gains: list[Line] = [
+        (s.name, [(n, _gain(n, ratio)) for n, ratio in zip(s.robots, s.ratio, strict=True)]) for s in scalings
+    ]
+    return _scaling_chart(times, "time to 95 % [s]", lambda first, n: first / n) + _scaling_chart(
+        gains, "times as fast as one robot", lambda _, n: float(n)
+    )
+
+
+def _gain(robots: int, ratio: Interval) -> Interval:
+    if robots == 1:
+        return Interval(1.0, math.nan, math.nan)
+    return Interval(*(1.0 / share if share > 0 else math.nan for share in (ratio.value, ratio.high, ratio.low)))
+
+
+def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, int], float]) -> str:
+    """Return a chart of lines; ``ideal`` gives the dashed one, from a line's figure for one robot."""
+    known = [(name, [(n, f) for n, f in line if math.isfinite(f.value)]) for name, line in lines]
+    counts = sorted({n for _, line in lines for n, _ in line})
+    values = [v for _, line in known for _, f in line for v in (f.value, f.high) if math.isfinite(v)]
+    ticks = np.asarray(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, max(values, default=1.0)))
+    top, right, bottom = float(ticks[-1]), _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+
+    def at(robots: int, value: float, k: float) -> tuple[float, float]:
+        x = _LEFT + 24 + (robots - 1) / max(counts[-1] - 1, 1) * (right - _LEFT - 48)
+        y = bottom - value / top * (bottom - _TOP)
+        return round(x + _APART * (k - 0.5 * (len(lines) - 1)), 1), round(y, 1)
+
+    def path(points: Sequence[tuple[float, float]]) -> str:
+        return "M" + "L".join(f"{x} {y}" for x, y in points)
+
+    names = ", ".join(name for name, _ in lines)
+    parts = [
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
+        f'aria-label="{escape(label)} against the number of robots: {escape(names)}">'
+    ]
+    for tick in ticks.tolist():
+        _, y = at(1, tick, 0)
+        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y}" y2="{y}"/>')
+        parts.append(f'<text class="tick" x="{_LEFT - 6}" y="{y + 4}" text-anchor="end">{tick:g}</text>')
+    for n in counts:
+        x, _ = at(n, 0.0, 0.5 * (len(lines) - 1))
+        parts.append(f'<text class="tick" x="{x}" y="{bottom + 16}" text-anchor="middle">{n}</text>')
+    for k, (name, line) in enumerate(known):
+        kind = f"line c{k % COLOURS}"
+        if line and line[0][0] == 1:
+            shares = [(n, ideal(line[0][1].value, n)) for n in range(1, counts[-1] + 1)]
+            points = [at(n, share, k) for n, share in shares if share <= top]
+            parts.append(f'<path class="{kind} dashed" style="stroke-width: 1; opacity: .6" d="{path(points)}"/>')
+        if line:
+            points = [at(n, f.value, k) for n, f in line]
+            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{escape(name)}</title></path>')
+        for n, f in line:
+            if math.isfinite(f.low) and math.isfinite(f.high):
+                limits = path([at(n, f.low, k), at(n, f.high, k)])
+                parts.append(f'<path class="{kind}" style="stroke-width: 1.2" d="{limits}"/>')
+            x, y = at(n, f.value, k)
+            parts.append(f'<circle class="{kind}" style="fill: var(--c)" cx="{x}" cy="{y}" r="2.5"/>')
+    parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{escape(label)}</text>')
+    centre = 0.5 * (_LEFT + right)
+    parts.append(f'<text class="label" x="{centre}" y="{_HEIGHT - 6}" text-anchor="middle">robots</text>')
+    return "".join([*parts, "</svg>"])

@@ -24,7 +24,7 @@ from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, K
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import SPLITS, Place, Suite
-from training.benchmark.team_episode import TeamJob, run_any_job
+from training.benchmark.team_episode import TeamJob, run_job
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.episodes.known_map import KnownMap
@@ -189,7 +189,7 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
 
         # Even one worker is a process of its own: the libraries' threads, and with them the roundings, are the
         # same in any number of workers.
-        run_all(missing, run_any_job, workers=workers, keep=keep, what="episodes", apart=True)
+        run_all(missing, run_job, workers=workers, keep=keep, what="episodes", apart=True)
         groups = _groups(plan, store)
     report = Report.of(groups, baseline=plan.baseline, config=_described(plan))
     write_tables(out, report)

@@ -10,11 +10,24 @@ import numpy as np
 
 from mecanum_env.rooms import load
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES
+from mecanum_env.team.config import TeamConfig
 from slam.settings import unknown_name
+from training.episodes.team import read_team
 from training.runs.errors import BadInput, bad_input
+from training.runs.options import refuse_team_options, whole_numbers
 from training.runs.provenance import short_digest
 
-__all__ = ["FLOOR_PLANS", "SLIPPERY", "SPLITS", "Place", "Suite", "choose", "names", "read_floor_plans"]
+__all__ = [
+    "FLOOR_PLANS",
+    "SLIPPERY",
+    "SPLITS",
+    "Place",
+    "Suite",
+    "choose",
+    "names",
+    "read_floor_plans",
+    "teams_of",
+]
 
 SPLITS: dict[str, range] = {
     "train": range(0, 1000),
@@ -131,3 +144,26 @@ def _make(name: str, plans: tuple[Place, ...]) -> Suite:
     noise = "nominal" if base == name else "slippery"
     places = plans if base == FLOOR_PLANS else (Place(name=_ROOMS[base], rooms=_ROOMS[base]),)
     return Suite(name=name, noise=noise, places=places)
+
+
+def teams_of(
+    robots: str, *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool
+) -> tuple[TeamConfig | None, ...]:
+    """Return the teams of ``--robots 1,2,3`` and ``--communication range,none``; None is one robot alone."""
+    counts = whole_numbers("--robots", robots, low=1, high=64)
+    if counts == [1]:
+        refuse_team_options(
+            communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+        )
+    words = [None] if communication is None else list(dict.fromkeys(map(str.strip, communication.split(","))))
+    found: list[TeamConfig | None] = [None] if 1 in counts else []
+    for count in counts:
+        found += [
+            read_team(None, {
+                "robots": count, "communication": {"model": word, "range_m": range_m}, "starts": starts,
+                "known_starts": False if unknown_starts else None,
+            })
+            for word in words
+            if count > 1
+        ]  # fmt: skip
+    return tuple(found)

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.picture import draw_maps
 from slam.metrics.measures import ate_aligned
-from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key, resampled, run_job
+from training.benchmark import episode as single
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key, resampled
 from training.episodes.team import TeamEpisode, prepare, run
 from training.runs.errors import one_line
 from training.runs.running import plain
 
-__all__ = ["TeamJob", "run_any_job", "run_team_job"]
+__all__ = ["TeamJob", "run_job"]
 
 Array = NDArray[np.float64]
 
@@ -43,27 +44,20 @@ class TeamJob(EpisodeJob):
         )  # fmt: skip
 
 
-def run_any_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
-    """Run one episode, of one robot or of a team; see :func:`training.benchmark.episode.run_job`."""
-    return run_team_job(job) if isinstance(job, TeamJob) else run_job(job)
+def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
+    """Run one episode, of one robot or of a team; as :func:`training.benchmark.episode.run_job`."""
+    return _run_team(job) if isinstance(job, TeamJob) else single.run_job(job)
 
 
-def run_team_job(job: TeamJob) -> EpisodeRow | EpisodeFailure:
-    """Run one episode of a team; an error in it is returned, so that the other episodes go on.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        On Ctrl-C: half an episode is no row.
-    """
+def _run_team(job: TeamJob) -> EpisodeRow | EpisodeFailure:
     try:
         # Nothing is written there.
-        episode = prepare(
+        team_episode = prepare(
             job.team, out=Path(tempfile.gettempdir()), agent=job.agent, rooms=job.rooms, slam=job.slam,
             noise=job.noise, seed=job.seed, floor_plan=job.floor_plan, max_steps=job.max_steps,
         )  # fmt: skip
-        run(episode, lambda **_: None)
-        row = None if episode.interrupted else _row(episode)
+        run(team_episode, lambda **_: None)
+        row = None if team_episode.interrupted else _row(team_episode)
     except Exception as error:
         return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
     if row is None:

@@ -69,9 +69,8 @@ def _touching(group: Group) -> Interval:
     if group.robots == 1:
         return NONE
     rows = [row.metrics for row in group.rows]
-    contacts, ways = (
-        np.array([row[name] for row in rows], float) for name in ("robot_collisions", "path_length_m")
-    )
+    contacts = np.array([row["robot_collisions"] for row in rows], float)
+    ways = np.array([row["path_length_m"] for row in rows], float)
     return ratio_of_sums(100.0 * contacts, ways, group.strata)
 
 

@@ -111,7 +111,7 @@ def benchmark(
     from training.benchmark.output import as_json as as_mapping
     from training.benchmark.parquet import require, write_parquet
     from training.benchmark.report import write_report
-    from training.benchmark.teams import teams_of
+    from training.benchmark.suites import teams_of
 
     plan = task.BenchmarkPlan.parse(
         suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
