@@ -159,11 +159,10 @@ def teams_of(
     found: list[TeamConfig | None] = [None] if 1 in counts else []
     for count in counts:
         found += [
-            read_team(None, {
-                "robots": count, "communication": {"model": word, "range_m": range_m}, "starts": starts,
-                "known_starts": False if unknown_starts else None,
-            })
+            read_team(
+                robots=count, communication=word, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+            )
             for word in words
             if count > 1
-        ]  # fmt: skip
+        ]
     return tuple(found)

@@ -83,10 +83,10 @@ def explore(
     }  # fmt: skip
     from training.episodes.team import read_team
 
-    team = read_team(config, {
-        "robots": robots, "communication": {"model": communication, "range_m": range_m}, "starts": starts,
-        "known_starts": False if unknown_starts else None,
-    })  # fmt: skip
+    team = read_team(
+        config, robots=robots, communication=communication, range_m=range_m, starts=starts,
+        unknown_starts=unknown_starts,
+    )  # fmt: skip
     if team.robots > 1:
         single = {"--video-substeps": video_substeps, "--mcap": mcap, "--rerun": rerun}
         _refuse([name for name, wanted in single.items() if wanted], "is for one robot; leave it out")

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Timer
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -30,6 +30,13 @@ def play(
     robot: opt.Robot = None,
     noise: opt.Noise = None,
     speed: Annotated[float, typer.Option(help="Times true speed, which is 10 steps a second.")] = 1.0,
+    robots: Annotated[
+        int, typer.Option(min=1, max=64, help="How many; the first one is yours, agents drive the others.")
+    ] = 1,
+    communication: opt.Communication = None,
+    range_m: opt.Range = None,
+    starts: opt.Starts = None,
+    unknown_starts: opt.UnknownStarts = False,
     frames: Annotated[
         int | None, typer.Option(min=1, help="End after so many steps.  [default: when you quit]")
     ] = None,
@@ -45,19 +52,32 @@ def play(
       mecanum play
       mecanum play --rooms cave --slam fastslam2 --seed 3
       mecanum play --agent ppo-frontier --speed 2
+      mecanum play --robots 2 --communication walls
       SDL_VIDEODRIVER=dummy mecanum play --frames 100
     """  # noqa: D301
     if not (math.isfinite(speed) and 0.01 <= speed <= 1000):
         raise BadInput(f"--speed must be from 0.01 to 1000, got {speed}")
+    from training.episodes.team import read_team
     from training.play.game import Game, open_window
     from training.play.session import Session
+    from training.play.team_session import TeamSession
 
+    team = None
+    if robots == 1:
+        opt.refuse_team_options(
+            communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+        )
+    else:
+        team = read_team(
+            robots=robots, communication=communication, range_m=range_m, starts=starts,
+            unknown_starts=unknown_starts,
+        )  # fmt: skip
     window = open_window()
     try:
         with _said_where_it_takes_long():
-            session = Session(
-                agent=agent, seed=seed, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan
-            )
+            where: dict[str, Any] = {"rooms": rooms, "slam": slam, "robot": robot, "noise": noise}
+            where |= {"agent": agent, "seed": seed, "floor_plan": floor_plan}
+            session = Session(**where) if team is None else TeamSession(team=team, **where)
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()

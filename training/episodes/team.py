@@ -93,11 +93,11 @@ class TeamEpisode:
         return {key: plain(value) for key, value in metrics.items()} | {"per_robot": robots}
 
 
-def read_team(config: Path | None, given: Mapping[str, Any]) -> TeamConfig:
-    """Return the team that a config file's [run] table names, with what is ``given`` before it.
-
-    ``given`` has settings of :class:`TeamConfig`, those of its ``communication`` as a mapping, and None for what
-    the file or the default decides.
+def read_team(
+    config: Path | None = None, *, robots: int | None = None, communication: str | None = None,
+    range_m: float | None = None, starts: str | None = None, unknown_starts: bool = False,
+) -> TeamConfig:  # fmt: skip
+    """Return the team that a config file's [run] table names, the options before it; of neither, one robot.
 
     Raises
     ------
@@ -106,16 +106,22 @@ def read_team(config: Path | None, given: Mapping[str, Any]) -> TeamConfig:
     """
     with bad_input():
         past = read_config(config, {"team": (dict,)})[1].get("team", {}) if config is not None else {}
-        settings = dict(past)
-        for name, value in given.items():
-            if isinstance(value, Mapping):
-                known = {key: v for key, v in value.items() if v is not None}
-                settings[name] = dict(settings.get(name, {})) | known
-            elif value is not None:
-                settings[name] = value
-        if "robots" not in settings:
-            settings["robots"] = 1
-        return from_mapping(TeamConfig, settings)
+        heard = {"model": communication, "range_m": range_m}
+        given = {"robots": robots, "starts": starts, "known_starts": False if unknown_starts else None}
+        settings = {"robots": 1} | past | _known(given)
+        if _known(heard):
+            settings["communication"] = dict(past.get("communication", {})) | _known(heard)
+        team = from_mapping(TeamConfig, settings)
+        if range_m is not None and team.robots > 1 and team.communication.model in ("unlimited", "none"):
+            raise ValueError(
+                f"--range {range_m:g} means nothing with --communication {team.communication.model}; "
+                "give range, line-of-sight or walls"
+            )
+        return team
+
+
+def _known(given: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def prepare(

@@ -1,5 +1,5 @@
 """``mecanum play``: a person drives.
 
-``session`` is what is played, ``controls`` what keys mean, ``picture`` what is shown, ``game`` the window and the
-pace.
+``session`` is what is played, ``team_session`` with other robots, ``controls`` what keys mean, ``picture`` what is
+shown, ``game`` the window and the pace.
 """

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.views.canvas import FLOOR, INK, PAGE, WALL, Colour, put_text, text_width
 from mecanum_env.views.paint import BELIEVED_PATH, PLANNED_PATH, UNSEEN
-from mecanum_env.views.render import FRAME_SHAPE, render_frame
+from mecanum_env.views.render import FRAME_SHAPE
 from training.play.controls import KEYS
 from training.play.session import Session
 
@@ -42,7 +42,7 @@ def play_picture(
     """
     # Drawn as OpenCV draws, blue first; the frame comes red first.
     picture = np.empty((*PICTURE_SHAPE, 3), np.uint8)
-    picture[_STRIP:] = render_frame(session.env, planned_path=session.planned_path)[:, :, ::-1]
+    picture[_STRIP:] = session.frame()[:, :, ::-1]
     _write_strip(picture[:_STRIP], session, steps_per_s)
     if show_help:
         _write_help(picture)

@@ -17,6 +17,7 @@ from mecanum_env import rooms as room_registry
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
+from mecanum_env.views.render import render_frame
 from training.episodes.explore import make_agent
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.play.controls import Command
@@ -97,6 +98,10 @@ class Session:
     def planned_path(self) -> NDArray[np.float64] | None:
         """The way ``(n, 2)`` that the agent means to go [m], where one drives."""
         return None if self.agent is None or self.agent.goal is None else self.agent.goal.path
+
+    def frame(self) -> NDArray[np.uint8]:
+        """Return the episode as it is now, as an RGB image ``(720, 1280, 3)``."""
+        return render_frame(self.env, planned_path=self.planned_path)
 
     def summary(self) -> str:
         """Return how the episode stands, in one line."""
