@@ -212,27 +212,6 @@ def test_a_recorder_is_ready_for_an_episode_of_no_step(tmp_path: Path) -> None:
 
 # ---- in a browser ----------------------------------------------------------------------------------------------
 
-BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    webdriver = pytest.importorskip("selenium.webdriver")
-    if BROWSER is None or DRIVER is None:
-        pytest.skip("needs chromium and chromedriver")
-    options = webdriver.ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in (
-        "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--disable-quic",
-        "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    ):  # fmt: skip
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    yield driver
-    driver.quit()
-
-
 def opened(browser: Any, episode: Recorded, *, at: str = "", width: int = 1280, height: int = 900) -> None:
     from selenium.webdriver.support.ui import WebDriverWait
 
