@@ -5,9 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-import shutil
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -211,6 +209,7 @@ def test_a_recorder_is_ready_for_an_episode_of_no_step(tmp_path: Path) -> None:
 
 
 # ---- in a browser ----------------------------------------------------------------------------------------------
+
 
 def opened(browser: Any, episode: Recorded, *, at: str = "", width: int = 1280, height: int = 900) -> None:
     from selenium.webdriver.support.ui import WebDriverWait
