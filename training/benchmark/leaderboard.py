@@ -23,7 +23,7 @@ __all__ = ["BEGIN", "END", "study", "tables", "update"]
 
 BEGIN, END = "<!-- leaderboard -->", "<!-- end of the leaderboard -->"
 
-_NOT_SUITES = ("comparison", "ends", "consistency", "config")
+_NOT_SUITES = ("comparison", "ends", "consistency", "config", "teams")
 _COLUMNS = (
     "time_to_95_s", "reached_95", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
     "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
