@@ -47,9 +47,9 @@ class Fleet:
     def _check_starts(self) -> None:
         for world, (body, _) in zip(self.worlds, self._bodies, strict=True):
             world.place(body)
+            self._space.reindex_shapes_for_body(body)
         for k, (body, _) in enumerate(self._bodies):
             (shape,) = body.shapes
-            shape.cache_bb()
             if self._space.shape_query(shape):
                 at = ", ".join(f"{v:.2f}" for v in self.worlds[k].pose)
                 raise FloorPlanError(f"robot {k} touches something at its start ({at}); choose another")
