@@ -65,6 +65,7 @@ class Member(ExploreEnv):
         single = cast("spaces.Dict", self.observation_space)
         self.observation_space = cast("Any", member_observation_space(single, team.robots))
         self.sightings: tuple[Sighting, ...] = ()
+        self.outlines = np.zeros((team.robots, 4, 4))  # of all bodies, as of now: see Fleet.outlines
 
     # ---- an episode ----------------------------------------------------------------------------------------
 
@@ -142,7 +143,7 @@ class Member(ExploreEnv):
         if self._team.robots == 1:
             return super()._look()
         plan, pose = self.truth.ground.plan, self.truth.world.pose
-        outlines = self._fleet.outlines()[self._others]
+        outlines = self.outlines[self._others]
         self._surfaces[len(plan.segments) :] = outlines.reshape(-1, 4)
         scan = self.lidar.scan(self._surfaces, plan.circles, pose, self._sensor_rng)
         noise = self._sighting_rng.standard_normal((len(self._others), 3))  # whatever there is to see

@@ -123,6 +123,7 @@ class Team:
         self.groups = np.zeros(team.robots, np.int64)
         for member in self.members:
             member.join(self.fleet, self.ground)
+        self._show_bodies()
         infos = [member.first_look() for member in self.members]
         self._communicate()
         self._share(infos)
@@ -162,6 +163,7 @@ class Team:
             targets[member.number] = member.wheel_targets(actions[member.number])
         before = {member.number: member.truth.world.collisions for member in active}
         self.fleet.step(targets, config.step_s, config.physics_step_s)
+        self._show_bodies()
         infos = [member.perceive(before[member.number]) for member in active]
         self._steps += 1
         self._communicate()
@@ -181,6 +183,12 @@ class Team:
         return outcomes
 
     # ---- parts of a step -----------------------------------------------------------------------------------
+
+    def _show_bodies(self) -> None:
+        """Have every robot's lidar meet the bodies where they are."""
+        bodies = self.fleet.outlines()
+        for member in self.members:
+            member.outlines = bodies
 
     def _communicate(self) -> None:
         """Have those that hear each other tell what they know."""

@@ -7,7 +7,7 @@ import pytest
 
 from mecanum_env import rooms
 from mecanum_env.config import NoiseConfig, RobotConfig
-from mecanum_env.physics.fleet import Fleet, body_outline
+from mecanum_env.physics.fleet import Fleet, outlines
 from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import World
 from mecanum_env.rooms import FloorPlan
@@ -120,7 +120,7 @@ def test_robots_do_not_start_in_each_other() -> None:
 
 
 def test_an_outline_is_the_body() -> None:
-    sides = body_outline(np.array([1.0, 2.0, np.pi / 2]), 0.6, 0.4)
+    (sides,) = outlines(np.array([(1.0, 2.0, np.pi / 2)]), np.array([(0.3, 0.2)]))
     assert np.allclose(np.hypot(*(sides[:, 2:] - sides[:, :2]).T), [0.6, 0.4, 0.6, 0.4])
     assert np.allclose(sides[:, :2].mean(axis=0), [1.0, 2.0])
     assert np.ptp(sides[:, 1]) == pytest.approx(0.6)
