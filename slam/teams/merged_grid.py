@@ -173,7 +173,7 @@ def _sum(
             if not changed:
                 continue
             for j in range(begin, end):
-                mine = 0
+                mine = np.int64(0)
                 block_i, block_j = i >> shift, j >> shift
                 if first <= j < last:
                     mine = np.int64(own[own_i, j - ahead])
