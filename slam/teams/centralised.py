@@ -111,7 +111,8 @@ class JointEkf:
         size, rows = self.members[self._active]._n, self._rows()
         cov = self._whole_cov(size)
         order = np.concatenate([np.where(rows < 3, rows, rows + size - 3), np.arange(3, size)])
-        return cov[np.ix_(order, order)]
+        whole: Array = cov[np.ix_(order, order)]
+        return whole
 
     def _whole_cov(self, n: int) -> Array:
         """Return the covariance of the first ``n`` states of the map's filter and those beside them."""
