@@ -37,7 +37,7 @@ STUDIES = {
     ),
     "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
     "team-filters": (
-        "training.studies.team_filters",
+        "training.studies.teams.filters",
         "robots that map one building: one filter for all, or one each",
     ),
     "recording-cost": ("training.studies.recording_cost", "what recording an episode takes"),

@@ -15,7 +15,7 @@ from slam.health.monitor import HealthConfig
 from slam.metrics.measures import nees_band, nees_pose
 from slam.motion import OdometryNoise, jacobians, move
 from slam.teams.centralised import JointEkf, expected_sighting, swap_robots
-from slam.types import Observations, Odometry
+from slam.types import LINE, Observations, Odometry
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
@@ -268,6 +268,28 @@ def test_two_robots_map_one_room_once() -> None:
     cov = team.joint_cov()
     assert np.linalg.eigvalsh(cov).min() > -1e-12
     assert np.trace(team.members[1].pose_cov) < 0.01 * np.trace(rough)
+
+
+def test_where_the_map_moves_all_robots_scans_move_along() -> None:
+    team = JointEkf(2, CONFIG)
+    team.reset([np.zeros(3), compose(inverse(np.array([2.0, 2.0, 0.3])), np.array([4.0, 3.0, -1.2]))])
+    rooms(team, 40, np.random.default_rng(2))
+    member = team.members[1]
+    assert not member._redraw_if_moved()
+    before, revision = [m.key_scans.poses for m in team.members], team.grid.revision
+    for mark, point in zip(member._book.marks, member._points, strict=True):  # the map moves by 0.1 m along x
+        if mark[0] == LINE:
+            point[1] += 0.1 * math.cos(point[0])
+        else:
+            point[0] += 0.1
+    assert member._redraw_if_moved()
+    assert team.grid.revision > revision
+    for member, poses in zip(team.members, before, strict=True):
+        assert len(poses) > 2
+        np.testing.assert_allclose(
+            member.key_scans.poses - poses, np.tile([0.1, 0, 0], (len(poses), 1)), atol=0.02
+        )
+    assert not member._redraw_if_moved()
 
 
 def test_common_landmarks_tie_robots_together() -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 
-from training.studies.team_filters import SINGLE, TEAM, explore, table
+from training.studies.teams.filters import SINGLE, TEAM, explore, table
 
 
 def test_all_filters_are_fed_alike_and_the_joint_one_is_consistent() -> None:
