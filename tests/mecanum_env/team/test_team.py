@@ -262,3 +262,31 @@ def test_members_are_environments_to_whoever_reads_them() -> None:
     team = Team(2, rooms="apartment")
     team.reset(seed=1)
     assert all(isinstance(m, ExploreEnv) for m in team.members)
+
+
+def test_a_joint_belief_is_one_map_and_all_poses() -> None:
+    errors = []
+    for seed in range(6):
+        starts = {"belief": "joint", "start_sigma_m": 0.1, "start_sigma_rad": 0.01}
+        team = Team(3, rooms="apartment", team=starts, config=ALL)
+        team.reset(seed=seed)
+        _drive(team, 30)
+        assert team.joint is not None
+        assert len({id(m.belief.grid) for m in team.members}) == 1
+        assert team.coverage_share == max(m.truth.record.coverage[-1] for m in team.members)
+        truth = np.array([m.truth.pose for m in team.members])
+        assert np.allclose(team.joint.poses, [m.belief.pose for m in team.members])
+        errors.append(np.abs(team.joint.poses - truth)[:, :2].max())
+        assert [[mate.robot for mate in m.belief.teammates] for m in team.members] == [[1, 2], [0, 2], [0, 1]]
+    # They see each other: their starts are soon known better than they were told.
+    assert np.median(errors) < 0.05
+
+
+def test_a_joint_belief_needs_to_hear_all() -> None:
+    for settings, words in (
+        ({"team": {"belief": "joint", "communication": {"model": "range"}}}, "unlimited"),
+        ({"team": {"belief": "joint", "known_starts": False}}, "known_starts"),
+        ({"team": {"belief": "joint"}, "slam": "dp-slam"}, "ekf-lines"), ({"team": {"belief": "ours"}}, "joint"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=words):
+            Team(2, **settings)
