@@ -42,6 +42,8 @@ class CompressedEkfConfig(EkfConfig):
     """EKF-SLAM with postponed updates."""
 
     leave_share: float = 0.5  # of the sensor's reach: having moved so far, the robot takes another region
+    crowd: int = 120  # landmarks: a region of more is smaller, and sooner left
+    crowd_share: float = 0.5  # ``leave_share`` of such a region, at least
     margin_m: float = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
     whole_up_to: int = 0  # landmarks: so many are one region, wherever they are
     rank_tolerance: float = (
@@ -91,6 +93,7 @@ class CompressedEkfSlam(EkfSlam):
         self._reach = 0.0  # how far the sensor sees [m]: lately, or as it says itself
         self._rank = 0  # of the covariance of near and far, lately
         self._made_for = 0.0  # that, when the region was chosen
+        self._leave_at = self.config.leave_share * self.config.margin_m  # [m] having moved so far
         self._v = aligned_zeros(0, len(self._x))  # V, its columns the map's own: zero where they are not far
 
     # ---- the filter ----------------------------------------------------------------------------------------
@@ -144,13 +147,13 @@ class CompressedEkfSlam(EkfSlam):
 
     def _settle(self, reach: float) -> None:
         """Take another region where the robot has left this one, or sees farther than it was made for."""
-        share, margin = self.config.leave_share, self.config.margin_m
+        margin = self.config.margin_m
         self._reach = max(reach, 0.95 * self._reach)
         if self.landmark_count <= self.config.whole_up_to and not len(self._far):
             return
         beyond = reach > self._made_for + margin and len(self._far) > 0
         moved = math.hypot(self._x[0] - self._centre[0], self._x[1] - self._centre[1])
-        if beyond or moved > share * max(self._made_for, margin) or self._reach < 0.5 * self._made_for:
+        if beyond or moved > self._leave_at or self._reach < 0.5 * self._made_for:
             self._choose_region(np.zeros(0, np.int64))
 
     def _choose_region(self, also: NDArray[np.int64]) -> None:
@@ -160,12 +163,23 @@ class CompressedEkfSlam(EkfSlam):
         places = np.sort(np.concatenate([self._near, self._far]))
         marks = self._map_marks[places]
         self._centre, self._made_for = (float(self._x[0]), float(self._x[1])), self._reach
-        radius = (1.0 + self.config.leave_share) * self._reach + self.config.margin_m
-        near = _distance(self._map_x[3:].reshape(-1, 2)[places], marks, *self._centre) < radius
+        distance = _distance(self._map_x[3:].reshape(-1, 2)[places], marks, *self._centre)
+        radius = self._radius(distance)
+        near = distance < radius
         near |= np.isin(self._map_ids[places], also) | (len(places) <= self.config.whole_up_to)
         self._near, self._far = places[near], places[~near]
         self._book.replace(self._map_ids[self._near], marks[near])
         self._enter()
+
+    def _radius(self, distance: Array) -> float:
+        """Return the next region's radius [m], landmarks being so far from its centre; note when to leave it."""
+        config, seen = self.config, self._reach + self.config.margin_m
+        share = config.leave_share
+        if len(distance) > config.crowd:
+            within = float(np.partition(distance, config.crowd)[config.crowd])
+            share = min(share, max(config.crowd_share, (within - seen) / max(self._reach, config.margin_m)))
+        self._leave_at = share * max(self._reach, config.margin_m)
+        return seen + share * self._reach
 
     def _leave(self) -> None:
         """Bring the whole map up to date."""
