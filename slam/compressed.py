@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import read_block, state_rows
 from slam.gaussian.lanes import aligned_zeros
-from slam.gaussian.low_rank import FEWEST_SAMPLES, factor
+from slam.gaussian.low_rank import FEWEST_SAMPLES, factor, root_of_loss
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
@@ -95,6 +95,7 @@ class CompressedEkfSlam(EkfSlam):
         self._made_for = 0.0  # that, when the region was chosen
         self._leave_at = self.config.leave_share * self.config.margin_m  # [m] having moved so far
         self._v = aligned_zeros(0, len(self._x))  # V, its columns the map's own: zero where they are not far
+        self._weights = np.zeros(0)  # squared norms of V's rows, in σ's of what is far
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -200,16 +201,14 @@ class CompressedEkfSlam(EkfSlam):
         y, v, k = self._beside, self._v, self._beside.own
         end = int(state_rows(self._far, robot=True).max()) + 1
         size = max(end, int(state_rows(self._near, robot=True).max()) + 1)
-        change = Change(
-            self._map_x.copy(), aligned_zeros(len(v), size), aligned_zeros(len(v), size),
-            np.zeros((k, max(size, len(self._map_x)))),
-        )  # fmt: skip
+        x, own, loss = self._map_x.copy(), np.zeros((k, max(size, len(self._map_x)))), aligned_zeros(0, size)
         if len(v):
-            add_combination(change.x, end, y.mean[k:], v)
-            change.left[:, :end] = v[:, :end]
-            change.right[:, :end] = product(y.cov[k:, k:], v, end)[:, :end]
-            change.own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
-        return change
+            add_combination(x, end, y.mean[k:], v)
+            root = root_of_loss(y.cov[k:, k:], self._weights, self.config.rank_tolerance)
+            loss = aligned_zeros(len(root), size)
+            loss[:, :end] = product(root, v, end)[:, :end]
+            own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
+        return Change(x, loss, -loss, own)
 
     def _cross(self, rows: int) -> Array:
         """Return the covariance ``(rows, n)`` of the region's first states with what is far; 0 with the others."""
@@ -245,7 +244,8 @@ class CompressedEkfSlam(EkfSlam):
                 np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance,
                 max(FEWEST_SAMPLES, self._rank + self._rank // 4),
             )  # fmt: skip
-            self._rank = len(v)
+            self._rank = len(v) if len(v) < len(row_sigma) else 0  # where it is not low, it may be elsewhere
+            self._weights = np.einsum("ij,ij,j->i", v[:, : len(b)], v[:, : len(b)], sigma**-2)
             self._v = aligned_zeros(len(v), rows.shape[1])
             self._v[:, b] = v[:, : len(b)]
             beside.join(u[:n].T, u[n:])
