@@ -42,7 +42,7 @@ class CompressedEkfConfig(EkfConfig):
     """EKF-SLAM with postponed updates."""
 
     leave_share: float = 0.5  # of the sensor's reach: having moved so far, the robot takes another region
-    crowd: int = 120  # landmarks: a region of more is smaller, and sooner left
+    crowd: int = 100  # landmarks: a region of more is smaller, and sooner left
     crowd_share: float = 0.5  # ``leave_share`` of such a region, at least
     margin_m: float = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
     whole_up_to: int = 0  # landmarks: so many are one region, wherever they are
@@ -240,11 +240,11 @@ class CompressedEkfSlam(EkfSlam):
             sigma = np.sqrt(np.diag(self._map_p)[b])
             own = np.sqrt(np.diag(beside.cov))
             row_sigma = np.concatenate([np.sqrt(np.diag(rows[:, a])), np.where(own > 0.0, own, 1.0)])
-            u, v = factor(
-                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance,
-                max(FEWEST_SAMPLES, self._rank + self._rank // 4),
-            )  # fmt: skip
-            self._rank = len(v) if len(v) < len(row_sigma) else 0  # where it is not low, it may be elsewhere
+            samples = max(FEWEST_SAMPLES, self._rank + self._rank // 4)
+            cross = np.vstack([rows[:, b], self._map_own[:, b]])
+            u, v = factor(cross, row_sigma, sigma, self.config.rank_tolerance, samples)
+            # Where it is high it stays so for a while: another look at one region in three.
+            self._rank = len(v) if 2 * samples <= len(cross) else self._rank // 2
             self._weights = np.einsum("ij,ij,j->i", v[:, : len(b)], v[:, : len(b)], sigma**-2)
             self._v = aligned_zeros(len(v), rows.shape[1])
             self._v[:, b] = v[:, : len(b)]
