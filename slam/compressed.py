@@ -53,6 +53,8 @@ class CompressedEkfConfig(EkfConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(0 < self.leave_share <= 10, "CompressedEkfConfig.leave_share must be in (0, 10]")
+        require(self.crowd >= 0, "CompressedEkfConfig.crowd must be ≥ 0")
+        require(self.crowd_share > 0, "CompressedEkfConfig.crowd_share must be > 0")
         require(self.margin_m >= 0, "CompressedEkfConfig.margin_m must be ≥ 0")
         require(self.whole_up_to >= 0, "CompressedEkfConfig.whole_up_to must be ≥ 0")
         require(self.rank_tolerance > 0, "CompressedEkfConfig.rank_tolerance must be > 0")
