@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +18,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.knowledge import Knowledge
 from slam.backend import Backend
-from slam.belief import Belief
+from slam.belief import Belief, Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import Scan, Sighting
@@ -181,12 +182,18 @@ class Member(ExploreEnv):
     def _observed_teammates(self) -> NDArray[np.float32]:
         out = np.zeros((self._team.robots - 1, 6), np.float32)
         x, y, theta = self._pose.tolist()
-        c, s = np.cos(theta), np.sin(theta)
-        for mate in self.belief.teammates:
-            dx, dy, turn = mate.pose[0] - x, mate.pose[1] - y, mate.pose[2] - theta
-            row = (1.0, c * dx + s * dy, c * dy - s * dx, np.cos(turn), np.sin(turn), mate.age_s)
-            out[self._others.index(mate.robot)] = np.clip(row, -_FAR, _FAR)
+        c, s = math.cos(theta), math.sin(theta)
+        for robot, pose, age_s, *_ in self._teammates():
+            mate_x, mate_y, mate_theta = pose.tolist()
+            dx, dy, turn = mate_x - x, mate_y - y, mate_theta - theta
+            ahead, aside = (min(max(v, -_FAR), _FAR) for v in (c * dx + s * dy, c * dy - s * dx))
+            out[robot - (robot > self.number)] = (
+                1.0, ahead, aside, math.cos(turn), math.sin(turn), min(age_s, _FAR)
+            )  # fmt: skip
         return out
+
+    def _teammates(self) -> tuple[Teammate, ...]:
+        return self.knowledge.teammates(self._steps * self.config.step_s)
 
     # ---- what the robot goes by ----------------------------------------------------------------------------
 
@@ -206,4 +213,4 @@ class Member(ExploreEnv):
         own = self.backend.belief
         if self._team.robots == 1:
             return own
-        return own.in_team(self.knowledge.grid, self.knowledge.teammates(self._steps * self.config.step_s))
+        return own.in_team(self.knowledge.grid, self._teammates())
