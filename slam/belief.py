@@ -83,8 +83,8 @@ class Belief:
         names = _POSTPONED[:5]
         return Belief.postponed(
             lambda: {name: getattr(self, name) for name in names}, lambda: self.landmark_cov,
-            lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid, health=self.health,
-            teammates=teammates,
+            lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid,
+            health=self.health, teammates=teammates,
         )  # fmt: skip
 
     @property

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import read_block, state_rows
 from slam.gaussian.lanes import aligned_zeros
-from slam.gaussian.low_rank import FEWEST_SAMPLES, factor
+from slam.gaussian.low_rank import FEWEST_SAMPLES, factor, root_of_loss
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
@@ -42,6 +42,8 @@ class CompressedEkfConfig(EkfConfig):
     """EKF-SLAM with postponed updates."""
 
     leave_share: float = 0.5  # of the sensor's reach: having moved so far, the robot takes another region
+    crowd: int = 100  # landmarks: a region of more is smaller, and sooner left
+    crowd_share: float = 0.5  # ``leave_share`` of such a region, at least
     margin_m: float = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
     whole_up_to: int = 0  # landmarks: so many are one region, wherever they are
     rank_tolerance: float = (
@@ -51,6 +53,8 @@ class CompressedEkfConfig(EkfConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(0 < self.leave_share <= 10, "CompressedEkfConfig.leave_share must be in (0, 10]")
+        require(self.crowd >= 0, "CompressedEkfConfig.crowd must be ≥ 0")
+        require(self.crowd_share > 0, "CompressedEkfConfig.crowd_share must be > 0")
         require(self.margin_m >= 0, "CompressedEkfConfig.margin_m must be ≥ 0")
         require(self.whole_up_to >= 0, "CompressedEkfConfig.whole_up_to must be ≥ 0")
         require(self.rank_tolerance > 0, "CompressedEkfConfig.rank_tolerance must be > 0")
@@ -91,7 +95,9 @@ class CompressedEkfSlam(EkfSlam):
         self._reach = 0.0  # how far the sensor sees [m]: lately, or as it says itself
         self._rank = 0  # of the covariance of near and far, lately
         self._made_for = 0.0  # that, when the region was chosen
+        self._leave_at = self.config.leave_share * self.config.margin_m  # [m] having moved so far
         self._v = aligned_zeros(0, len(self._x))  # V, its columns the map's own: zero where they are not far
+        self._weights = np.zeros(0)  # squared norms of V's rows, in σ's of what is far
 
     # ---- the filter ----------------------------------------------------------------------------------------
 
@@ -144,13 +150,13 @@ class CompressedEkfSlam(EkfSlam):
 
     def _settle(self, reach: float) -> None:
         """Take another region where the robot has left this one, or sees farther than it was made for."""
-        share, margin = self.config.leave_share, self.config.margin_m
+        margin = self.config.margin_m
         self._reach = max(reach, 0.95 * self._reach)
         if self.landmark_count <= self.config.whole_up_to and not len(self._far):
             return
         beyond = reach > self._made_for + margin and len(self._far) > 0
         moved = math.hypot(self._x[0] - self._centre[0], self._x[1] - self._centre[1])
-        if beyond or moved > share * max(self._made_for, margin) or self._reach < 0.5 * self._made_for:
+        if beyond or moved > self._leave_at or self._reach < 0.5 * self._made_for:
             self._choose_region(np.zeros(0, np.int64))
 
     def _choose_region(self, also: NDArray[np.int64]) -> None:
@@ -160,12 +166,23 @@ class CompressedEkfSlam(EkfSlam):
         places = np.sort(np.concatenate([self._near, self._far]))
         marks = self._map_marks[places]
         self._centre, self._made_for = (float(self._x[0]), float(self._x[1])), self._reach
-        radius = (1.0 + self.config.leave_share) * self._reach + self.config.margin_m
-        near = _distance(self._map_x[3:].reshape(-1, 2)[places], marks, *self._centre) < radius
+        distance = _distance(self._map_x[3:].reshape(-1, 2)[places], marks, *self._centre)
+        radius = self._radius(distance)
+        near = distance < radius
         near |= np.isin(self._map_ids[places], also) | (len(places) <= self.config.whole_up_to)
         self._near, self._far = places[near], places[~near]
         self._book.replace(self._map_ids[self._near], marks[near])
         self._enter()
+
+    def _radius(self, distance: Array) -> float:
+        """Return the next region's radius [m], landmarks being so far from its centre; note when to leave it."""
+        config, seen = self.config, self._reach + self.config.margin_m
+        share = config.leave_share
+        if len(distance) > config.crowd:
+            within = float(np.partition(distance, config.crowd)[config.crowd])
+            share = min(share, max(config.crowd_share, (within - seen) / max(self._reach, config.margin_m)))
+        self._leave_at = share * max(self._reach, config.margin_m)
+        return seen + share * self._reach
 
     def _leave(self) -> None:
         """Bring the whole map up to date."""
@@ -186,16 +203,14 @@ class CompressedEkfSlam(EkfSlam):
         y, v, k = self._beside, self._v, self._beside.own
         end = int(state_rows(self._far, robot=True).max()) + 1
         size = max(end, int(state_rows(self._near, robot=True).max()) + 1)
-        change = Change(
-            self._map_x.copy(), aligned_zeros(len(v), size), aligned_zeros(len(v), size),
-            np.zeros((k, max(size, len(self._map_x)))),
-        )  # fmt: skip
+        x, own, loss = self._map_x.copy(), np.zeros((k, max(size, len(self._map_x)))), aligned_zeros(0, size)
         if len(v):
-            add_combination(change.x, end, y.mean[k:], v)
-            change.left[:, :end] = v[:, :end]
-            change.right[:, :end] = product(y.cov[k:, k:], v, end)[:, :end]
-            change.own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
-        return change
+            add_combination(x, end, y.mean[k:], v)
+            root = root_of_loss(y.cov[k:, k:], self._weights, self.config.rank_tolerance)
+            loss = aligned_zeros(len(root), size)
+            loss[:, :end] = product(root, v, end)[:, :end]
+            own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
+        return Change(x, loss, -loss, own)
 
     def _cross(self, rows: int) -> Array:
         """Return the covariance ``(rows, n)`` of the region's first states with what is far; 0 with the others."""
@@ -227,11 +242,12 @@ class CompressedEkfSlam(EkfSlam):
             sigma = np.sqrt(np.diag(self._map_p)[b])
             own = np.sqrt(np.diag(beside.cov))
             row_sigma = np.concatenate([np.sqrt(np.diag(rows[:, a])), np.where(own > 0.0, own, 1.0)])
-            u, v = factor(
-                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance,
-                max(FEWEST_SAMPLES, self._rank + self._rank // 4),
-            )  # fmt: skip
-            self._rank = len(v)
+            samples = max(FEWEST_SAMPLES, self._rank + self._rank // 4)
+            cross = np.vstack([rows[:, b], self._map_own[:, b]])
+            u, v = factor(cross, row_sigma, sigma, self.config.rank_tolerance, samples)
+            # Where it is high it stays so for a while: another look at one region in three.
+            self._rank = len(v) if 2 * samples <= len(cross) else self._rank // 2
+            self._weights = np.einsum("ij,ij,j->i", v[:, : len(b)], v[:, : len(b)], sigma**-2)
             self._v = aligned_zeros(len(v), rows.shape[1])
             self._v[:, b] = v[:, : len(b)]
             beside.join(u[:n].T, u[n:])

@@ -39,7 +39,7 @@ class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
 
     leave_share: float = 1.5  # larger regions than its parent's: another one takes as long as a hundred steps
     whole_up_to: int = 300
-    rank_tolerance: float = 1e-6
+    rank_tolerance: float = 1e-8
 
     wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
 

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.physics.collisions import add_robots, build_space
 from mecanum_env.physics.world import World, divide
 from mecanum_env.rooms.floor_plan import FloorPlanError
 
-__all__ = ["Fleet", "body_outline"]
+__all__ = ["Fleet", "outlines"]
 
 Array = NDArray[np.float64]
 
@@ -41,15 +42,16 @@ class Fleet:
         self._space = build_space(self.worlds[0].plan)
         self._bodies = add_robots(self._space, robots)
         self._radii = np.array([robot.circumscribed_radius_m for robot in robots])
+        self._halves = 0.5 * np.array([(robot.length_m, robot.width_m) for robot in robots])
         self._fastest = np.array([world.fastest_m_s for world in self.worlds])
         self._check_starts()
 
     def _check_starts(self) -> None:
         for world, (body, _) in zip(self.worlds, self._bodies, strict=True):
             world.place(body)
+            self._space.reindex_shapes_for_body(body)
         for k, (body, _) in enumerate(self._bodies):
             (shape,) = body.shapes
-            shape.cache_bb()
             if self._space.shape_query(shape):
                 at = ", ".join(f"{v:.2f}" for v in self.worlds[k].pose)
                 raise FloorPlanError(f"robot {k} touches something at its start ({at}); choose another")
@@ -92,15 +94,21 @@ class Fleet:
 
     def outlines(self) -> Array:
         """Return the sides of every body ``(n, 4, 4)``: x1, y1, x2, y2 in the world frame [m]."""
-        return np.array([
-            body_outline(world.pose, world.robot.length_m, world.robot.width_m) for world in self.worlds
-        ])  # fmt: skip
+        return outlines(np.array([world.pose for world in self.worlds]), self._halves)
 
 
-def body_outline(pose: Array, length_m: float, width_m: float) -> Array:
-    """Return the four sides of a body at a pose ``(3,)`` as segments ``(4, 4)`` [m], counter-clockwise."""
-    x, y, theta = pose.tolist()
-    c, s = math.cos(theta), math.sin(theta)
-    ahead, aside = 0.5 * length_m * np.array([1, -1, -1, 1]), 0.5 * width_m * np.array([1, 1, -1, -1])
-    corners = np.column_stack([x + c * ahead - s * aside, y + s * ahead + c * aside])
-    return np.hstack([corners, np.roll(corners, -1, axis=0)])
+@njit(cache=True, nogil=True)
+def outlines(poses: Array, halves: Array) -> Array:
+    """Return the sides of bodies at poses ``(n, 3)`` as segments ``(n, 4, 4)`` [m], counter-clockwise.
+
+    ``halves`` ``(n, 2)`` [m] are half their lengths and widths.
+    """
+    out = np.empty((len(poses), 4, 4))
+    for k in range(len(poses)):
+        x, y, c, s = poses[k, 0], poses[k, 1], math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        for i, (along, across) in enumerate(((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))):
+            ahead, aside = along * halves[k, 0], across * halves[k, 1]
+            out[k, i, 0], out[k, i, 1] = x + c * ahead - s * aside, y + s * ahead + c * aside
+        for i in range(4):
+            out[k, i, 2], out[k, i, 3] = out[k, (i + 1) % 4, 0], out[k, (i + 1) % 4, 1]
+    return out

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from slam.settings import not_negative, positive, require, unknown_name
 
-__all__ = ["COMMUNICATION", "STARTS", "CommunicationConfig", "SightingConfig", "TeamConfig"]
+__all__ = ["BELIEFS", "COMMUNICATION", "STARTS", "CommunicationConfig", "SightingConfig", "TeamConfig"]
 
 STARTS = ("together", "scattered")
+BELIEFS = ("own", "joint")
 COMMUNICATION = ("unlimited", "range", "line-of-sight", "walls", "none")
 
 
@@ -59,6 +60,7 @@ class TeamConfig:
     known_starts: bool = True  # every robot knows where the others start; else each has a frame of its own
     start_sigma_m: float = 0.0  # how far off that knowledge is, 1σ of x and of y
     start_sigma_rad: float = 0.0
+    belief: str = "own"  # each robot a filter of its own; or "joint": one over all (slam.teams.centralised)
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)
     sighting: SightingConfig = field(default_factory=SightingConfig)
 
@@ -66,4 +68,9 @@ class TeamConfig:
         require(1 <= self.robots <= 64, f"TeamConfig.robots must be 1 to 64, got {self.robots}")
         if self.starts not in STARTS:
             raise unknown_name("way to start", self.starts, STARTS)
+        if self.belief not in BELIEFS:
+            raise unknown_name("belief of a team", self.belief, BELIEFS)
         not_negative(self, "start_sigma_m", "start_sigma_rad")
+        joint = self.belief == "joint"
+        all_known = self.known_starts and self.communication.model == "unlimited"
+        require(not joint or all_known, "TeamConfig.belief joint needs known_starts and unlimited communication")

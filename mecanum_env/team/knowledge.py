@@ -62,13 +62,14 @@ class Knowledge:
         if frame_known and team.known_starts:
             self.frames = {k: None for k in range(team.robots) if k != robot}
         self._chart: tuple[float, Chart | None] = (-math.inf, None)
-        self._grid = MergedGrid(backend.grid)
+        self._grid = None if team.belief == "joint" else MergedGrid(backend.grid)
 
     # ---- telling -------------------------------------------------------------------------------------------
 
     def chart_now(self, time_s: float) -> None:
         """Copy the own map, to be told from now on."""
-        self._chart = time_s, Chart.of(self._backend.grid)
+        if self._grid is not None:
+            self._chart = time_s, Chart.of(self._backend.grid)
 
     def report(self, time_s: float) -> Report:
         """Return what this robot tells of itself."""
@@ -95,6 +96,7 @@ class Knowledge:
 
     def merge(self) -> None:
         """Put the charts that were heard into the map."""
+        assert self._grid is not None  # else nobody has a chart to tell of
         self._grid.take({
             robot: (report.chart, self.frames[robot])
             for robot, report in self.heard.items()
@@ -105,7 +107,9 @@ class Knowledge:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The own map and the others', as far as was heard."""
+        """The own map and the others', as far as was heard; the one of a joint belief."""
+        if self._grid is None:
+            return self._backend.grid
         self._grid.follow()
         return self._grid
 

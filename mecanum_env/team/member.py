@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
@@ -13,11 +14,11 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation
 from mecanum_env.physics.fleet import Fleet
-from mecanum_env.physics.floor import Floor
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.knowledge import Knowledge
-from slam.belief import Belief
+from slam.backend import Backend
+from slam.belief import Belief, Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import Scan, Sighting
@@ -27,6 +28,7 @@ __all__ = ["Member", "member_observation_space"]
 Array = NDArray[np.float64]
 
 _NO_CIRCLES = np.zeros((0, 3))
+_LEAST_SIGMA = 1e-4  # [m, rad]: never exactly zero
 _FAR = 1e3  # [m, s] bound of what is observed of teammates
 
 
@@ -55,39 +57,49 @@ class Member(ExploreEnv):
         As in :class:`ExploreEnv`.
     config : EnvConfig
         Everything else.
+    backend : Backend, optional
+        Its part of a joint filter, which its team starts; else it has one of its own.
     """
 
     knowledge: Knowledge
+    start: Array
+    """Where it believes that it starts ``(3,)``, in its belief's frame."""
+    start_cov: Array | None
 
-    def __init__(self, number: int, team: TeamConfig, *, action: str, config: EnvConfig) -> None:
+    def __init__(
+        self, number: int, team: TeamConfig, *, action: str, config: EnvConfig, backend: Backend | None = None
+    ) -> None:
         super().__init__(action=action, config=config)
-        self.number, self._team = number, team
+        self.number, self._team, self.joint = number, team, backend is not None
+        if backend is not None:
+            self.backend = backend
         single = cast("spaces.Dict", self.observation_space)
         self.observation_space = cast("Any", member_observation_space(single, team.robots))
         self.sightings: tuple[Sighting, ...] = ()
+        self.outlines = np.zeros((team.robots, 4, 4))  # of all bodies, as of now: see Fleet.outlines
 
     # ---- an episode ----------------------------------------------------------------------------------------
 
     def place(
-        self, plan: FloorPlan, seed: int, *, floor: Floor | None, ground: GroundTruth | None,
-        start_error: Array, step_limit: int,
-    ) -> None:  # fmt: skip
+        self, plan: FloorPlan, seed: int, *, first: Member | None, start_error: Array, step_limit: int
+    ) -> None:
         """Put the robot at the plan's start.
 
         Parameters
         ----------
-        floor, ground : optional
-            Of the first robot, where they are shared: the floor that all stand on, and the truth in the frame
-            that all beliefs are in.
+        first : Member, optional
+            The team's first robot: its floor all stand on, its frame beliefs are in where starts are known.
         start_error : Array
             ``(3,)`` by which the start is believed to be elsewhere [m, m, rad].
         step_limit : int
             Steps of the episode.
         """
-        self._shared_ground, self._start_error = ground, start_error
-        self._step_limit = step_limit
-        self.sightings = ()
-        self._set_up(plan, seed, floor)
+        known = first is not None and self._team.known_starts
+        self._shared_ground = first.truth.ground if first is not None and known else None
+        self._start_error, self._step_limit, self.sightings = start_error, step_limit, ()
+        self._set_up(plan, seed, None if first is None else first.truth.world.floor)
+        if first is not None and self.joint:
+            self._coverage = first.own_coverage  # of the one grid
         self._sighting_rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
 
     def join(self, fleet: Fleet, ground: GroundTruth) -> None:
@@ -124,13 +136,14 @@ class Member(ExploreEnv):
 
     def _start_backend(self, start: Array, seed: int) -> None:
         team = self._team
-        if self._shared_ground is None or not (team.start_sigma_m or team.start_sigma_rad):
-            super()._start_backend(start, seed)
-            return
-        believed = start + self._start_error
-        believed[2] = wrap_scalar(believed[2])
-        sigmas = np.maximum((team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad), 1e-4)
-        self.backend.reset(believed, pose_cov=np.diag(np.square(sigmas)), seed=seed)
+        self.start, self.start_cov = start, None
+        if self._shared_ground is not None and (team.start_sigma_m or team.start_sigma_rad):
+            self.start = start + self._start_error
+            self.start[2] = wrap_scalar(self.start[2])
+            sigmas = np.maximum((team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad), _LEAST_SIGMA)
+            self.start_cov = np.diag(np.square(sigmas))
+        if not self.joint:  # else all start together
+            self.backend.reset(self.start, pose_cov=self.start_cov, seed=seed)
 
     # ---- the others ----------------------------------------------------------------------------------------
 
@@ -142,7 +155,7 @@ class Member(ExploreEnv):
         if self._team.robots == 1:
             return super()._look()
         plan, pose = self.truth.ground.plan, self.truth.world.pose
-        outlines = self._fleet.outlines()[self._others]
+        outlines = self.outlines[self._others]
         self._surfaces[len(plan.segments) :] = outlines.reshape(-1, 4)
         scan = self.lidar.scan(self._surfaces, plan.circles, pose, self._sensor_rng)
         noise = self._sighting_rng.standard_normal((len(self._others), 3))  # whatever there is to see
@@ -169,12 +182,18 @@ class Member(ExploreEnv):
     def _observed_teammates(self) -> NDArray[np.float32]:
         out = np.zeros((self._team.robots - 1, 6), np.float32)
         x, y, theta = self._pose.tolist()
-        c, s = np.cos(theta), np.sin(theta)
-        for mate in self.belief.teammates:
-            dx, dy, turn = mate.pose[0] - x, mate.pose[1] - y, mate.pose[2] - theta
-            row = (1.0, c * dx + s * dy, c * dy - s * dx, np.cos(turn), np.sin(turn), mate.age_s)
-            out[self._others.index(mate.robot)] = np.clip(row, -_FAR, _FAR)
+        c, s = math.cos(theta), math.sin(theta)
+        for robot, pose, age_s, *_ in self._teammates():
+            mate_x, mate_y, mate_theta = pose.tolist()
+            dx, dy, turn = mate_x - x, mate_y - y, mate_theta - theta
+            ahead, aside = (min(max(v, -_FAR), _FAR) for v in (c * dx + s * dy, c * dy - s * dx))
+            out[robot - (robot > self.number)] = (
+                1.0, ahead, aside, math.cos(turn), math.sin(turn), min(age_s, _FAR)
+            )  # fmt: skip
         return out
+
+    def _teammates(self) -> tuple[Teammate, ...]:
+        return self.knowledge.teammates(self._steps * self.config.step_s)
 
     # ---- what the robot goes by ----------------------------------------------------------------------------
 
@@ -194,4 +213,4 @@ class Member(ExploreEnv):
         own = self.backend.belief
         if self._team.robots == 1:
             return own
-        return own.in_team(self.knowledge.grid, self.knowledge.teammates(self._steps * self.config.step_s))
+        return own.in_team(self.knowledge.grid, self._teammates())

@@ -16,18 +16,24 @@ from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
 from mecanum_env.physics.fleet import Fleet
 from mecanum_env.rooms import FloorPlan
+from mecanum_env.sensing.calibration import backend_settings
 from mecanum_env.team.communication import groups
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.coverage import TeamCoverage
 from mecanum_env.team.member import Member
 from mecanum_env.team.starts import start_poses
+from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
+from slam.metrics.chi_square import chi2_quantile
 from slam.settings import from_mapping, require, unknown_name
+from slam.teams.centralised import JointEkf
 
 __all__ = ["Outcome", "Team"]
 
 Array = NDArray[np.float64]
 
+_JOINT = "ekf-lines"
+_GATE = chi2_quantile(0.999, 3)  # of a sighting
 _OPTIONS = ("floor_plan", "start_poses", "room_seed")
 
 
@@ -78,8 +84,17 @@ class Team:
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
         self.max_steps = max_steps
+        self.joint: JointEkf | None = None
+        """The one filter of a joint belief."""
+        if self.team.belief == "joint":
+            if settings.get("slam", _JOINT) != _JOINT:
+                raise ValueError(f"a joint belief is {_JOINT} over all robots; slam must be left out or be that")
+            self.config = replace(self.config, slam=_JOINT)
+            settings_of_all = from_mapping(EkfLinesConfig, backend_settings(self.config))
+            self.joint = JointEkf(self.team.robots, settings_of_all)
+        parts = (None,) * self.team.robots if self.joint is None else self.joint.members
         self.members = tuple(
-            Member(k, self.team, action=action, config=self.config) for k in range(self.team.robots)
+            Member(k, self.team, action=action, config=self.config, backend=part) for k, part in enumerate(parts)
         )
         self._rng = np.random.default_rng()
         self.active: list[int] = []
@@ -109,12 +124,14 @@ class Team:
         first = self.members[0]
         for member, plan in zip(self.members, plans, strict=True):
             k = member.number
-            shared = k > 0 and team.known_starts
             member.place(
-                plan, seed if k == 0 else _seed_of(seed, k), floor=first.truth.world.floor if k > 0 else None,
-                ground=first.truth.ground if shared else None, start_error=sigmas * drawn[k],
-                step_limit=self.max_steps,
+                plan, seed if k == 0 else _seed_of(seed, k), first=first if k > 0 else None,
+                start_error=sigmas * drawn[k], step_limit=self.max_steps,
             )  # fmt: skip
+        if self.joint is not None:
+            exact = np.diag(np.full(3, 1e-8))
+            covs = [exact if member.start_cov is None else member.start_cov for member in self.members]
+            self.joint.reset([member.start for member in self.members], covs, seed)
         self.ground: GroundTruth = first.truth.ground
         """The truth, in the frame of the first robot's start."""
         self.fleet = Fleet([member.truth.world for member in self.members])
@@ -124,6 +141,7 @@ class Team:
         self.groups = np.zeros(team.robots, np.int64)
         for member in self.members:
             member.join(self.fleet, self.ground)
+        self._show_bodies()
         infos = [member.first_look() for member in self.members]
         self._communicate()
         self._share(infos)
@@ -163,6 +181,7 @@ class Team:
             targets[member.number] = member.wheel_targets(actions[member.number])
         before = {member.number: member.truth.world.collisions for member in active}
         self.fleet.step(targets, config.step_s, config.physics_step_s)
+        self._show_bodies()
         infos = [member.perceive(before[member.number]) for member in active]
         self._steps += 1
         self._communicate()
@@ -183,6 +202,12 @@ class Team:
 
     # ---- parts of a step -----------------------------------------------------------------------------------
 
+    def _show_bodies(self) -> None:
+        """Have every robot's lidar meet the bodies where they are."""
+        bodies = self.fleet.outlines()
+        for member in self.members:
+            member.outlines = bodies
+
     def _communicate(self) -> None:
         """Have those that hear each other tell what they know."""
         members = self.members
@@ -191,6 +216,9 @@ class Team:
         time_s = self._steps * self.config.step_s
         for member in members:
             member.knowledge.see(member.sightings, time_s)
+            if self.joint is not None:
+                for other, measured, cov in member.sightings:
+                    self.joint.members[member.number].see(other, measured, cov, gate=_GATE)
         places = np.array([member.truth.world.pose[:2] for member in members])
         self.groups = groups(self.team.communication, places, self.ground.plan.segments)
         due = self._steps % self._every == 0
@@ -213,8 +241,8 @@ class Team:
     def _share(self, infos: Sequence[dict[str, Any]]) -> None:
         """Put what is the team's into the infos of the active robots."""
         active = [self.members[k] for k in self.active]
-        if len(self.members) == 1:
-            self.coverage_share = infos[0]["coverage"]
+        if len(self.members) == 1 or self.joint is not None:
+            self.coverage_share = infos[-1]["coverage"]
         else:
             if self.coverage.each_step or self._steps % self._every == 0:
                 for member in active:

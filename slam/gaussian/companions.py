@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slam.gaussian.lanes import LANES, aligned_zeros
 from slam.gaussian.stacked_update import SPARE_ROWS, solve
-from slam.gaussian.tiles import add_combination, subtract
+from slam.gaussian.tiles import add_combination, downdate, subtract
 from slam.motion import Twist, predict_robot
 
 __all__ = ["Companions"]
@@ -30,7 +30,7 @@ class Companions:
 
     def __init__(self, observations: int, size: int, cov: Array | None = None) -> None:
         """Begin with states of a covariance ``(k, k)``, none if left out; ``size`` is the map's state's."""
-        self.cov = np.zeros((0, 0)) if cov is None else cov  # E
+        self.cov = np.zeros((0, 0)) if cov is None else cov  # E; of those appended the upper triangle
         self.own = len(self.cov)  # those that are there all along, the first ones
         self.mean = np.zeros(self.own)
         self.cross = aligned_zeros(self.own, size)  # C: of each with the robot and the landmarks
@@ -127,16 +127,16 @@ def _correct(
     solve(s, we, states, rows)
     add_combination(mean, states, s[:rows, rows], we)
     subtract(cross, states, n, we, w, rows)
-    for i in range(own):
-        for j in range(own):
-            for k in range(rows):
-                cov[i, j] -= we[k, i] * we[k, j]
     if states > own:  # they are many
-        joined = cov[own:]
-        subtract(joined, states - own, states, we[:, own:], we, rows)
+        downdate(cov, states, we, we, rows, 0)
         for i in range(own):
-            for j in range(own, states):
-                cov[i, j] = cov[j, i]
+            for j in range(i + 1, states):
+                cov[j, i] = cov[i, j]
+    else:
+        for i in range(own):
+            for j in range(own):
+                for k in range(rows):
+                    cov[i, j] -= we[k, i] * we[k, j]
     if reset:
         _reset(cross, n, w[rows : rows + SPARE_ROWS : 2])
 

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.tiles import product
 
-__all__ = ["FEWEST_SAMPLES", "factor"]
+__all__ = ["FEWEST_SAMPLES", "factor", "root_of_loss"]
 
 Array = NDArray[np.float64]
 
 FEWEST_SAMPLES = 48
 """Random sums of columns that are tried at first."""
+
+_ROUNDING = 1e-14  # what a thousand updates of a covariance leave of it
 
 
 def factor(
@@ -33,15 +35,13 @@ def factor(
     m, n = cov.shape
     scaled = aligned_zeros(m, n)
     scaled[:, :n] = cov / row_sigma[:, None]
-    basis = np.eye(m)
-    while samples < m:
+    while 2 * samples <= m:  # with more of them the factors take longer than they save
         sums = np.random.default_rng(0).standard_normal((n, samples)) / column_sigma[:, None]
-        found = _orthonormal(product(scaled[:, :n], sums, samples)[:, :samples].copy(), tolerance)
-        if found.shape[1] < samples:
-            basis = found
-            break
+        basis = _orthonormal(product(scaled[:, :n], sums, samples)[:, :samples].copy(), tolerance)
+        if basis.shape[1] < samples:
+            return row_sigma[:, None] * basis, product(basis.T, scaled, n)
         samples *= 2
-    return row_sigma[:, None] * basis, product(basis.T, scaled, n)
+    return np.diag(row_sigma), scaled
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -86,3 +86,40 @@ def _orthonormal(columns: Array, tolerance: float) -> Array:
                 columns[j, i] -= new[j] * along[i]
                 squares[i] += columns[j, i] * columns[j, i]
     return out[:, :found].copy()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def root_of_loss(cov: Array, weights: Array, tolerance: float) -> Array:
+    """Return G ``(k, r)`` with Gᵀ G = −``cov`` ``(r, r)``, which is ≤ 0, but for ``tolerance``.
+
+    That bounds what is left out of the trace, each entry times its weight ``(r,)``, or rounding does. Pivoted
+    Cholesky. k is small: all that was learnt is by way of the few landmarks seen meanwhile. Of ``cov`` the upper
+    triangle is read.
+    """
+    r = cov.shape[0]
+    root, rest = np.empty((r, r)), np.empty(r)
+    for i in range(r):
+        rest[i] = -cov[i, i]
+    enough = max(tolerance, _ROUNDING * np.sum(weights * rest))
+    found = 0
+    while found < r:
+        left, best = 0.0, 0
+        for i in range(r):
+            left += weights[i] * max(rest[i], 0.0)
+            if weights[i] * rest[i] > weights[best] * rest[best]:
+                best = i
+        if not left > enough:
+            break
+        new, pivot = root[found], np.sqrt(rest[best])
+        for i in range(r):
+            new[i] = -cov[i, best] if i < best else -cov[best, i]
+        for k in range(found):
+            along = root[k, best]
+            for i in range(r):
+                new[i] -= along * root[k, i]
+        for i in range(r):
+            new[i] /= pivot
+            rest[i] -= new[i] * new[i]
+        rest[best] = 0.0
+        found += 1
+    return root[:found].copy()

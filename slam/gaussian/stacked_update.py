@@ -20,7 +20,7 @@ from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
 
-__all__ = ["NO_LIMITS", "SPARE_ROWS", "solve", "stacked_update", "whiten", "work_space"]
+__all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "work_space"]
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def whiten(
             s[a, a + 1] += z[k, 3]
             s[a + 1, a + 1] += z[k, 4]
             a += 2
-    _cholesky(s, rows)
+    cholesky(s, rows)
     solve(s, w, n, rows)
     return rows
 
@@ -141,7 +141,7 @@ def _innovation_columns(w: Array, m: int, h: Array, a: int, s: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cholesky(s: Array, rows: int) -> None:
+def cholesky(s: Array, rows: int) -> None:
     """Factor the upper triangle S = L Lᵀ in place, and multiply the column right of it, ν, by L⁻¹."""
     for k in range(rows):
         inverse = 1.0 / math.sqrt(s[k, k])

@@ -10,6 +10,7 @@ way along a single wall, follows the scan before it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,12 +101,27 @@ class KeyScans:
         n = len(self._scans)
         return self._since_check >= n // 8 and n >= 2
 
-    def redraw_if_moved(self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64]) -> bool:
+    def redraw_if_moved(
+        self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64], others: Sequence[KeyScans] = ()
+    ) -> bool:
         """Redraw ``grid`` if a landmark's correction moved a key scan by more than half a cell; tell whether.
 
         ``landmarks`` ``(n, 2)`` are the current estimates, of points x, y and of walls α, r; ``row_of_id`` maps a
-        landmark's id to its row, or -1.
+        landmark's id to its row, or -1. ``others`` are key scans of other robots, drawn into the same grid.
         """
+        everyone = (self, *others)
+        corrected = [k._corrected(landmarks, row_of_id) for k in everyone]
+        if max(largest for _, largest in corrected) <= 0.5 * grid.resolution:
+            return False
+        for scans, (poses, _) in zip(everyone, corrected, strict=True):
+            scans._poses[: len(poses)] = poses
+            if len(poses):
+                scans._last = tuple(poses[-1].tolist())
+        grid.redraw(np.concatenate([poses for poses, _ in corrected]), [s for k in everyone for s in k._scans])
+        return True
+
+    def _corrected(self, landmarks: Array, row_of_id: NDArray[np.int64]) -> tuple[Array, float]:
+        """Return where the key scans ``(n, 3)`` should be drawn, and by how much [m] one moved most."""
         n = len(self._scans)
         self._since_check = 0
         corrected = np.empty((n, 3))
@@ -113,12 +129,7 @@ class KeyScans:
             self._poses[:n], self._anchor_ids, self._anchor_local, landmarks, row_of_id, self.config.lever_m,
             corrected,
         )  # fmt: skip
-        if largest <= 0.5 * grid.resolution:
-            return False
-        self._poses[:n] = corrected
-        self._last = tuple(corrected[-1].tolist())
-        grid.redraw(corrected, self._scans)
-        return True
+        return corrected, largest
 
     def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
         """Keep only as many scans as there are sensor poses ``(n, 3)``, the first ones, and redraw ``grid``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from slam.geometry import rotation, transform_points
 from slam.grids.occupancy import OccupancyGrid
-from slam.grids.scan_drawing import ENTROPY_BIT, MAX_LOG_ODDS, MIN_LOG_ODDS, PROBABILITY_BYTE
+from slam.grids.scan_drawing import ENTROPY_BIT, MAX_LOG_ODDS, MIN_LOG_ODDS, PROBABILITY_BYTE, WORD
 
 __all__ = ["Chart", "MergedGrid"]
 
 Array = NDArray[np.float64]
+_BLOCK = 64  # cells that are looked at together
 _Box = tuple[int, int, int, int]  # lattice rows and columns: first, first, beyond the last, beyond the last
 
 
@@ -44,6 +45,7 @@ class MergedGrid(OccupancyGrid):
         self._seen = -1  # drawings of the own grid that are in here
         self._charts: dict[int, tuple[Chart, Array | None]] = {}
         self._given = np.zeros(self.shape, np.int16)  # the others' sum, on this lattice
+        self._taken = np.zeros(self.shape, np.int8)  # what of the own grid is in here
 
     def take(self, charts: dict[int, tuple[Chart, Array | None]]) -> None:
         """Replace what other robots told.
@@ -66,7 +68,7 @@ class MergedGrid(OccupancyGrid):
         if len(rows):
             row0, col0 = self.lattice_origin
             box = (row0 + rows[0], col0 + cols[0], row0 + rows[-1] + 1, col0 + cols[-1] + 1)
-            self._merge(*(int(v) for v in box))
+            self._merge(*(int(v) for v in box), all_of_it=True)
 
     def follow(self) -> None:
         """Take over what was drawn into the own grid since the last time."""
@@ -80,7 +82,7 @@ class MergedGrid(OccupancyGrid):
         self._grow(*box)
         self._merge(*box)
 
-    def _moved(self, plane: NDArray[np.int16], lattice_origin: tuple[int, int]) -> NDArray[np.int16]:
+    def _moved(self, plane: NDArray[Any], lattice_origin: tuple[int, int]) -> NDArray[Any]:
         """Return a plane of this grid, as it was before it grew, in its present shape."""
         moved = np.zeros(self.shape, plane.dtype)
         r, c = (then - now for then, now in zip(lattice_origin, self.lattice_origin, strict=True))
@@ -92,6 +94,7 @@ class MergedGrid(OccupancyGrid):
         super()._grow(row0, col0, row1, col1)
         if (self.shape, self.lattice_origin) != before:
             self._given = self._moved(self._given, before[1])
+            self._taken = self._moved(self._taken, before[1])
 
     def _add(self, given: NDArray[np.int16], chart: Chart, frame: Array | None) -> None:
         """Add a chart to a plane of this grid; no sum of what was observed is zero."""
@@ -105,13 +108,13 @@ class MergedGrid(OccupancyGrid):
         window += cells
         window[observed & (window == 0)] = -1
 
-    def _merge(self, row0: int, col0: int, row1: int, col1: int) -> None:
+    def _merge(self, row0: int, col0: int, row1: int, col1: int, *, all_of_it: bool = False) -> None:
         """Sum up own and given cells in a box of the lattice."""
         own, r, c = self._own, *self.lattice_origin
         known, entropy = _sum(
             own.log_odds, own.visited, own.lattice_origin[0] - r, own.lattice_origin[1] - c, self._given,
-            self.log_odds, self.visited, row0 - r, col0 - c, row1 - r, col1 - c, self.overview_sums,
-            self._overview_shift,
+            self._taken, self.log_odds, self.visited, row0 - r, col0 - c, row1 - r, col1 - c, self.overview_sums,
+            self._overview_shift, all_of_it,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
@@ -147,36 +150,51 @@ def _turned(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum(
     own: NDArray[np.int8], own_visited: NDArray[np.uint8], down: int, ahead: int, given: NDArray[np.int16],
-    cells: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int, row1: int, col1: int,
-    overview: NDArray[np.int32], shift: int,
+    taken: NDArray[np.int8], cells: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int, row1: int,
+    col1: int, overview: NDArray[np.int32], shift: int, all_of_it: bool,
 ) -> tuple[int, float]:  # fmt: skip
     """Write own + given cells of a box; return by how much the known cells and the entropy went up.
 
-    ``down`` and ``ahead``: rows and columns from the first cell here to that of the own grid.
+    ``down`` and ``ahead``: rows and columns from the first cell here to that of the own grid. ``taken`` is what
+    of the own grid is in here: where it is the same still, nothing is done, unless it shall be ``all_of_it``; else
+    the box's columns begin and end at multiples of a word.
     """
+    own_words, taken_words = own.view(np.uint64), taken.view(np.uint64)
+    own_trail, trail = own_visited.view(np.uint64), visited.view(np.uint64)
     known, entropy = 0, 0.0
     for i in range(row0, row1):
         own_i = i - down
-        for j in range(col0, col1):
-            own_j = j - ahead
-            inside = 0 <= own_i < own.shape[0] and 0 <= own_j < own.shape[1]
-            mine = np.int64(own[own_i, own_j]) if inside else 0
-            total = mine + given[i, j]
-            if total == 0 and (mine != 0 or given[i, j] != 0):
-                total = -1
-            total = min(max(total, MIN_LOG_ODDS), MAX_LOG_ODDS)
-            before = np.int64(cells[i, j])
-            block_i, block_j = i >> shift, j >> shift
-            if total != before:
-                cells[i, j] = total
-                overview[1, block_i, block_j] += (PROBABILITY_BYTE[total & 255] if total != 0 else 0) - (
-                    PROBABILITY_BYTE[before & 255] if before != 0 else 0
-                )
-                entropy += ENTROPY_BIT[total & 255] - ENTROPY_BIT[before & 255]
-                gained = (total != 0) - (before != 0)
-                overview[0, block_i, block_j] += gained
-                known += gained
-            if inside and own_visited[own_i, own_j] != visited[i, j]:
-                overview[2, block_i, block_j] += np.int64(own_visited[own_i, own_j]) - np.int64(visited[i, j])
-                visited[i, j] = own_visited[own_i, own_j]
+        inside = 0 <= own_i < own.shape[0]
+        first, last = max(ahead, 0), min(ahead + own.shape[1], cells.shape[1]) if inside else 0
+        for begin in range(col0, col1, _BLOCK):
+            end = min(begin + _BLOCK, col1)
+            changed = all_of_it
+            if not all_of_it:  # a box of whole chunks: words of cells compare at once
+                for j in range(max(begin, first) // WORD, min(end, last) // WORD):
+                    changed |= own_words[own_i, j - ahead // WORD] != taken_words[i, j]
+                    changed |= own_trail[own_i, j - ahead // WORD] != trail[i, j]
+            if not changed:
+                continue
+            for j in range(begin, end):
+                mine = np.int64(0)
+                block_i, block_j = i >> shift, j >> shift
+                if first <= j < last:
+                    mine = np.int64(own[own_i, j - ahead])
+                    taken[i, j] = mine
+                    overview[2, block_i, block_j] += np.int64(own_visited[own_i, j - ahead]) - visited[i, j]
+                    visited[i, j] = own_visited[own_i, j - ahead]
+                total = mine + given[i, j]
+                if total == 0 and (mine != 0 or given[i, j] != 0):
+                    total = -1
+                total = min(max(total, MIN_LOG_ODDS), MAX_LOG_ODDS)
+                before = np.int64(cells[i, j])
+                if total != before:
+                    cells[i, j] = total
+                    overview[1, block_i, block_j] += (PROBABILITY_BYTE[total & 255] if total != 0 else 0) - (
+                        PROBABILITY_BYTE[before & 255] if before != 0 else 0
+                    )
+                    entropy += ENTROPY_BIT[total & 255] - ENTROPY_BIT[before & 255]
+                    gained = (total != 0) - (before != 0)
+                    overview[0, block_i, block_j] += gained
+                    known += gained
     return known, entropy

@@ -115,6 +115,27 @@ def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
     compare(full.belief, compressed.belief)
 
 
+def test_a_crowded_region_is_smaller() -> None:
+    """It has as many landmarks as are a crowd, and is left the sooner."""
+    landmarks = grove(5, 240)
+    wide = {"leave_share": 1.5, "crowd_share": 0.2}
+    full = slam.make("ekf")
+    crowds = [slam.make("compressed-ekf", config={**wide, "crowd": crowd}) for crowd in (1000, 90, 10)]
+    most, regions = np.zeros(3, int), np.zeros(3, int)
+    centres = [(0.0, 0.0)] * 3
+    for k, _ in enumerate(through_the_grove(landmarks, (full, *crowds), 5, 200, turn_at=100)):
+        for i, backend in enumerate(crowds):
+            assert isinstance(backend, CompressedEkfSlam)
+            regions[i] += backend._centre != centres[i]
+            centres[i] = backend._centre
+            if k > 150:  # before that it still grew, by what was new
+                most[i] = max(most[i], backend._book.count)
+    assert most[0] > most[1] > most[2] and regions[0] < regions[1] < regions[2]
+    assert most[1] <= 90
+    for backend in crowds:
+        compare(full.belief, backend.belief)
+
+
 LASTING = {
     "odometry": {
         "speed_share": 0.05,

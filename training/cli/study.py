@@ -36,6 +36,10 @@ STUDIES = {
         "faults made mid-episode: is the belief lost, does it know, is it found again?",
     ),
     "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
+    "team-filters": (
+        "training.studies.teams.filters",
+        "robots that map one building: one filter for all, or one each",
+    ),
     "recording-cost": ("training.studies.recording_cost", "what recording an episode takes"),
 }
 """Name → the module whose function ``study`` it is, and a line for the list."""

@@ -149,6 +149,7 @@ def prepare(
         if run.get("start") is not None:
             plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)
         robots = Team(team=team, config=replace(world, coverage_target=1.0), max_steps=run["max_steps"])
+        world = replace(world, slam=robots.config.slam)  # a joint belief has one of its own
         found = robots.reset(seed=run["seed"], options={"floor_plan": plan})
         explorers = tuple(make_agent(run["agent"], member) for member in robots.members)
         for k, (explorer, member) in enumerate(zip(explorers, robots.members, strict=True)):

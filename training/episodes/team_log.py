@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from mecanum_env.episode import score_map
 from mecanum_env.team.team import Team
+from slam.grids.occupancy import OccupancyGrid
 from slam.metrics import measures
 from slam.teams.merged_grid import Chart, MergedGrid
 
@@ -89,12 +90,14 @@ class TeamLog:
         return np.asarray(self._first / max(self._first.sum(), 1.0))
 
 
-def team_map(team: Team) -> tuple[MergedGrid, list[int]]:
+def team_map(team: Team) -> tuple[OccupancyGrid, list[int]]:
     """Return the robots' own maps put together in the first one's frame, and the robots that are in it.
 
-    Left out are those of whom the first does not know where their frame is.
+    Left out are those of whom the first does not know where their frame is. A joint belief has one map.
     """
     first, *others = team.members
+    if team.joint is not None:
+        return first.grid, list(range(len(team.members)))
     frames = first.knowledge.frames
     known = [member for member in others if member.number in frames]
     merged = MergedGrid(first.backend.grid)

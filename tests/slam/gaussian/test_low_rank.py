@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from slam.gaussian.low_rank import factor
+from slam.gaussian.low_rank import factor, root_of_loss
 
 
 def blocks(rank: int, noise: float, *, m: int = 150, n: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -39,3 +39,19 @@ def test_it_is_the_same_every_time() -> None:
     one, two = factor(*blocks(20, 0.0), 1e-6), factor(*blocks(20, 0.0), 1e-6)
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("size", "rank", "tolerance"), [(60, 7, 1e-6), (60, 0, 1e-6), (9, 9, 1e-10), (40, 12, 1e-2)]
+)
+def test_what_was_learnt_has_a_root_of_few_rows(size: int, rank: int, tolerance: float) -> None:
+    """Only the upper triangle counts; what is left out of the weighted trace is within the tolerance."""
+    rng = np.random.default_rng(size)
+    learnt = 0.7 ** np.arange(rank)[:, None] * rng.normal(size=(rank, size))
+    weights = rng.uniform(0.1, 100.0, size)
+    cov = -learnt.T @ learnt
+    root = root_of_loss(np.triu(cov) + np.tril(rng.normal(size=cov.shape), -1), weights, tolerance)
+    assert len(root) <= rank
+    rest = -cov - root.T @ root
+    assert -1e-9 < weights @ np.diag(rest) <= tolerance + 1e-9
+    assert np.linalg.eigvalsh(rest).min() > -1e-9  # no covariance gets too small by it

@@ -96,6 +96,21 @@ def test_add_combination_is_the_plain_product(n: int, rows: int) -> None:
     np.testing.assert_allclose(out, want, atol=1e-12)
 
 
+def test_a_large_product_is_rounded_like_a_small_one() -> None:
+    """It is done some columns at a time, which changes no bit."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(150, 150)), rng.normal(size=(150, 800))
+    whole, p = product(a, b, 800), aligned_zeros(800, 800)
+    downdate(p, 800, b, b, 150, 0)
+    np.testing.assert_allclose(whole[:, :800], a @ b, atol=1e-11)
+    np.testing.assert_allclose(np.triu(p[:, :800]), np.triu(-b.T @ b), atol=1e-11)
+    for begin in range(0, 800, 50):
+        part, q = np.ascontiguousarray(b[:, begin : begin + 50]), aligned_zeros(50, 50)
+        np.testing.assert_array_equal(product(a, part, 50)[:, :50], whole[:, begin : begin + 50])
+        downdate(q, 50, part, part, 150, 0)
+        np.testing.assert_array_equal(np.triu(q[:, :50]), np.triu(p[begin : begin + 50, begin : begin + 50]))
+
+
 @given(sizes, sizes, st.integers(0, 30))
 def test_product_is_the_plain_one(height: int, n: int, depth: int) -> None:
     rng = np.random.default_rng(n)

@@ -1,0 +1,376 @@
+"""Centralised EKF-SLAM: one joint Gaussian of N robots' poses and one map, with nothing left out.
+
+    x = (x_a | m_1 … m_n),  e = (x_b, x_c, …)
+
+The robot a whose turn it is stands where the single-robot filter has its robot, before the landmarks; the others
+stand beside the map (:mod:`slam.gaussian.companions`), which no scan of a's shows and every scan corrects. So each
+robot's step is the single-robot filter's, kernels and all, plus a product that is linear in landmarks and robots.
+A turn passes by exchanging three rows: O(n + N). With relative start poses known this is the filter of Fenwick,
+Newman and Leonard (ICRA 2002), and what distributed ones are measured against.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from slam.belief import Belief
+from slam.ekf import EkfSlam
+from slam.gaussian.companions import Companions
+from slam.gaussian.settings import EkfConfig, EkfLinesConfig
+from slam.gaussian.stacked_update import cholesky, solve
+from slam.gaussian.tiles import add_combination, downdate, subtract
+from slam.geometry import wrap, wrap_scalar
+from slam.grids.occupancy import OccupancyGrid
+from slam.landmarks.book import LandmarkBook, LandmarkPolicy
+from slam.settings import require
+from slam.types import Observations, Odometry, Scan
+
+__all__ = ["JointEkf", "JointMember", "expected_sighting", "swap_robots"]
+
+Array = NDArray[np.float64]
+
+_SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
+_LAST_SEEN = 5  # column of marks
+
+
+class JointEkf:
+    """The joint filter of a team: reset it, then feed each of its ``members`` as a backend of its own.
+
+    Parameters
+    ----------
+    robots : int
+        How many; at least 1.
+    config : EkfConfig, optional
+        Every robot's; that of ``ekf-lines`` if left out. Landmarks with known ids have the ids of all robots.
+
+    Attributes
+    ----------
+    members : tuple[JointMember, ...]
+        One backend a robot.
+
+    Notes
+    -----
+    All of it is in one frame, that of the start poses. Shared are the landmarks, every covariance and one grid,
+    into which all scans are drawn: who follows it by ``take_changes`` must be one for all robots. Each robot has
+    its own wheels, extractor, health, key scans and count of updates: what "lately seen" means is its own affair.
+    """
+
+    def __init__(self, robots: int, config: EkfConfig | None = None) -> None:
+        require(robots >= 1, f"a team has at least 1 robot, got {robots}")
+        self.config = config or EkfLinesConfig()
+        self.members = tuple(JointMember(self, i, self.config) for i in range(robots))
+        self.reset(np.zeros((robots, 3)))
+
+    def reset(self, poses: ArrayLike, covs: ArrayLike | None = None, seed: int = 0) -> None:
+        """Start over at poses ``(N, 3)``, independent and of covariances ``(N, 3, 3)``, the map empty.
+
+        Without ``covs`` all of them are known as well as a single robot's start. ``ValueError`` for other shapes.
+        """
+        at, many = np.array(poses, dtype=np.float64), len(self.members)
+        if at.shape != (many, 3):
+            raise ValueError(f"the start poses of {many} robots are ({many}, 3) numbers, got {at.shape}")
+        known = [None] * many if covs is None else list(np.array(covs, dtype=np.float64))
+        if len(known) != many:
+            raise ValueError(f"{many} robots need as many covariances, got {len(known)}")
+        for member, pose, cov in zip(self.members, at, known, strict=True):
+            member._begin_at(pose, cov, seed)
+        first = self.members[0]
+        others = np.zeros((3 * (many - 1), 3 * (many - 1)))
+        for i, member in enumerate(self.members[1:]):
+            others[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = member._start_cov
+            member.grid = first.grid
+        first._beside = Companions(len(first._match), len(first._x), others)
+        first._beside.mean[:] = at[1:].ravel()
+        self._active = 0
+        self._row = [-3, *range(0, 3 * (many - 1), 3)]  # where a robot stands beside the map; -3 is before it
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map of cells that all members draw into; live."""
+        return self.members[0].grid
+
+    @property
+    def poses(self) -> Array:
+        """Pose means ``(N, 3)``."""
+        at = self.members[self._active]
+        every: Array = np.concatenate([at._x[:3], at._beside.mean])[self._rows()].reshape(-1, 3)
+        every[:, 2] = wrap(every[:, 2])
+        return every
+
+    def joint_pose_cov(self) -> Array:
+        """Return the covariance ``(3N, 3N)`` of all robots' poses, in their order."""
+        cov, rows = self._whole_cov(3), self._rows()
+        return cov[np.ix_(rows, rows)]
+
+    def joint_cov(self) -> Array:
+        """Return the covariance ``(3N + 2n, 3N + 2n)`` of all robots' poses and all landmarks, walls included."""
+        size, rows = self.members[self._active]._n, self._rows()
+        cov = self._whole_cov(size)
+        order = np.concatenate([np.where(rows < 3, rows, rows + size - 3), np.arange(3, size)])
+        whole: Array = cov[np.ix_(order, order)]
+        return whole
+
+    def _whole_cov(self, n: int) -> Array:
+        """Return the covariance of the first ``n`` states of the map's filter and those beside them."""
+        at = self.members[self._active]
+        p, cross = np.triu(at._p[:n, :n]), at._beside.cross[:, :n]
+        return np.block([[p + np.triu(p, 1).T, cross.T], [cross, at._beside.cov]])
+
+    def _rows(self) -> NDArray[np.int64]:
+        """Return where every pose stands ``(3N,)`` when those beside the map follow the active robot's."""
+        return (3 + np.array(self._row)[:, None] + np.arange(3)).ravel()
+
+    def _turn(self, index: int) -> None:
+        """Let it be this robot's turn."""
+        before, now = self.members[self._active], self.members[index]
+        if before is now:
+            return
+        before._settle_beliefs()  # they read the rows that another robot's pose stands in from now on
+        for name in _SHARED:
+            setattr(now, name, getattr(before, name))
+        now._team_book.take_over(before._team_book)
+        row, beside = self._row[index], now._beside
+        swap_robots(now._x, now._p, now._n, beside.mean, beside.cov, beside.cross, row)
+        self._row[self._active], self._row[index] = row, self._row[self._active]
+        self._active = index
+
+
+class JointMember(EkfSlam):
+    """One robot of a :class:`JointEkf`: a backend like ``ekf-lines`` whose map is the team's.
+
+    It tells its health and never gives up (``relocalises`` is False): to put back what was before the first
+    doubtful scan, as a single robot does, would undo what all the others have seen since.
+    """
+
+    relocalises = False
+
+    def __init__(self, team: JointEkf, index: int, config: EkfConfig) -> None:
+        self._team, self.index = team, index
+        super().__init__(config)
+
+    def reset(self, *args: object, **kwargs: object) -> None:
+        """Refuse: the start of one robot is the start of all."""
+        raise RuntimeError("one robot of a team cannot start over: call JointEkf.reset with the poses of all")
+
+    def _begin_at(self, pose: Array, cov: Array | None, seed: int) -> None:
+        super().reset(pose, pose_cov=cov, seed=seed)
+
+    def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
+        super()._start(pose, pose_cov, seed)
+        self._start_cov = pose_cov
+
+    def _begin(self, policy: LandmarkPolicy) -> None:
+        super()._begin(policy)
+        self._book = self._team_book = _TeamBook(policy)
+
+    # ---- the filter: each call is a turn -------------------------------------------------------------------
+
+    def predict(self, odometry: Odometry) -> None:
+        """Move this robot on by what its wheels measured."""
+        self._team._turn(self.index)
+        super().predict(odometry)
+
+    def update(self, scan: Scan) -> None:
+        """Correct all robots and the map by a scan of this one's."""
+        self._team._turn(self.index)
+        super().update(scan)
+
+    def observe(self, observations: Observations) -> None:
+        """Correct all robots and the map by landmark observations of this robot's."""
+        self._team._turn(self.index)
+        super().observe(observations)
+
+    def see(self, other: int, z: ArrayLike, cov: ArrayLike, *, gate: float = math.inf) -> float:
+        """Correct all by where this robot sees the body of another one; return the NIS (three degrees of freedom).
+
+        Parameters
+        ----------
+        other : int
+            The index of the robot that is seen.
+        z : Array
+            ``(3,)`` range [m] and bearing [rad] of its body's centre from this one's, and its heading less this
+            one's [rad]: :func:`expected_sighting`.
+        cov : Array
+            ``(3, 3)`` covariance of ``z``.
+        gate : float
+            Nothing is corrected where the NIS is above it.
+        """
+        team, at, r = self._team, np.array(z, dtype=np.float64), np.array(cov, dtype=np.float64)
+        if not 0 <= other < len(team.members) or other == self.index:
+            raise ValueError(f"robot {self.index} of {len(team.members)} cannot see a robot {other}")
+        if at.shape != (3,) or r.shape != (3, 3) or not (np.all(np.isfinite(at)) and np.all(np.isfinite(r))):
+            raise ValueError("a sighting is three finite numbers with a finite (3, 3) covariance")
+        team._turn(self.index)
+        self._settle_beliefs()
+        beside = self._beside
+        return float(_see(
+            self._x, self._p, self._n, beside.mean, beside.cov, beside.cross, team._row[other], at, r, gate,
+            self._w, self._s, np.zeros((3, len(beside.mean))),
+        ))  # fmt: skip
+
+    def _redraw_if_moved(self) -> bool:
+        others = [m.key_scans for m in self._team.members if m is not self]
+        return self.key_scans.redraw_if_moved(self.grid, *self._map_points(), others)
+
+    # ---- the belief: each look is a turn, too --------------------------------------------------------------
+
+    @property
+    def pose(self) -> Array:
+        """Pose mean ``(3,)`` of this robot."""
+        self._team._turn(self.index)
+        return super().pose
+
+    @property
+    def pose_cov(self) -> Array:
+        """Pose covariance ``(3, 3)`` of this robot."""
+        self._team._turn(self.index)
+        return super().pose_cov
+
+    def pose_nees(self, true_pose: Array) -> float:
+        """Return the NEES of this robot's pose against the truth ``(3,)``."""
+        self._team._turn(self.index)
+        return super().pose_nees(true_pose)
+
+    @property
+    def joint_cov(self) -> Array:
+        """Covariance ``(3 + 2n, 3 + 2n)`` of this robot and every landmark, walls included."""
+        self._team._turn(self.index)
+        return super().joint_cov
+
+    @property
+    def belief(self) -> Belief:
+        """The pose of this robot, the landmarks, their joint covariance and the grid."""
+        self._team._turn(self.index)
+        return super().belief
+
+    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+        """Write the landmarks nearest to this robot in its frame (see the base class)."""
+        self._team._turn(self.index)
+        super().near_landmarks(out)
+
+    @property
+    def landmark_count(self) -> int:
+        """Number of the team's landmarks, walls included."""
+        self._team._turn(self.index)
+        return super().landmark_count
+
+    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+        """Return per point landmark how often all robots saw it and its direction in the belief's frame [rad]."""
+        self._team._turn(self.index)
+        return super().landmark_details()
+
+
+class _TeamBook(LandmarkBook):
+    """One robot's look at the team's landmarks.
+
+    They are the team's, and so is how often they were seen or missed. The count of updates, tentative ones and
+    when a landmark was seen last are the robot's own: one that only others have seen it never saw, so that meeting
+    it is closing a loop (:mod:`slam.landmarks.loop_closing`).
+    """
+
+    def __init__(self, policy: LandmarkPolicy) -> None:
+        super().__init__(policy)
+        self._seen = np.zeros(0)  # (ids,) last sightings of landmarks, while it is another robot's turn
+
+    def take_over(self, other: _TeamBook) -> None:
+        """Go on with the landmarks of another robot's book, which is put away."""
+        ids, size = other.ids, len(other.row_of_id)
+        other._seen = np.full(size, -np.inf)
+        other._seen[ids] = other.marks[:, _LAST_SEEN]
+        self.count, self._next_id, self.row_of_id = other.count, other._next_id, other.row_of_id
+        self._ids, self._marks = other._ids, other._marks
+        seen = np.full(size, -np.inf)
+        seen[: len(self._seen)] = self._seen
+        self.marks[:, _LAST_SEEN] = seen[ids]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def swap_robots(x: Array, p: Array, n: int, mean: Array, cov: Array, cross: Array, s: int) -> None:
+    """Exchange the robot of a joint Gaussian with the one whose pose stands beside the map from state ``s`` on.
+
+    ``x`` ``(≥ n,)`` and ``p``, an upper triangle, are the map's filter, ``mean`` ``(k,)``, ``cov`` ``(k, k)`` and
+    ``cross`` ``(k, ≥ n)`` the states beside it. Every number stays what it is.
+    """
+    for q in range(3):
+        x[q], mean[s + q] = mean[s + q], x[q]
+        for j in range(3, n):
+            p[q, j], cross[s + q, j] = cross[s + q, j], p[q, j]
+        for t in range(mean.shape[0]):
+            if t < s or t >= s + 3:
+                value = cross[t, q]
+                cross[t, q] = cov[t, s + q]
+                cov[t, s + q] = cov[s + q, t] = value
+        for r in range(q, 3):
+            value = p[q, r]
+            p[q, r] = cov[s + q, s + r]
+            cov[s + q, s + r] = cov[s + r, s + q] = value
+            cross[s + q, r], cross[s + r, q] = cross[s + r, q], cross[s + q, r]
+    x[2] = wrap_scalar(x[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def expected_sighting(seer: Array, seen: Array, hi: Array, hj: Array) -> tuple[float, float, float]:
+    """Return range, bearing and relative heading at which a robot at ``seer`` should see one at ``seen``.
+
+    Of poses ``(≥ 3,)``; ``hi`` and ``hj`` ``(3, 3)`` are filled with the Jacobians by either pose.
+    """
+    dx, dy = seen[0] - seer[0], seen[1] - seer[1]
+    rho2 = dx * dx + dy * dy
+    rho = math.sqrt(rho2)
+    hj[0, 0], hj[0, 1], hj[0, 2] = dx / rho, dy / rho, 0.0
+    hj[1, 0], hj[1, 1], hj[1, 2] = -dy / rho2, dx / rho2, 0.0
+    hj[2, 0], hj[2, 1], hj[2, 2] = 0.0, 0.0, 1.0
+    for e in range(3):
+        hi[e, 0], hi[e, 1], hi[e, 2] = -hj[e, 0], -hj[e, 1], 0.0
+    hi[1, 2] = hi[2, 2] = -1.0
+    return rho, wrap_scalar(math.atan2(dy, dx) - seer[2]), wrap_scalar(seen[2] - seer[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _see(
+    x: Array, p: Array, n: int, mean: Array, cov: Array, cross: Array, j: int, z: Array, r: Array, gate: float,
+    w: Array, s: Array, we: Array,
+) -> float:  # fmt: skip
+    """Correct by a sighting of the robot that stands beside the map from state ``j`` on; return the NIS.
+
+    As :mod:`slam.gaussian.stacked_update` and :mod:`slam.gaussian.companions` do it, with H by both poses; ``w``,
+    ``s`` and ``we`` ``(3, k)`` are work space.
+    """
+    k = mean.shape[0]
+    hi, hj = np.empty((3, 3)), np.empty((3, 3))
+    rho, bearing, turn = expected_sighting(x, mean[j : j + 3], hi, hj)
+    for e in range(3):
+        for c in range(n):
+            w[e, c] = 0.0
+            for q in range(3):
+                w[e, c] += hi[e, q] * p[min(q, c), max(q, c)] + hj[e, q] * cross[j + q, c]
+        for c in range(k):
+            we[e, c] = 0.0
+            for q in range(3):
+                we[e, c] += hi[e, q] * cross[c, q] + hj[e, q] * cov[j + q, c]
+    for e in range(3):
+        for f in range(e, 3):
+            s[e, f] = r[e, f]
+            for q in range(3):
+                s[e, f] += w[e, q] * hi[f, q] + we[e, j + q] * hj[f, q]
+    s[0, 3], s[1, 3], s[2, 3] = z[0] - rho, wrap_scalar(z[1] - bearing), wrap_scalar(z[2] - turn)
+    cholesky(s, 3)
+    nis = s[0, 3] ** 2 + s[1, 3] ** 2 + s[2, 3] ** 2
+    if not nis <= gate:
+        return float(nis)
+    solve(s, w, n, 3)
+    solve(s, we, k, 3)
+    add_combination(x, n, s[:3, 3], w)
+    x[2] = wrap_scalar(x[2])
+    add_combination(mean, k, s[:3, 3], we)
+    downdate(p, n, w, w, 3, 0)
+    subtract(cross, k, n, we, w, 3)
+    for a in range(k):
+        for b in range(k):
+            for e in range(3):
+                cov[a, b] -= we[e, a] * we[e, b]
+    return float(nis)

@@ -1,0 +1,56 @@
+"""PettingZoo's side of a team."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import supersuit
+from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+import mecanum_env
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+def test_it_is_a_parallel_environment(robots: int) -> None:
+    parallel_api_test(mecanum_env.parallel_env(robots=robots, max_steps=30), num_cycles=70)
+
+
+def test_seeds_make_episodes() -> None:
+    parallel_seed_test(lambda: mecanum_env.parallel_env(robots=2, max_steps=20), num_cycles=20)
+
+
+def test_stable_baselines3_takes_it_by_supersuit() -> None:
+    from stable_baselines3 import PPO
+
+    env = supersuit.pettingzoo_env_to_vec_env_v1(mecanum_env.parallel_env(robots=2, max_steps=25))
+    envs = supersuit.concat_vec_envs_v1(env, 1, base_class="stable_baselines3")
+    model = PPO("MultiInputPolicy", envs, n_steps=16, batch_size=16, n_epochs=1)
+    model.learn(64)
+    assert model.num_timesteps >= 64
+    envs.close()
+
+
+def test_agents_have_beliefs_goals_and_a_picture() -> None:
+    env = mecanum_env.parallel_env(robots=2, render_mode="rgb_array", max_steps=5)
+    env.reset(seed=0)
+    env.announce("robot_1", np.array([1.0, 2.0]))
+    env.step({name: np.zeros(3, np.float32) for name in env.agents})
+    (mate,) = env.belief("robot_0").teammates
+    assert mate.goal is not None
+    assert np.allclose(mate.goal, (1.0, 2.0))
+    frame = env.render()
+    assert frame is not None
+    assert frame.shape == (720, 1280, 3)
+    with pytest.raises(ValueError, match="robot_0, robot_1"):
+        env.belief("robot_7")
+    with pytest.raises(ValueError, match="rgb_array"):
+        mecanum_env.parallel_env(render_mode="human")
+
+
+def test_all_are_done_together_when_the_target_is_covered() -> None:
+    env = mecanum_env.parallel_env(robots=2, config={"coverage_target": 0.01})
+    env.reset(seed=0)
+    _, _, terminated, _, infos = env.step({name: np.zeros(3, np.float32) for name in env.agents})
+    assert terminated == {"robot_0": True, "robot_1": True}
+    assert env.agents == []
+    assert all(info["is_success"] for info in infos.values())
