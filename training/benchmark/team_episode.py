@@ -99,7 +99,7 @@ def _metrics(episode: TeamEpisode) -> dict[str, Any]:
     metrics["map_robots"] = len(metrics["map_robots"])
     metrics = {name: value for name, value in metrics.items() if name not in _IN_KEY}
     return metrics | {
-        "first_share_max": max(robot["first_share"] for robot in robots),
+        "first_share_max": max((robot["first_share"] for robot in robots if robot["first_share"]), default=None),
         "path_length_max_m": max(robot["path_length_m"] for robot in robots),
         "ate_aligned_rmse_m": plain(float(np.sqrt(np.mean(np.square(aligned))))),
         "decisions": len(decisions),

@@ -63,11 +63,14 @@ def _summary(metrics: dict[str, Any], files: str) -> str:
         ("coverage", f"{100.0 * metrics['coverage']:.1f} % ({verdict}); 95 % at {at}"),
         ("path", f"{metrics['path_length_m']:.1f} m in all, {metrics['collisions']} collisions, {touching}"),
         ("map", f"wall IoU {'-' if iou is None else f'{iou:.3f}'}; ATE {ate:.1f} cm"),
-        *(
-            (f"robot {robot['robot']}", f"{robot['path_length_m']:.1f} m, {robot['collisions']} collisions, own "
-             f"map {100.0 * robot['coverage']:.1f} %, saw {100.0 * robot['first_share']:.1f} % first")
-            for robot in metrics["per_robot"]
-        ),
+        *((f"robot {robot['robot']}", _of_robot(robot)) for robot in metrics["per_robot"]),
         ("files", files),
     ]  # fmt: skip
     return "\n".join(f"{name:<12} {text}" for name, text in rows)
+
+
+def _of_robot(robot: dict[str, Any]) -> str:
+    share = robot["first_share"]
+    first = "" if share is None else f", saw {100.0 * share:.1f} % first"
+    own = f"own map {100.0 * robot['coverage']:.1f} %"
+    return f"{robot['path_length_m']:.1f} m, {robot['collisions']} collisions, {own}{first}"

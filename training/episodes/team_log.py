@@ -85,7 +85,12 @@ class TeamLog:
 
     @property
     def first_shares(self) -> Array:
-        """Of what the team has mapped, the share that each robot had first ``(robots,)``; they sum up to 1."""
+        """Of what the team has mapped, the share that each robot had first ``(robots,)``; they sum up to 1.
+
+        Nobody's where all share one belief, and so one map: nan.
+        """
+        if self._team.joint is not None:
+            return np.full(len(self._first), np.nan)
         self._note_first()
         return np.asarray(self._first / max(self._first.sum(), 1.0))
 

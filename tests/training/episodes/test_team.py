@@ -127,3 +127,15 @@ def test_it_ends_when_nobody_has_anything_left(tmp_path: Path) -> None:
     task.run(episode, lambda **_: None)
     assert episode.end == "covered" and episode.log.coverage[-1] > 0.95
     assert math.isclose(episode.log.times[-1], 0.1 * (len(episode.log.times) - 1))
+
+
+def test_a_joint_belief_has_one_map_which_is_nobodys(tmp_path: Path) -> None:
+    team = TeamConfig(robots=2, belief="joint")
+    episode = task.prepare(team, out=tmp_path, rooms="rectangular", seed=3, max_steps=10)
+    task.run(episode, lambda **_: None)
+    metrics = episode.metrics()
+    assert episode.config.slam == metrics["slam"] == "ekf-lines"
+    assert [robot["first_share"] for robot in metrics["per_robot"]] == [None, None]
+    merged, together = team_map(episode.team)
+    assert together == [0, 1] and merged is episode.team.members[1].grid
+    assert metrics["coverage"] == metrics["per_robot"][1]["coverage"] > 0.1
