@@ -30,6 +30,7 @@ _CURVES = {"time_s": "coverage_by_time", "path_length_m": "coverage_by_path"}
 _LABELS = {"time_s": "time [s]", "path_length_m": "way [m]"}
 _WIDTH, _HEIGHT = 480, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 24, 40  # margins
+_MOST = 1.6  # times the highest figure: what lies beyond is cut off
 _APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px]
 
 
@@ -155,13 +156,15 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
     """Return a chart of lines; ``ideal`` gives the dashed one, from a line's figure for one robot."""
     known = [(name, [(n, f) for n, f in line if math.isfinite(f.value)]) for name, line in lines]
     counts = sorted({n for _, line in lines for n, _ in line})
-    values = [v for _, line in known for _, f in line for v in (f.value, f.high) if math.isfinite(v)]
+    # One that once never got there has an interval up to its limit of time, which would flatten all else.
+    most = _MOST * max((f.value for _, line in known for _, f in line), default=1.0)
+    values = [min(v, most) for _, line in known for _, f in line for v in (f.value, f.high) if math.isfinite(v)]
     ticks = np.asarray(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, max(values, default=1.0)))
     top, right, bottom = float(ticks[-1]), _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
 
     def at(robots: int, value: float, k: float) -> tuple[float, float]:
         x = _LEFT + 24 + (robots - 1) / max(counts[-1] - 1, 1) * (right - _LEFT - 48)
-        y = bottom - value / top * (bottom - _TOP)
+        y = bottom - min(value, top) / top * (bottom - _TOP)
         return round(x + _APART * (k - 0.5 * (len(lines) - 1)), 1), round(y, 1)
 
     def path(points: Sequence[tuple[float, float]]) -> str:
