@@ -231,12 +231,12 @@ class Backend(abc.ABC):
         return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
 
     def _drawing_gives_way(self, x: float, y: float, scan: Scan) -> bool:
-        """Tell whether the map around was drawn from poses far less sure than the present one (x, y).
+        """Tell whether the map around a pose at (x, y) is old, and drawing or pose so unsure that they must differ.
 
-        Where it contradicts a scan, that says nothing of the pose, and the scan is drawn over it.
+        Where they contradict each other, that says nothing of the pose, and the scan is drawn over the map.
         """
-        drawn = self.key_scans.largest_variance(x, y, scan.range_max)
-        return drawn > max(self.recovery.config.unsure_share * self._end_variance(), self.recovery.config.blur_m**2)
+        drawn = self.key_scans.old_variance(x, y, scan.range_max)
+        return drawn > 0.0 and max(drawn, self._end_variance()) > self.recovery.config.unsure_m**2
 
     def _contradicts(self, body: tuple[float, float, float], scan: Scan) -> bool:
         """Take in what a doubtful scan says of the corrected pose of the body; tell whether it still disagrees."""

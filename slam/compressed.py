@@ -37,6 +37,9 @@ __all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
 Array = NDArray[np.float64]
 
 
+_LEFT_OUT_M2 = 1e-11  # of all covariances with what is far, at most: root of the squares' sum
+
+
 @dataclass(frozen=True, kw_only=True)
 class CompressedEkfConfig(EkfConfig):
     """EKF-SLAM with postponed updates."""
@@ -227,8 +230,11 @@ class CompressedEkfSlam(EkfSlam):
             sigma = np.sqrt(np.diag(self._map_p)[b])
             own = np.sqrt(np.diag(beside.cov))
             row_sigma = np.concatenate([np.sqrt(np.diag(rows[:, a])), np.where(own > 0.0, own, 1.0)])
+            # Where all share an error of metres, and stand to each other within millimetres, correlations must be
+            # told apart more finely: what is left out must stay small beside the millimetres.
+            tolerance = min(self.config.rank_tolerance, _LEFT_OUT_M2 / float(row_sigma.max() * sigma.max()))
             u, v = factor(
-                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, self.config.rank_tolerance,
+                np.vstack([rows[:, b], self._map_own[:, b]]), row_sigma, sigma, tolerance,
                 max(FEWEST_SAMPLES, self._rank + self._rank // 4),
             )  # fmt: skip
             self._rank = len(v)

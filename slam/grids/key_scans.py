@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 _ANCHORS = 12  # landmarks that a key scan hangs on, at most
 
+_RECENT = 100  # key scans, some 20 m of way
+
 # How well a key scan hangs on what: weights are σ⁻², σ in m and rad.
 _POINT = 0.02**-2  # a point, or how far off a wall is
 _TURN = 0.005**-2  # the direction of a wall
@@ -76,10 +78,14 @@ class KeyScans:
             or math.cos(theta - last_theta) <= self._cos_spacing
         )
 
-    def largest_variance(self, x: float, y: float, radius_m: float) -> float:
-        """Return the variance [m²] of the least sure key scan within a radius of a place; 0 where there is none."""
-        near = np.hypot(*(self._poses[: len(self._scans), :2] - (x, y)).T) <= radius_m
-        return float(self._variances[: len(self._scans)][near].max(initial=0.0))
+    def old_variance(self, x: float, y: float, radius_m: float) -> float:
+        """Return the variance [m²] of the least sure old key scan within a radius of a place; 0 where there is none.
+
+        Old are all but the last hundred: beside those the robot knows where it is, unsure as both may be.
+        """
+        n = max(len(self._scans) - _RECENT, 0)
+        near = np.hypot(self._poses[:n, 0] - x, self._poses[:n, 1] - y) <= radius_m
+        return float(self._variances[:n][near].max(initial=0.0))
 
     def keep(
         self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array,

@@ -82,17 +82,18 @@ def test_it_is_the_full_filter(look_every: int) -> None:
 
 
 def through_the_grove(
-    landmarks: np.ndarray, backends: tuple[Backend, ...], seed: int, steps: int, turn_at: int | None = None
-) -> Iterator[np.ndarray]:
+    landmarks: np.ndarray, backends: tuple[Backend, ...], seed: int, steps: int, turn_at: int | None = None,
+    *, start_cov: tuple[float, float, float] = (0.01, 0.01, 0.01), noise: np.ndarray = NOISE,
+) -> Iterator[np.ndarray]:  # fmt: skip
     """Drive straight on, and back where asked for, all told the same; yield the true pose after each step."""
     rng, pose = np.random.default_rng(seed), np.zeros(3)
     for backend in backends:
-        backend.reset(pose_cov=np.diag([0.01, 0.01, 0.01]))
+        backend.reset(pose_cov=np.diag(start_cov))
     for k in range(steps):
         turning = turn_at is not None and turn_at <= k < turn_at + 3
         twist = np.array([0.0, 0.0, math.pi / 0.9]) if turning else np.array([0.8, 0.0, 0.0])
         pose, odometry = drive(pose, twist, (0.02, 0.02), rng, dt=0.3)
-        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
+        seen = observe_landmarks(pose, landmarks, OFFSET, noise, rng, reach=4.0)
         for backend in backends:
             backend.predict(odometry)
             backend.observe(seen)
@@ -156,6 +157,22 @@ def test_the_invariant_filter_is_the_same_in_regions(wheels: dict[str, Any]) -> 
         (mean, cov), (same_mean, same_cov) = whole.wheel_errors, regional.wheel_errors
         np.testing.assert_allclose(same_mean, mean, atol=0.01 * np.sqrt(np.diag(cov)).min())
         np.testing.assert_allclose(same_cov, cov, rtol=0.01, atol=1e-8)
+
+
+def test_regions_keep_millimetres_where_all_is_unsure_by_metres() -> None:
+    """On a floor of halls the covariance had negative eigenvalues after an hour, and the pose was no number."""
+    whole, regions = (slam.make("invariant-ekf", config=c) for c in (WHOLE, {**REGIONS, "rank_tolerance": 1e-6}))
+    assert isinstance(whole, CompressedEkfSlam)
+    assert isinstance(regions, CompressedEkfSlam)
+    start, noise = (9.0, 9.0, 4e-4), np.diag([1e-6, 1e-7])
+    for _ in through_the_grove(grove(7), (whole, regions), 7, 240, 118, start_cov=start, noise=noise):
+        pass
+    assert len(regions._far) > 20
+    assert whole.pose_cov[0, 0] > 4.0
+    cov, same = whole.belief.whole_cov, regions.belief.whole_cov
+    assert cov is not None and same is not None
+    assert np.linalg.eigvalsh(same)[0] > 0.0
+    np.testing.assert_allclose(regions.pose, whole.pose, atol=1e-4)
 
 
 @pytest.mark.parametrize("lines", [False, True])
