@@ -231,7 +231,7 @@ class Backend(abc.ABC):
         return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
 
     def _drawing_gives_way(self, x: float, y: float, scan: Scan) -> bool:
-        """Tell whether the map around a pose at (x, y) is old, and drawing or pose so unsure that they must differ.
+        """Tell whether the map around a pose at (x, y) is old, and it or the pose so unsure that both must differ.
 
         Where they contradict each other, that says nothing of the pose, and the scan is drawn over the map.
         """

@@ -79,7 +79,7 @@ class KeyScans:
         )
 
     def old_variance(self, x: float, y: float, radius_m: float) -> float:
-        """Return the variance [m²] of the least sure old key scan within a radius of a place; 0 where there is none.
+        """Return the variance [m²] of the least sure old key scan within a radius of a place; 0 without one.
 
         Old are all but the last hundred: beside those the robot knows where it is, unsure as both may be.
         """

@@ -159,22 +159,6 @@ def test_the_invariant_filter_is_the_same_in_regions(wheels: dict[str, Any]) -> 
         np.testing.assert_allclose(same_cov, cov, rtol=0.01, atol=1e-8)
 
 
-def test_regions_keep_millimetres_where_all_is_unsure_by_metres() -> None:
-    """On a floor of halls the covariance had negative eigenvalues after an hour, and the pose was no number."""
-    whole, regions = (slam.make("invariant-ekf", config=c) for c in (WHOLE, {**REGIONS, "rank_tolerance": 1e-6}))
-    assert isinstance(whole, CompressedEkfSlam)
-    assert isinstance(regions, CompressedEkfSlam)
-    start, noise = (9.0, 9.0, 4e-4), np.diag([1e-6, 1e-7])
-    for _ in through_the_grove(grove(7), (whole, regions), 7, 240, 118, start_cov=start, noise=noise):
-        pass
-    assert len(regions._far) > 20
-    assert whole.pose_cov[0, 0] > 4.0
-    cov, same = whole.belief.whole_cov, regions.belief.whole_cov
-    assert cov is not None and same is not None
-    assert np.linalg.eigvalsh(same)[0] > 0.0
-    np.testing.assert_allclose(regions.pose, whole.pose, atol=1e-4)
-
-
 @pytest.mark.parametrize("lines", [False, True])
 def test_scans_of_rooms_give_the_full_filter_s_map(lines: bool) -> None:
     """A long hall, driven down and back with scans: landmarks come, are left behind and met again."""

@@ -80,7 +80,7 @@ def test_a_drawing_from_unsure_poses_says_nothing_against_a_sure_one(
     backend = env.backend
     monkeypatch.setattr(backend, "_redraw_if_moved", lambda: False)
     monkeypatch.setattr(backend.key_scans, "old_variance", lambda x, y, radius_m: variance)
-    backend.key_scans.put_back(backend.grid, backend.key_scans.poses + [0.5, 0.3, 0.1])
+    backend.key_scans.put_back(backend.grid, backend.key_scans.poses + np.array([0.5, 0.3, 0.1]))
     pose = backend.pose
     for _ in range(40):
         env.step(np.zeros(3, np.float32))
