@@ -123,6 +123,10 @@ class Backend(abc.ABC):
         if self._doubtful and recovery.kept is None and self._redraw_if_moved():
             seen = recovery.look(self.grid, (x, y, theta), scan)
             self._doubtful = recovery.monitor.doubtful(seen)
+        if self._doubtful and self._drawing_gives_way(x, y, scan):
+            recovery.kept, self._doubtful = None, False
+            self._update(scan)
+            return
         if not self._doubtful:
             recovery.kept = None
             recovery.monitor.take(seen, self._end_variance())
@@ -208,7 +212,7 @@ class Backend(abc.ABC):
         grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
         if self.key_scans.wants(x, y, theta):
             ids, marks = self._landmarks_in_view()
-            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, marks)
+            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, marks, self._end_variance())
 
     def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
         """Return ids ``(k,)`` of the landmarks that the last scan showed, and ``(k, 3)`` as key scans keep."""
@@ -225,6 +229,14 @@ class Backend(abc.ABC):
         """Return the variance [m²] of a beam's end three metres off, by the covariance of the pose."""
         cov = self.pose_cov
         return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
+
+    def _drawing_gives_way(self, x: float, y: float, scan: Scan) -> bool:
+        """Tell whether the map around a pose at (x, y) is old, and it or the pose so unsure that both must differ.
+
+        Where they contradict each other, that says nothing of the pose, and the scan is drawn over the map.
+        """
+        drawn = self.key_scans.old_variance(x, y, scan.range_max)
+        return drawn > 0.0 and max(drawn, self._end_variance()) > self.recovery.config.unsure_m**2
 
     def _contradicts(self, body: tuple[float, float, float], scan: Scan) -> bool:
         """Take in what a doubtful scan says of the corrected pose of the body; tell whether it still disagrees."""

@@ -22,6 +22,7 @@ __all__ = ["ControlConfig", "PathFollower"]
 Array = NDArray[np.float64]
 
 _CREEP_M_S, _CREEP_ROOM_M = 0.2, 1.0
+_CREPT_M = 0.2  # between two places that it has crept over
 _CREEP_HALF_RAD = 0.35  # half the width of the way that must be free
 
 
@@ -123,6 +124,7 @@ class PathFollower:
         self._arc = np.zeros(1)
         self._heading: float | None = None
         self._creeping: float | None = None  # direction [rad, belief's frame] that it creeps in
+        self._crept: list[tuple[float, float]] = []  # places [m, belief's frame] that it has crept over
         self._index = 0
         self.blocked = False  # the last step wanted to move and could not
         self.arrived = False
@@ -131,7 +133,7 @@ class PathFollower:
     def set_path(self, path: Array, heading: float | None) -> None:
         """Follow ``path`` ``(n, 2)`` and end with ``heading`` [rad], or with any where it is ``None``."""
         self._path = np.ascontiguousarray(path, dtype=np.float64)
-        self._creeping = None
+        self._creeping, self._crept = None, []
         self._arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self._path, axis=0).T))])
         self._heading = heading
         self._index = 0
@@ -164,13 +166,17 @@ class PathFollower:
     def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
 
-        For a robot that does not know where on the map it is; where it came from, the map shows most.
-        Without a scan it stands.
+        For a robot that does not know where on the map it is; where it came from, the map shows most. Where no
+        beam returns, from too wide a hall or a blind lidar, it goes back over what it has crept, and then stands.
         """
         hits, pose = scan_points(observation, self._lidar), np.asarray(belief.pose, dtype=np.float64)
-        if observation is None or not len(hits):
+        if observation is None:
             return np.zeros(3)
         share, lidar = np.asarray(observation["scan"], np.float64), self._lidar
+        if share.min() >= 1.0:
+            return self._creep_back(pose, belief)
+        if not self._crept or math.dist(self._crept[-1], pose[:2]) >= _CREPT_M:
+            self._crept.append((float(pose[0]), float(pose[1])))
         width = max(round(_CREEP_HALF_RAD / lidar.angle_increment), 1)
         room = np.min([np.roll(share, k) for k in range(-width, width + 1)], axis=0) * lidar.range_max_m
         angles = pose[2] + lidar.angle_min + lidar.angle_increment * np.arange(lidar.beams)
@@ -181,6 +187,17 @@ class PathFollower:
         self._creeping = angle = float(angles[int(np.argmax(worth))])
         velocity = _CREEP_M_S * np.array([math.cos(angle), math.sin(angle)])
         return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, hits)
+
+    def _creep_back(self, pose: Array, belief: Belief) -> Array:
+        """Return the twist ``(3,)`` that creeps to the last place that it crept over, and from there on back."""
+        if self._crept and math.dist(self._crept[-1], pose[:2]) < 0.5 * _CREPT_M:
+            self._crept.pop()
+        if not self._crept:
+            return np.zeros(3)
+        way = np.array(self._crept[-1]) - pose[:2]
+        self._creeping = math.atan2(way[1], way[0])
+        velocity = _CREEP_M_S * way / math.hypot(*way)
+        return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, np.zeros((0, 2)))
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""

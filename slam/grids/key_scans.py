@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 _ANCHORS = 12  # landmarks that a key scan hangs on, at most
 
+_RECENT = 100  # key scans, some 20 m of way
+
 # How well a key scan hangs on what: weights are σ⁻², σ in m and rad.
 _POINT = 0.02**-2  # a point, or how far off a wall is
 _TURN = 0.005**-2  # the direction of a wall
@@ -50,6 +52,7 @@ class KeyScans:
         self.config = config or KeyScanConfig()
         self._scans: list[tuple[Scan, NDArray[np.int16]]] = []
         self._poses = np.zeros((64, 3))  # of the sensor, as last drawn
+        self._variances = np.zeros(64)  # [m²] of where the beams ended, when the scan was taken
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
         self._since_check = 0
@@ -76,19 +79,32 @@ class KeyScans:
             or math.cos(theta - last_theta) <= self._cos_spacing
         )
 
+    def old_variance(self, x: float, y: float, radius_m: float) -> float:
+        """Return the variance [m²] of the least sure old key scan within a radius of a place; 0 without one.
+
+        Old are all but the last hundred: beside those the robot knows where it is, unsure as both may be.
+        """
+        n = max(len(self._scans) - _RECENT, 0)
+        near = np.hypot(self._poses[:n, 0] - x, self._poses[:n, 1] - y) <= radius_m
+        return float(self._variances[:n][near].max(initial=0.0))
+
     def keep(
-        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array
-    ) -> None:
+        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array,
+        variance: float = 0.0,
+    ) -> None:  # fmt: skip
         """Keep a scan, and what was seen with it.
 
         ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as it is now, or α, r, 1 of a wall.
+        ``variance`` [m²] is that of where its beams ended.
         """
         n = len(self._scans)
         if n == len(self._poses):
             self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
+            self._variances = np.concatenate([self._variances, np.zeros_like(self._variances)])
             self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
             self._anchor_local = np.vstack([self._anchor_local, np.zeros_like(self._anchor_local)])
         _hang(sensor_pose, ids, marks, n, self._poses, self._anchor_ids, self._anchor_local)
+        self._variances[n] = variance
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan, surface.copy()))
 

@@ -44,6 +44,7 @@ class HealthConfig:
     scan_weight: float = 0.3
     lost_per_scan: float = 1e-5  # how likely a robot gets lost from one scan to the next
     blur_m: float = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
+    unsure_m: float = 0.3  # σ of the beams' ends, now or when they were drawn, at which an old drawing gives way
     doubt_against: float = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
     doubt_sharp: float = 0.6  # … where it agrees from the corrected pose
     give_up: float = 0.2  # P(fine) below which the belief is lost

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.landmarks.association import IGNORED, add_expected, predicted
+from slam.landmarks.association import IGNORED, add_expected, gated_distance, predicted
 from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
 from slam.types import LINE
 
@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 _LAST_SEEN = 5  # column of marks
 _OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company
 _HOLD = 3  # other landmarks seen, that old ones can wait for company
+_ALONE = 5.0  # times ``sigma`` to which one must be expected to be taken without company
 _LEAST = 3  # old landmarks that the others predict narrowly, for them all to be taken
 
 
@@ -57,24 +58,29 @@ def put_off(
     x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float,
     match: NDArray[np.int64],
 ) -> int:  # fmt: skip
-    """Set to IGNORED the matches with old landmarks that are not expected to within ``sigma`` [m]; count them."""
+    """Set to IGNORED the matches with old landmarks that are not expected to within ``sigma`` [m]; count them.
+
+    Where too little else is seen to wait for company, leaving them out would be going blind: there only those
+    that are too uncertain, or too far off, to be taken alone.
+    """
     h = np.empty((2, 5))
-    doubtful = np.zeros(z.shape[0], np.bool_)
-    count = held = 0
+    doubtful, alone = np.zeros(z.shape[0], np.bool_), np.zeros(z.shape[0], np.bool_)
+    held = 0
     for k in range(z.shape[0]):
         i = match[k]
         if i < 0:
             continue
-        old = now - marks[i, _LAST_SEEN] > _OLD
-        doubtful[k] = old and _expected_variance(x, p, i, offset, z[k], h) > sigma * sigma
-        count += doubtful[k]
+        if now - marks[i, _LAST_SEEN] > _OLD:
+            sigmas2 = _expected_variance(x, p, i, offset, z[k], h) / sigma**2
+            doubtful[k] = sigmas2 > 1.0
+            if doubtful[k] and sigmas2 <= _ALONE**2:
+                alone[k] = gated_distance(x, p, i, offset, z[k], h) < JOINT_GATES[1]
         held += not doubtful[k]
-    # They can wait while others hold the pose. Where nothing else is seen, leaving them out would be going blind.
-    if held < _HOLD:
-        return 0
+    count = 0
     for k in range(z.shape[0]):
-        if doubtful[k]:
+        if doubtful[k] and (held >= _HOLD or not alone[k]):
             match[k] = IGNORED
+            count += 1
     return count
 
 

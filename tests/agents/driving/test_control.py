@@ -145,3 +145,29 @@ def test_scan_points_stand_in_the_body_frame():
     ahead = np.ones(sector.beams)
     ahead[sector.beams // 2] = 0.1
     np.testing.assert_allclose(scan_points({"scan": ahead}, sector), [[0.08 + 0.8, 0.0]], atol=1e-6)
+
+
+def test_lost_in_the_open_it_creeps_back_and_turns_where_it_loses_sight():
+    """A wall ahead, farther off than the scan is looked at for safety; behind, nothing."""
+    classes, control, pose = room(30.0, 6.0), follower(), np.array([8.0, 3.0, 0.0])
+    control.set_path(resample(np.array([(6.0, 3.0), (10.0, 3.0)]), 0.1), None)
+    angles = LIDAR.angle_min + LIDAR.angle_increment * np.arange(LIDAR.beams)
+
+    def creep(wall_m: float, least: float = 1.0) -> np.ndarray:
+        with np.errstate(divide="ignore"):
+            ranges = np.where(np.cos(angles) > 0.9, wall_m / np.cos(angles), np.inf)
+        scan = np.maximum(np.minimum(ranges / LIDAR.range_max_m, 1.0), least)
+        return control.creep({"scan": scan.astype(np.float32)}, belief_of(classes, tuple(pose)))
+
+    places = []
+    for _ in range(600):
+        pose = drive(pose, creep(12.0 - pose[0] - LIDAR.offset_m, 0.0) / np.array([0.8, 0.8, 1.5]), ROBOT)
+        places.append(pose[0])
+    lost_sight = 12.0 - LIDAR.offset_m - LIDAR.range_max_m
+    assert min(places) == pytest.approx(lost_sight, abs=0.3)  # back, as far as the wall is seen …
+    assert places[-1] > lost_sight + 3.0  # … and then to what is to be seen
+    assert max(places) < 12.0 - 0.29
+    for _ in range(800):  # now the lidar is blind
+        pose = drive(pose, creep(1.0) / np.array([0.8, 0.8, 1.5]), ROBOT)
+    assert pose[0] == pytest.approx(8.0, abs=0.3)  # over what it has crept, and no farther
+    assert not creep(1.0).any()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
@@ -144,3 +145,16 @@ def test_only_scans_from_new_places_are_kept() -> None:
     for k in range(200):
         keys.keep(np.array([k, 1.0, 0.0]), scan, surface, IDS, points(CORNERS))
     assert len(keys) == 203
+
+
+def test_how_unsure_the_old_drawing_is_around_a_place() -> None:
+    keys, scan = KeyScans(), room_scan(np.array([2.0, 2.0, 0.0]))
+    none, surface = np.zeros(0, np.int64), np.full(len(scan.ranges), -1, np.int16)
+    for k in range(150):
+        assert k > 100 or keys.old_variance(0.0, 0.0, 8.0) == 0.0
+        keys.keep(np.array([float(k), 0.0, 0.0]), scan, surface, none, np.zeros((0, 3)), 0.01 * (k + 1))
+    assert keys.old_variance(10.0, 0.0, 5.5) == pytest.approx(0.16)
+    assert keys.old_variance(48.0, 0.0, 5.5) == pytest.approx(0.5)  # the hundred after it are not old
+    assert keys.old_variance(100.0, 0.0, 5.5) == 0.0
+    keys.put_back(OccupancyGrid(), keys.poses[:112])
+    assert keys.old_variance(10.0, 0.0, 5.5) == pytest.approx(0.12)

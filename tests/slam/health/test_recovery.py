@@ -71,6 +71,25 @@ def test_a_closed_loop_is_no_reason_to_be_lost(redraws: bool, monkeypatch: pytes
         assert np.hypot(*(backend.pose - compose(shift, env.truth.pose))[:2]) < 0.05
 
 
+@pytest.mark.parametrize("variance", [0.0, 1.0])
+def test_a_drawing_from_unsure_poses_says_nothing_against_a_sure_one(
+    variance: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In a hall the start is drawn half a metre off, and nothing says so before the robot is back."""
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    monkeypatch.setattr(backend, "_redraw_if_moved", lambda: False)
+    monkeypatch.setattr(backend.key_scans, "old_variance", lambda x, y, radius_m: variance)
+    backend.key_scans.put_back(backend.grid, backend.key_scans.poses + np.array([0.5, 0.3, 0.1]))
+    pose = backend.pose
+    for _ in range(40):
+        env.step(np.zeros(3, np.float32))
+    assert (backend.recovery.times_lost == 0) == (variance > 0.0)
+    if variance:
+        assert np.hypot(*(backend.pose - pose)[:2]) < 0.03
+        assert not backend._doubtful  # it is drawn anew meanwhile
+
+
 @pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "dp-slam"])
 def test_where_nothing_is_wrong_nothing_changes(name: str) -> None:
     watched, alone = driven(name, 40), driven(name, 40, settings={"health": {"recover": False}})
