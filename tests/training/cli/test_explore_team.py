@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from agents.base import Goal
 from mecanum_env.config import from_toml
+from mecanum_env.team.team import Team
 from slam.landmarks.database import read_landmark_map
 from tests.slam.written_files import read_map_server, read_tum
 from tests.training.cli.test_bad_input import explore_refused
 from tests.training.cli.test_explore import run
 from training.cli import main
+from training.episodes import team as task
 from training.episodes.explore import FILES as SINGLE_FILES
 from training.episodes.team import FILES, files_of
+from training.episodes.team_recording import TeamRecorder
+from training.views.team_files import TeamSaver
 
 SHORT = ["explore", "--rooms", "rectangular", "--seed", "3", "--max-steps", "15"]
 
@@ -110,3 +116,23 @@ def test_a_signal_keeps_the_episode_so_far(tmp_path: Path, how: signal.Signals, 
 )
 def test_bad_input(argv: list[str], words: str, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert words in explore_refused(argv, capsys, tmp_path / "out")
+
+
+def test_what_kills_a_run_takes_no_more_than_a_minute_of_it(tmp_path: Path) -> None:
+    episode = task.prepare(
+        task.read_team(robots=2), out=tmp_path, agent="random", rooms="rectangular", max_steps=30
+    )
+    recorder = TeamRecorder()
+    seen: list[int] = []
+
+    class Look:
+        def take(self, team: Team, goals: Sequence[Goal | None]) -> None:
+            if (tmp_path / "metrics.json").exists():
+                metrics = metrics_of(tmp_path)
+                times, _ = read_tum(tmp_path / "trajectory_true_robot_1.tum")
+                assert metrics["end"] == "running" and len(times) == metrics["steps"] + 1
+                assert sorted(p.name for p in tmp_path.iterdir()) == files(2)
+                seen.append(metrics["steps"])
+
+    task.run(episode, lambda **_: None, [recorder, TeamSaver(episode, recorder, every_s=0.0), Look()])
+    assert episode.end == "time" and seen and seen[0] <= 1
