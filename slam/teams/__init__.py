@@ -1,4 +1,7 @@
-"""Teams.
+"""Teams: several robots map one building, each by a filter of its own, and their maps are merged.
 
-``account``
+``account`` is what a robot tells the others, of itself only. ``alignment`` finds where one's frame lies in
+another's, from candidates by ``constellation`` that ``contradiction`` rules out by free space; ``sighting`` says
+it by one robot seeing another. ``fusion`` makes one map of accounts, from scratch each time and never fed back, by
+the Gaussian in ``joint``; ``frames`` takes poses, points and walls from one frame into another.
 """

@@ -34,7 +34,7 @@ class Account:
     kinds: NDArray[np.int8]  # (n,) CONVEX, CONCAVE or 0 where not known
     directions: Array  # (n,) of the bisector into free space [rad], nan where not known
     times_seen: NDArray[np.int64]  # (n,)
-    walls: Array  # (k, 2) α [rad], r [m]: x cos α + y sin α = r, the normal pointing into the wall, so r may be < 0
+    walls: Array  # (k, 2) α [rad], r [m]: x cos α + y sin α = r, the normal points into the wall, r may be < 0
     wall_ends: Array  # (k, 4) x1, y1, x2, y2 [m]: as far as they were seen
     cov: Array  # (3 + 2n + 2k,) squared: of pose, points, walls (α, r), in ordinary coordinates
 

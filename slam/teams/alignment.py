@@ -1,8 +1,8 @@
 """Where one robot's frame lies in another's, found by what both have mapped: never a guess.
 
-Candidates come from pairs of corners (``constellation``), each is fitted to all landmarks of both accounts together
-(``joint``), and one is taken only if it explains much, contradicts nothing, and has no rival that explains nearly as
-much: rooms repeat, and a corridor looks the same from both ends. Else the answer is None.
+Candidates come from corners (``constellation``). Each is fitted to all landmarks of both accounts together
+(``joint``), and one is taken only if it explains much, contradicts nothing, and has no rival that explains nearly
+as much: rooms repeat, and a corridor looks the same from both ends. Else the answer is None.
 """
 
 from __future__ import annotations
@@ -55,7 +55,14 @@ class AlignmentConfig:
 
     def __post_init__(self) -> None:
         not_negative(
-            self, "rival_share", "rival_m", "rival_rad", "most_refused", "most_contradicted", "sigma_m", "sigma_rad"
+            self,
+            "rival_share",
+            "rival_m",
+            "rival_rad",
+            "most_refused",
+            "most_contradicted",
+            "sigma_m",
+            "sigma_rad",
         )
         for name in ("gate", "outlier_gate", "prior_gate"):
             require(0 < getattr(self, name) < 1, f"AlignmentConfig.{name} must be in (0, 1)")
@@ -92,8 +99,8 @@ def align(
     grids
         The maps of a and b, each in its own frame; walls of one must not stand in free space of the other.
     prior
-        Pose ``(3,)`` and covariance ``(3, 3)`` of b's frame in a's from elsewhere (known starts, a sighting): where
-        to look. It only gates; the alignment speaks of the landmarks alone, so that nothing is counted twice.
+        Pose ``(3,)`` and covariance ``(3, 3)`` of b's frame in a's from elsewhere (known starts, a sighting):
+        where to look. It only gates: the alignment speaks of the landmarks alone, and nothing counts twice.
     """
     config = config or AlignmentConfig()
     guesses = list(candidates(a, b, config.constellation))
@@ -102,14 +109,16 @@ def align(
     found: list[_Fit] = []
     for guess in guesses:
         fit = _fit(a, b, guess, config, grids)
-        if fit is None or (prior is not None and not _near_prior(fit.pose, fit.joint.cov[-3:, -3:], prior, config)):
+        if fit is None or (
+            prior is not None and not _near_prior(fit.pose, fit.joint.cov[-3:, -3:], prior, config)
+        ):
             continue
         if not any(_same_place(fit.pose, other.pose, config) for other in found):
             found.append(fit)
-    found.sort(key=lambda fit: -fit.count)
+    found.sort(key=lambda fit: -fit.matches)
     if not found:
         return None
-    rival = found[1].count / found[0].count if len(found) > 1 else 0.0
+    rival = found[1].matches / found[0].matches if len(found) > 1 else 0.0
     fewest = config.fewest if grids is not None else config.fewest_without_grids
     fewest = config.fewest_with_prior if prior is not None else fewest
     if rival > config.rival_share or not _believable(found[0], fewest, config):
@@ -135,12 +144,13 @@ class _Fit(NamedTuple):
         return np.asarray(self.joint.frames[1], np.float64)
 
     @property
-    def count(self) -> int:
+    def matches(self) -> int:
         return len(self.points) + len(self.walls)
 
 
 def _fit(
-    a: Account, b: Account, guess: Array, config: AlignmentConfig, grids: tuple[OccupancyGrid, OccupancyGrid] | None
+    a: Account, b: Account, guess: Array, config: AlignmentConfig,
+    grids: tuple[OccupancyGrid, OccupancyGrid] | None,
 ) -> _Fit | None:  # fmt: skip
     """Fit a candidate; None where there is nothing to fit, or one map's walls stand in the other's free space."""
     pose = guess
@@ -183,7 +193,7 @@ def _agreeing(joint: Joint, config: AlignmentConfig) -> NDArray[np.bool_]:
 def _believable(fit: _Fit, fewest: tuple[int, int], config: AlignmentConfig) -> bool:
     sigmas = np.sqrt(np.diag(fit.joint.cov[-3:, -3:]))
     return bool(
-        len(fit.points) >= fewest[0] and fit.count >= fewest[1] and fit.refused <= config.most_refused
+        len(fit.points) >= fewest[0] and fit.matches >= fewest[1] and fit.refused <= config.most_refused
         and sigmas[:2].max() <= config.sigma_m and sigmas[2] <= config.sigma_rad
     )  # fmt: skip
 

@@ -42,7 +42,16 @@ class ConstellationConfig:
 
     def __post_init__(self) -> None:
         positive(
-            self, "shortest_m", "neighbours", "length_m", "turn_rad", "near_m", "places", "count", "wall_turn_rad", "overlap_m"
+            self,
+            "shortest_m",
+            "neighbours",
+            "length_m",
+            "turn_rad",
+            "near_m",
+            "places",
+            "count",
+            "wall_turn_rad",
+            "overlap_m",
         )
         require(len(self.tolerances_m) > 0, "ConstellationConfig.tolerances_m must not be empty")
 
@@ -79,7 +88,7 @@ def _pairs(points: Array, neighbours: int, shortest: float) -> Pairs:
     apart[apart < shortest] = np.inf
     nearest = np.argsort(apart, axis=1, kind="stable")[:, :neighbours]
     pairs = np.column_stack([np.repeat(np.arange(len(points)), nearest.shape[1]), nearest.ravel()])
-    return pairs[np.isfinite(apart[pairs[:, 0], pairs[:, 1]])]
+    return np.asarray(pairs[np.isfinite(apart[pairs[:, 0], pairs[:, 1]])], np.int64)
 
 
 def _by_pairs(
@@ -118,11 +127,13 @@ def _by_single_corners(a: Account, b: Account, rows_a: NDArray[np.int64], rows_b
     p, q = p[alike], q[alike]
     turn = a.directions[p] - b.directions[q]
     # The mean turn between walls near that one: theirs is known to a fraction of a degree.
-    between = (a.walls[:, None, 0] - b.walls[None, :, 0]).ravel()
+    between = np.sort(wrap(a.walls[:, None, 0] - b.walls[None, :, 0]).ravel())
+    between = np.concatenate([between - 2.0 * math.pi, between, between + 2.0 * math.pi])
+    total = np.concatenate([[0.0], np.cumsum(between)])
+    turn = wrap(turn)
     for window in (0.15, 0.05):
-        off = wrap(between[None] - turn[:, None])
-        near = np.abs(off) < window
-        turn = turn + np.where(near, off, 0.0).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
+        low, high = np.searchsorted(between, turn - window), np.searchsorted(between, turn + window)
+        turn = np.where(high > low, (total[high] - total[low]) / np.maximum(high - low, 1), turn)
     c, s = np.cos(turn), np.sin(turn)
     x, y = b.points[q].T
     return np.column_stack([a.points[p] - np.column_stack([c * x - s * y, s * x + c * y]), wrap(turn)])
@@ -133,8 +144,10 @@ def _support(
     config: ConstellationConfig,
 ) -> Array:  # fmt: skip
     """Return for each pose ``(h,)`` how many of b's corners have one of a's that may be the same."""
+    rows_a = rows_a[np.argsort(a.points[rows_a, 0], kind="stable")]
     there, theirs = (
-        np.column_stack([x.points[rows], x.directions[rows], x.kinds[rows]]) for x, rows in ((a, rows_a), (b, rows_b))
+        np.column_stack([x.points[rows], x.directions[rows], x.kinds[rows]])
+        for x, rows in ((a, rows_a), (b, rows_b))
     )
     out = np.zeros(len(poses))
     _count_near(np.ascontiguousarray(poses), there, theirs, config.near_m, config.turn_rad, out)
@@ -143,55 +156,26 @@ def _support(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _count_near(poses: Array, a: Array, b: Array, near: float, most_turn: float, out: Array) -> None:
-    """Do what :func:`_support` says; rows are x, y, direction, kind. Nearer counts more: the middle comes first."""
+    """Do what :func:`_support` says; rows are x, y, direction, kind, those of ``a`` by rising x.
+
+    Nearer counts more, so that of many poses about one place the middle comes first.
+    """
+    xs = a[:, 0].copy()
     for k in range(len(poses)):
         x, y, turn = poses[k]
         c, s = math.cos(turn), math.sin(turn)
         for j in range(len(b)):
             bx, by = x + c * b[j, 0] - s * b[j, 1], y + s * b[j, 0] + c * b[j, 1]
             least = near * near
-            for i in range(len(a)):
-                squared = (bx - a[i, 0]) ** 2 + (by - a[i, 1]) ** 2
+            for i in range(np.searchsorted(xs, bx - near), len(a)):
+                if xs[i] > bx + near:
+                    break
+                squared = (bx - xs[i]) ** 2 + (by - a[i, 1]) ** 2
                 if squared < least and a[i, 3] == b[j, 3]:
                     off = wrap_scalar(a[i, 2] - b[j, 2] - turn)
                     if abs(off) < most_turn:
                         least = squared
             out[k] += 1.0 - least / (near * near)
-
-
-def _by_single_corners(a: Account, b: Account, rows_a: NDArray[np.int64], rows_b: NDArray[np.int64]) -> Array:
-    """Return the frame ``(h, 3)`` by every corner of b's that is of the kind of one of a's."""
-    p, q = (x.ravel() for x in np.meshgrid(rows_a, rows_b, indexing="ij"))
-    alike = a.kinds[p] == b.kinds[q]
-    p, q = p[alike], q[alike]
-    turn = a.directions[p] - b.directions[q]
-    # The mean turn between walls near that one: theirs is known to a fraction of a degree.
-    between = (a.walls[:, None, 0] - b.walls[None, :, 0]).ravel()
-    for window in (0.15, 0.05):
-        off = wrap(between[None] - turn[:, None])
-        near = np.abs(off) < window
-        turn = turn + np.where(near, off, 0.0).sum(axis=1) / np.maximum(near.sum(axis=1), 1)
-    c, s = np.cos(turn), np.sin(turn)
-    x, y = b.points[q].T
-    return np.column_stack([a.points[p] - np.column_stack([c * x - s * y, s * x + c * y]), wrap(turn)])
-
-
-def _support(
-    a: Account, b: Account, rows_a: NDArray[np.int64], rows_b: NDArray[np.int64], poses: Array,
-    config: ConstellationConfig,
-) -> Array:  # fmt: skip
-    """Return for each pose ``(h,)`` how many of b's corners have one of a's that may be the same."""
-    points_a, points_b = a.points[rows_a], b.points[rows_b]
-    same_kind = a.kinds[rows_a][None] == b.kinds[rows_b][:, None]
-    turns = a.directions[rows_a][None] - b.directions[rows_b][:, None]
-    out = np.zeros(len(poses))
-    for k, pose in enumerate(poses):
-        apart = transform_points(pose, points_b)[:, None] - points_a[None]
-        near = same_kind & (np.abs(wrap(turns - pose[2])) < config.turn_rad)
-        squared = np.where(near, np.einsum("bai,bai->ba", apart, apart), np.inf).min(axis=1)
-        # Nearer is better, so that of many candidates for one place the middle comes first.
-        out[k] = np.maximum(0.0, 1.0 - squared / config.near_m**2).sum()
-    return out
 
 
 # ---- which landmarks are the same ------------------------------------------------------------------------------
@@ -242,7 +226,7 @@ def _mutual(apart: Array, most: float) -> Pairs:
     row, column = apart.argmin(axis=1), apart.argmin(axis=0)
     rows = np.arange(len(apart))
     good = (column[row] == rows) & (apart[rows, row] < most)
-    return np.column_stack([rows, row])[good].astype(np.int64)
+    return np.asarray(np.column_stack([rows, row])[good], np.int64)
 
 
 def rigid_fit(a: Account, b: Account, pose: Array, points: Pairs, walls: Pairs) -> Array:
@@ -260,6 +244,6 @@ def rigid_fit(a: Account, b: Account, pose: Array, points: Pairs, walls: Pairs) 
     step = np.linalg.lstsq(jacobian, -residual, rcond=None)[0]
     if not math.isfinite(float(step.sum())):
         return pose
-    out = pose + step
+    out = np.asarray(pose + step, np.float64)
     out[2] = float(wrap(out[2]))
     return out

@@ -51,7 +51,7 @@ def pose_into(frame: Array, pose: Array) -> tuple[Array, Array, Array]:
 
 
 def points_into(frame: Array, points: Array) -> tuple[Array, Array, Array]:
-    """Return points ``(n, 2)`` in the outer frame, and Jacobians ``(n, 2, 2)`` by point, ``(n, 2, 3)`` by frame."""
+    """Return points ``(n, 2)`` in the outer frame, and Jacobians by point ``(n, 2, 2)``, frame ``(n, 2, 3)``."""
     moved = transform_points(frame, points)
     by_point = np.broadcast_to(rotation(float(frame[2])), (len(points), 2, 2))
     by_frame = np.zeros((len(points), 2, 3))

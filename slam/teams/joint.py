@@ -45,7 +45,8 @@ class SameConfig:
     """How much of what two robots find of one landmark differs beyond their filters' covariances.
 
     Corners are seen from other sides, walls in other pieces; an account's landmarks are each given so much of an
-    error of their own. Chosen so that over apartments of the training seeds 0-49 the NEES/3 of alignments is near 1.
+    error of their own. Chosen so that the NEES/3 of alignments in apartments of the training
+    seeds 0-49 is near 1.
     """
 
     point_sigma_m: float = 0.001
@@ -147,7 +148,8 @@ def joint_of(
             outlying[k] = w @ np.linalg.lstsq(block, w, rcond=None)[0]
     chi_square = float(left @ weighed)
     return Joint(
-        x=y[:s], frames=np.column_stack([y[s::3], y[s + 1 :: 3], wrap(y[s + 2 :: 3])]), cov=cov, starts=starts[:-1],
+        x=y[:s], frames=np.column_stack([y[s::3], y[s + 1 :: 3], wrap(y[s + 2 :: 3])]), cov=cov,
+        starts=starts[:-1],
         chi_square=chi_square, dof=2 * len(links) - free, outlying=outlying,
     )  # fmt: skip
 
