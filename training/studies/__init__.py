@@ -2,6 +2,6 @@
 
 ``consistency`` (also in ``circle_world``), ``complexity``, ``belief``, ``dp_slam_cost`` and ``calibrate`` ask
 estimators, ``speed``, ``speed_batch``, ``scale``, ``recording_cost`` and ``digests`` the code; ``paper_b``,
-``paper_c`` and ``paper_d`` repeat the papers' claims; ``recovery`` makes faults. ``peers`` are other simulators
-under the same load, ``exploring`` is the episode that several run.
+``paper_c`` and ``paper_d`` repeat the papers' claims; ``recovery`` makes faults, ``teams`` are of several
+robots. ``peers`` are other simulators under the same load, ``exploring`` is the episode that several run.
 """
