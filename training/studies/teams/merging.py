@@ -137,7 +137,7 @@ def _judged(found: Alignment, a: _Told, b: _Told, true: Array, prior: tuple[Arra
     frames = None
     if prior is not None:
         frames = {0: (np.zeros(3), np.zeros((3, 3))), 1: prior}
-    if right:
+    if right and len(a.corners):  # caves have none
         row |= _merged(fuse([a.account, b.account], [found], frames=frames), a, b, true)
     return row
 
@@ -172,7 +172,8 @@ def summarise(rows: Mapping[Job, Row]) -> dict[str, Row]:
         missed = [row["overlap"] for row in rows.values() if row[name]["outcome"] == "none"]
 
         def mean(key: str, dof: int, right: list[Row] = right) -> float | None:
-            values = [v for t in right for v in (t[key] if isinstance(t[key], list) else [t[key]])]
+            told = [t[key] for t in right if key in t]
+            values = [v for t in told for v in (t if isinstance(t, list) else [t])]
             return statistics.fmean(values) / dof if values else None
 
         out[name] = {
