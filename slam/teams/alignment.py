@@ -38,7 +38,7 @@ class AlignmentConfig:
     constellation: ConstellationConfig = field(default_factory=ConstellationConfig)
     same: SameConfig = field(default_factory=SameConfig)
     # Matched corners, and corners and walls together. In apartments of the training seeds 50-249 up to 7 and 15 of
-    # them agreed on a wrong place, and never without a third of one map's walls in the other's free space.
+    # them agreed on a wrong place, and never without a quarter of one map's walls in the other's free space.
     fewest: tuple[int, int] = (2, 8)
     fewest_without_grids: tuple[int, int] = (9, 22)
     fewest_with_prior: tuple[int, int] = (1, 4)
