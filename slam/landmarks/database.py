@@ -1,6 +1,6 @@
 """The cartographic database: landmarks, what distinguishes them and how they relate (theory.md, paper D).
 
-An SQLite file, readable with any SQLite tool, of three tables:
+An SQLite file, readable with any SQLite tool, of these tables:
 
 ``landmarks(id, kind, x, y, var_x, var_y, cov_xy, angle, times_seen)``
     One row a landmark: position [m] and covariance [m²] in the map's frame; ``kind`` is ``convex``,
@@ -9,6 +9,8 @@ An SQLite file, readable with any SQLite tool, of three tables:
 ``relations(a, b, distance, distance_sigma, correlation)``
     One row a pair a < b of near neighbours; see :func:`relate`. Relative positions are known far better than
     absolute ones (theory.md, paper B, 2): here that can be read off.
+``sightings(landmark, robot)``
+    Which robots have a landmark in their maps; empty where one robot alone made the map.
 ``meta(key, value)``
     ``schema_version``, ``frame``, ``units``, ``backend``.
 """
@@ -17,6 +19,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,7 +34,8 @@ __all__ = ["SCHEMA_VERSION", "LandmarkMap", "read_landmark_map", "relate", "writ
 
 Array = NDArray[np.float64]
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""That of what is written. Version 1 had no ``sightings``, and is read as if there were none."""
 
 _KIND_NAMES = {CONVEX: "convex", CONCAVE: "concave", 0: "unknown"}
 
@@ -52,6 +56,11 @@ CREATE TABLE relations (
     correlation REAL,
     PRIMARY KEY (a, b), CHECK (a < b)
 ) WITHOUT ROWID;
+CREATE TABLE sightings (
+    landmark INTEGER NOT NULL REFERENCES landmarks (id),
+    robot INTEGER NOT NULL,
+    PRIMARY KEY (landmark, robot)
+) WITHOUT ROWID;
 """
 
 
@@ -60,6 +69,7 @@ _LANDMARKS = [
     ("times_seen", "i8"),
 ]  # fmt: skip
 _RELATIONS = [("a", "i8"), ("b", "i8"), ("distance", "f8"), ("distance_sigma", "f8"), ("correlation", "f8")]
+_SIGHTINGS = [("landmark", "i8"), ("robot", "i8")]
 
 
 class LandmarkMap(NamedTuple):
@@ -68,6 +78,7 @@ class LandmarkMap(NamedTuple):
     landmarks: NDArray[np.void]  # (n,) by rising id
     relations: NDArray[np.void]  # (r,) by rising pair
     meta: dict[str, str]
+    sightings: NDArray[np.void]  # (s,) by rising landmark, then robot
 
 
 def relate(
@@ -129,6 +140,7 @@ def write_landmark_map(
     kinds: ArrayLike | None = None,
     angles: ArrayLike | None = None,
     times_seen: ArrayLike | None = None,
+    seen_by: Sequence[Iterable[int]] | None = None,
     backend: str = "",
     frame: str = "start",
     neighbours: int = 8,
@@ -151,6 +163,8 @@ def write_landmark_map(
         Direction of each corner's bisector into free space [rad], nan where not known.
     times_seen : (n,) int, optional
         Number of observations; 0 where not counted.
+    seen_by : (n,) of robots' ids, optional
+        Which robots have each landmark in their maps, where several made the map together.
     backend, frame : str
         Who estimated this, and in which frame: by default that of the robot's start.
     neighbours : int
@@ -187,6 +201,10 @@ def write_landmark_map(
         (*pair, *map(_or_null, values))
         for pair, *values in zip(names[order][pairs].tolist(), *(m.tolist() for m in measures), strict=True)
     ]
+    robots = [()] * n if seen_by is None else [sorted({int(robot) for robot in seen}) for seen in seen_by]
+    if len(robots) != n:
+        raise ValueError(f"landmark seen_by must have length {n}, got {len(robots)}")
+    sightings = [(int(names[i]), robot) for i in order for robot in robots[i]]
     meta = {"backend": backend, "frame": frame, "schema_version": str(SCHEMA_VERSION), "units": "m, rad"}
     with replacing(path) as temporary, closing(sqlite3.connect(temporary)) as database:
         # A half-written temporary file is thrown away whole: no journal is needed.
@@ -194,6 +212,7 @@ def write_landmark_map(
         database.executemany("INSERT INTO meta VALUES (?, ?)", sorted(meta.items()))
         database.executemany("INSERT INTO landmarks VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", rows)
         database.executemany("INSERT INTO relations VALUES (?, ?, ?, ?, ?)", relations)
+        database.executemany("INSERT INTO sightings VALUES (?, ?)", sightings)
         database.commit()
 
 
@@ -212,12 +231,15 @@ def read_landmark_map(path: str | Path) -> LandmarkMap:
         # Read-only, so that reading never changes or creates a file.
         with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
             meta = dict(database.execute("SELECT key, value FROM meta"))
-            if meta.get("schema_version") != str(SCHEMA_VERSION):
-                version = meta.get("schema_version")
-                raise ValueError(f"schema version {version!r}, this program reads {SCHEMA_VERSION}")
+            version = meta.get("schema_version")
+            if version not in ("1", str(SCHEMA_VERSION)):
+                raise ValueError(f"schema version {version!r}, this program reads 1 and {SCHEMA_VERSION}")
             landmarks = _read(database, "landmarks", _LANDMARKS)
             relations = _read(database, "relations", _RELATIONS)
-        return LandmarkMap(landmarks, relations, meta)
+            sightings = np.zeros(0, _SIGHTINGS)
+            if version != "1":
+                sightings = _read(database, "sightings", _SIGHTINGS)
+        return LandmarkMap(landmarks, relations, meta, sightings)
     except (sqlite3.Error, ValueError, TypeError, KeyError, OverflowError) as error:
         raise ValueError(f"{path} is not a landmark map: {error}") from error
 

@@ -23,6 +23,10 @@ STUDIES = {
     ),
     "leaderboard": ("training.benchmark.leaderboard", "put a benchmark's figures into a Markdown page"),
     "learned-tour": ("training.dungeons.training", "train learned-tour on plans like the dungeons benchmark's"),
+    "merging": (
+        "training.studies.teams.merging",
+        "maps of two robots that know nothing of each other's start, merged",
+    ),
     "moving-picture": ("training.views.moving_picture", "the README's moving picture"),
     "paper-b": ("training.studies.paper_b", "what EKF-SLAM and FastSLAM do to a map's covariance"),
     "paper-c": (

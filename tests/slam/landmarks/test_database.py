@@ -44,7 +44,7 @@ def test_round_trip(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cov.transpose(2, 0, 1), written["cov"][order])
     np.testing.assert_array_equal(landmarks["angle"], written["angles"][order])
     np.testing.assert_array_equal(landmarks["times_seen"], written["times_seen"][order])
-    assert read.meta == {"schema_version": "1", "frame": "start", "units": "m, rad", "backend": "ekf"}
+    assert read.meta == {"schema_version": "2", "frame": "start", "units": "m, rad", "backend": "ekf"}
     assert len(read.relations) == 10 and (read.relations["a"] < read.relations["b"]).all()
     assert list(tmp_path.iterdir()) == [path]
 
@@ -181,3 +181,26 @@ def test_what_is_not_a_landmark_map(tmp_path: Path) -> None:
     write_landmark_map(path, **example())
     path.write_bytes(path.read_bytes()[:5000])
     refused("not a landmark map")
+
+
+def test_who_saw_a_landmark(tmp_path: Path) -> None:
+    path, written = tmp_path / "landmarks.db", example()
+    write_landmark_map(path, **written, seen_by=[(1, 0), (2,), (), (0, 0), (1,)])
+    read = read_landmark_map(path)
+    assert read.sightings.tolist() == [(0, 0), (3, 2), (5, 1), (7, 0), (7, 1)]
+    with pytest.raises(ValueError, match="seen_by must have length 5"):
+        write_landmark_map(path, **written, seen_by=[(1,)])
+
+
+def test_a_file_of_version_1_is_read(tmp_path: Path) -> None:
+    path, written = tmp_path / "landmarks.db", example()
+    write_landmark_map(path, **written)
+    now = read_landmark_map(path)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("DROP TABLE sightings")
+        database.execute("UPDATE meta SET value = '1' WHERE key = 'schema_version'")
+        database.commit()
+    read = read_landmark_map(path)
+    assert read.landmarks["id"].tolist() == now.landmarks["id"].tolist()
+    np.testing.assert_array_equal(read.landmarks["angle"], now.landmarks["angle"])
+    assert len(read.sightings) == 0 and read.sightings.dtype.names == ("landmark", "robot")
