@@ -55,7 +55,7 @@ def test_every_file_is_there_and_of_the_episode(out: Path) -> None:
         assert len(times) == metrics["steps"] + 1
         apart = np.hypot(*(true[:, :2] - estimate[:, :2]).T)
         assert np.sqrt(np.mean(apart**2)) == pytest.approx(robot["ate_rmse_m"], abs=1e-6)
-        landmarks, _, _ = read_landmark_map(out / f"landmarks_robot_{k}.db")
+        landmarks = read_landmark_map(out / f"landmarks_robot_{k}.db").landmarks
         assert len(landmarks) == robot["landmarks"]
     merged, own = (read_map_server(out / f"{name}.yaml")[0] for name in ("map", "map_robot_0"))
     assert np.count_nonzero(merged != -1) >= np.count_nonzero(own != -1) > 0
