@@ -27,8 +27,8 @@ _LOOK_AGAIN_S = 60.0  # at a frame that is known, for a better one
 class Frames:
     """What a robot knows of the others' frames.
 
-    Maps are laid on each other by their landmarks (:func:`slam.teams.alignment.align`), by the robot with the lower
-    number of two, who tells the other. A sighting, or starts that are known roughly, say where to look; by
+    Maps are laid on each other by their landmarks (:func:`slam.teams.alignment.align`), by the robot with the
+    lower number of two, who tells the other. A sighting, or starts that are known roughly, say where to look; by
     themselves they place a robot, but no map.
 
     Parameters

@@ -180,7 +180,7 @@ def test_frames_are_found_by_maps_and_are_the_true_ones(sigma: float) -> None:
             believed = compose(inverse(member.backend.pose), compose(pose, mate.backend.pose))
             true = compose(inverse(here), there)
             assert np.hypot(*(believed - true)[:2]) < 0.05
-        assert member.belief.grid.known_area_m2 > 1.2 * member.backend.grid.known_area_m2
+        assert member.belief.grid.known_area_m2 > member.backend.grid.known_area_m2 + 1.0
 
 
 def test_frames_need_a_joint_covariance() -> None:
@@ -207,13 +207,7 @@ def test_what_a_team_covers_is_the_union_whatever_the_frames() -> None:
 def test_starts_believed_to_be_elsewhere_are_within_what_is_said() -> None:
     errors = []
     for seed in range(40):
-        team = Team(
-            2,
-            floor_plan=_hall(),
-            config=ALL,
-            team={"start_sigma_m": 0.1, "start_sigma_rad": 0.02},
-            slam="odometry",
-        )
+        team = Team(2, floor_plan=_hall(), config=ALL, team={"start_sigma_m": 0.1, "start_sigma_rad": 0.02})
         team.reset(seed=seed)
         first, second = team.members
         assert np.array_equal(first.backend.pose, np.zeros(3))
