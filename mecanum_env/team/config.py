@@ -64,6 +64,11 @@ class TeamConfig:
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)
     sighting: SightingConfig = field(default_factory=SightingConfig)
 
+    @property
+    def starts_exact(self) -> bool:
+        """Whether beliefs share a frame, but for what they err by themselves."""
+        return self.known_starts and self.start_sigma_m == 0.0 and self.start_sigma_rad == 0.0
+
     def __post_init__(self) -> None:
         require(1 <= self.robots <= 64, f"TeamConfig.robots must be 1 to 64, got {self.robots}")
         if self.starts not in STARTS:

@@ -7,34 +7,26 @@ passes something on passes it on as it was: so no information is counted twice (
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.team.config import TeamConfig
+from mecanum_env.team.frames import Frames
+from mecanum_env.team.reports import Report
 from slam.backend import Backend
 from slam.belief import Teammate
 from slam.geometry import compose, transform_points
 from slam.grids.occupancy import OccupancyGrid
+from slam.teams.account import Account
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Sighting
 
-__all__ = ["Knowledge", "Report"]
+__all__ = ["Knowledge"]
 
 Array = NDArray[np.float64]
 
 _IN_SIGHT_S = 0.5  # a robot seen so lately is where it was seen, whatever it told before
-
-
-class Report(NamedTuple):
-    """What a robot tells of itself, in the frame of its own belief."""
-
-    time_s: float
-    pose: Array  # (3,)
-    goal: Array | None  # (2,) [m]
-    chart_s: float  # when the chart was made
-    chart: Chart | None
 
 
 class Knowledge:
@@ -48,20 +40,20 @@ class Knowledge:
         Its own estimator.
     team : TeamConfig
         How many there are, and what is known of their starts.
-    frame_known : bool
-        Whether its frame is the team's.
     """
 
-    def __init__(self, robot: int, backend: Backend, team: TeamConfig, *, frame_known: bool) -> None:
+    def __init__(self, robot: int, backend: Backend, team: TeamConfig) -> None:
         self.robot = robot
         self.goal: Array | None = None  # (2,) [m] where it says that it goes
         self._backend, self._team = backend, team
         self.heard: dict[int, Report] = {}
+        self._sightings: tuple[Sighting, ...] = ()  # of this step
         self._seen: dict[int, tuple[float, Array]] = {}  # time [s] and pose ``(3,)`` in the own frame
-        self.frames: dict[int, Array | None] = {}  # pose (3,) of others' frames in the own one, None: the same
-        if frame_known and team.known_starts:
-            self.frames = {k: None for k in range(team.robots) if k != robot}
-        self._chart: tuple[float, Chart | None] = (-math.inf, None)
+        self._frames: Frames | None = None  # where they are not all the same
+        if team.robots > 1 and team.belief == "own" and not team.starts_exact:
+            rough = 2.0 * np.diag(np.square((team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad)))
+            self._frames = Frames(robot, backend, rough if team.known_starts else None)
+        self._chart: tuple[float, Chart | None, Account | None] = (-math.inf, None, None)
         self._grid = None if team.belief == "joint" else MergedGrid(backend.grid)
 
     # ---- telling -------------------------------------------------------------------------------------------
@@ -69,11 +61,13 @@ class Knowledge:
     def chart_now(self, time_s: float) -> None:
         """Copy the own map, to be told from now on."""
         if self._grid is not None:
-            self._chart = time_s, Chart.of(self._backend.grid)
+            account = None if self._frames is None else Account.of(self.robot, time_s, self._backend)
+            self._chart = time_s, Chart.of(self._backend.grid), account
 
     def report(self, time_s: float) -> Report:
         """Return what this robot tells of itself."""
-        return Report(time_s, self._backend.pose, self.goal, *self._chart)
+        frames = {} if self._frames is None else dict(self._frames.found)
+        return Report(time_s, self._backend.pose, self._backend.pose_cov, self.goal, *self._chart, frames)
 
     # ---- hearing and seeing --------------------------------------------------------------------------------
 
@@ -90,17 +84,25 @@ class Knowledge:
     def see(self, sightings: tuple[Sighting, ...], time_s: float) -> None:
         """Take note of where the others were measured to be."""
         pose = self._backend.pose
+        self._sightings = sightings
         for robot, (distance, bearing, turn), _ in sightings:
             seen = np.array([distance * math.cos(bearing), distance * math.sin(bearing), turn])
             self._seen[robot] = time_s, compose(pose, seen)
 
-    def merge(self) -> None:
-        """Put the charts that were heard into the map."""
+    def merge(self, time_s: float) -> None:
+        """Put the charts that were heard into the map, as far as it is known where they lie."""
         assert self._grid is not None  # else nobody has a chart to tell of
+        frames = self._frames
+        if frames is not None:
+            for sighting in self._sightings:
+                report = self.heard.get(sighting.robot)
+                if report is not None and report.time_s == time_s:
+                    frames.take_sighting(sighting, report)
+            frames.take_reports(time_s, self.heard, self._chart[2])
         self._grid.take({
-            robot: (report.chart, self.frames[robot])
+            robot: (report.chart, None if frames is None else frames.found[robot])
             for robot, report in self.heard.items()
-            if report.chart is not None and robot in self.frames
+            if report.chart is not None and (frames is None or robot in frames.found)
         })  # fmt: skip
 
     # ---- reading -------------------------------------------------------------------------------------------
@@ -118,12 +120,12 @@ class Knowledge:
         found = []
         for robot in range(self._team.robots):
             report, seen = self.heard.get(robot), self._seen.get(robot)
-            frame = self.frames.get(robot)
-            placed = report is not None and robot in self.frames
+            frame = np.zeros(3) if self._frames is None else self._frames.of(robot)
+            placed = report is not None and frame is not None
             goal = None
-            if placed and report is not None:
+            if report is not None and frame is not None:
                 pose, when, goal = report.pose, report.time_s, report.goal
-                if frame is not None:
+                if self._frames is not None:
                     pose = compose(frame, pose)
                     goal = None if goal is None else transform_points(frame, goal[None])[0]
             if seen is not None and (not placed or seen[0] >= when or time_s - seen[0] <= _IN_SIGHT_S):

@@ -109,8 +109,7 @@ class Member(ExploreEnv):
         # The other bodies' sides behind the plan's surfaces.
         self._surfaces = np.vstack([plan.segments, np.zeros((4 * (self._team.robots - 1), 4))])
         self._others = [k for k in range(self._team.robots) if k != self.number]
-        frame_known = self._shared_ground is not None or self.number == 0
-        self.knowledge = Knowledge(self.number, self.backend, self._team, frame_known=frame_known)
+        self.knowledge = Knowledge(self.number, self.backend, self._team)
 
     def first_look(self) -> dict[str, Any]:
         """Take the first scan; return the first info."""
@@ -137,7 +136,7 @@ class Member(ExploreEnv):
     def _start_backend(self, start: Array, seed: int) -> None:
         team = self._team
         self.start, self.start_cov = start, None
-        if self._shared_ground is not None and (team.start_sigma_m or team.start_sigma_rad):
+        if self._shared_ground is not None and not team.starts_exact:
             self.start = start + self._start_error
             self.start[2] = wrap_scalar(self.start[2])
             sigmas = np.maximum((team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad), _LEAST_SIGMA)

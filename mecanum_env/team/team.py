@@ -26,6 +26,7 @@ from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
 from slam.settings import from_mapping, require, unknown_name
+from slam.teams.account import Account
 from slam.teams.centralised import JointEkf
 
 __all__ = ["Outcome", "Team"]
@@ -96,6 +97,8 @@ class Team:
         self.members = tuple(
             Member(k, self.team, action=action, config=self.config, backend=part) for k, part in enumerate(parts)
         )
+        if self.team.robots > 1 and self.joint is None and not self.team.starts_exact:
+            Account.of(0, 0.0, self.members[0].backend)  # raises where frames could not be found
         self._rng = np.random.default_rng()
         self.active: list[int] = []
         """Numbers of the robots that are still exploring; the others stand where they ended."""
@@ -236,7 +239,7 @@ class Team:
                         reports[robot] = report
             for knowledge in hearing:
                 if knowledge.hear(reports):
-                    knowledge.merge()
+                    knowledge.merge(time_s)
 
     def _share(self, infos: Sequence[dict[str, Any]]) -> None:
         """Put what is the team's into the infos of the active robots."""

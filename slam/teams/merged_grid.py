@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import rotation, transform_points
-from slam.grids.occupancy import OccupancyGrid
+from slam.grids.occupancy import CLASS_OF, OccupancyGrid
 from slam.grids.scan_drawing import ENTROPY_BIT, MAX_LOG_ODDS, MIN_LOG_ODDS, PROBABILITY_BYTE, WORD
 
 __all__ = ["Chart", "MergedGrid"]
@@ -30,6 +30,12 @@ class Chart(NamedTuple):
     def of(cls, grid: OccupancyGrid) -> Chart:
         """Return a copy of a grid."""
         return cls(grid.log_odds.copy(), grid.lattice_origin)
+
+    def grid(self, resolution: float) -> OccupancyGrid:
+        """Return the classes of the cells as a grid of this resolution [m]."""
+        row, col = self.lattice_origin
+        classes = CLASS_OF[self.cells.view(np.uint8)]
+        return OccupancyGrid.from_classes(classes, resolution, (col * resolution, row * resolution))
 
 
 class MergedGrid(OccupancyGrid):

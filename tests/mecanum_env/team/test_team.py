@@ -157,10 +157,42 @@ def test_maps_are_shared_by_those_that_know_their_frames(known: bool) -> None:
         assert np.allclose(b[:2], (9, 3), atol=0.05)
 
 
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_frames_are_found_by_maps_and_are_the_true_ones(sigma: float) -> None:
+    starts = {"known_starts": sigma > 0.0, "start_sigma_m": sigma, "start_sigma_rad": 0.2 * sigma}
+    team = Team(3, rooms="apartment", team=starts, config=ALL)
+    observations = [o for o, _ in team.reset(seed=4)]
+    drivers = [agents.make("nearest-frontier") for _ in team.members]
+    for driver, member in zip(drivers, team.members, strict=True):
+        driver.reset(member.belief)
+    for _ in range(250):
+        actions = {k: drivers[k].act(observations[k], team.members[k].belief) for k in team.active}
+        for k, outcome in team.step(actions).items():
+            observations[k] = outcome.observation
+    for member in team.members:
+        frames = member.knowledge._frames
+        assert frames is not None
+        assert len(frames.found) == 2
+        for other, pose in frames.found.items():
+            mate = team.members[other]
+            here, there = (compose(m.truth.ground.start, m.truth.pose) for m in (member, mate))
+            # Where it believes the other to be, by the other's belief and the frame, against where it is.
+            believed = compose(inverse(member.backend.pose), compose(pose, mate.backend.pose))
+            true = compose(inverse(here), there)
+            assert np.hypot(*(believed - true)[:2]) < 0.05
+        assert member.belief.grid.known_area_m2 > member.backend.grid.known_area_m2 + 1.0
+
+
+def test_frames_need_a_joint_covariance() -> None:
+    with pytest.raises(ValueError, match="invariant-ekf"):
+        Team(2, team={"known_starts": False}, slam="dp-slam")
+
+
 def test_what_a_team_covers_is_the_union_whatever_the_frames() -> None:
     shares = []
     for known in (True, False):
-        team = Team(2, floor_plan=_hall(), config=ALL, team={"known_starts": known}, slam="truth")
+        slam = "truth" if known else "invariant-ekf"
+        team = Team(2, floor_plan=_hall(), config=ALL, team={"known_starts": known}, slam=slam)
         team.reset(seed=0, options={"start_poses": [(2.0, 3.0, 0.0), (9.0, 3.0, 1.0)]})
         _drive(team, 10)
         shares.append(team.coverage_share)
@@ -175,13 +207,7 @@ def test_what_a_team_covers_is_the_union_whatever_the_frames() -> None:
 def test_starts_believed_to_be_elsewhere_are_within_what_is_said() -> None:
     errors = []
     for seed in range(40):
-        team = Team(
-            2,
-            floor_plan=_hall(),
-            config=ALL,
-            team={"start_sigma_m": 0.1, "start_sigma_rad": 0.02},
-            slam="odometry",
-        )
+        team = Team(2, floor_plan=_hall(), config=ALL, team={"start_sigma_m": 0.1, "start_sigma_rad": 0.02})
         team.reset(seed=seed)
         first, second = team.members
         assert np.array_equal(first.backend.pose, np.zeros(3))

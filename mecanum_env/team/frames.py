@@ -1,0 +1,102 @@
+"""Where the frames of the other robots' beliefs lie in a robot's own, where starts are not known for sure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mecanum_env.team.reports import Report
+from slam.backend import Backend
+from slam.geometry import compose, inverse
+from slam.teams.account import Account
+from slam.teams.alignment import align
+from slam.teams.sighting import combine, relative_pose
+from slam.types import Sighting
+
+__all__ = ["Frames"]
+
+Array = NDArray[np.float64]
+
+_TRY_AGAIN_S = 10.0  # maps have to grow before another look finds what one did not
+_LOOK_AGAIN_S = 60.0  # at a frame that is known, for a better one
+
+
+class Frames:
+    """What a robot knows of the others' frames.
+
+    Maps are laid on each other by their landmarks (:func:`slam.teams.alignment.align`), by the robot with the
+    lower number of two, who tells the other. A sighting, or starts that are known roughly, say where to look; by
+    themselves they place a robot, but no map.
+
+    Parameters
+    ----------
+    robot : int
+        Whose.
+    backend : Backend
+        Its estimator, which has to keep a joint covariance.
+    start_cov : Array, optional
+        Covariance ``(3, 3)`` of any other's frame, where starts are known so well.
+    """
+
+    def __init__(self, robot: int, backend: Backend, start_cov: Array | None = None) -> None:
+        self.found: dict[int, Array] = {}
+        """Pose ``(3,)`` of a robot's frame in the own one, as far as maps tell."""
+        self._robot, self._backend, self._start_cov = robot, backend, start_cov
+        self._rough: dict[int, tuple[Array, Array]] = {}  # pose and covariance, by sightings
+        self._looked_s: dict[int, float] = {}
+
+    def of(self, robot: int) -> Array | None:
+        """Return the pose ``(3,)`` of a robot's frame, the best that is known; None where nothing is."""
+        if robot in self.found:
+            return self.found[robot]
+        if robot in self._rough:
+            return self._rough[robot][0]
+        return None if self._start_cov is None else np.zeros(3)
+
+    def take_sighting(self, sighting: Sighting, report: Report) -> None:
+        """Take in that a robot was seen, and what it told at the same instant."""
+        seen = relative_pose(
+            sighting.measured,
+            sighting.cov,
+            self._backend.pose,
+            self._backend.pose_cov,
+            report.pose,
+            report.pose_cov,
+        )
+        before = self._rough.get(sighting.robot)
+        self._rough[sighting.robot] = seen if before is None else combine([before, seen])
+
+    def take_reports(self, time_s: float, heard: Mapping[int, Report], account: Account | None) -> None:
+        """Take over what others found of the frames, and look for those that are not known yet.
+
+        ``account`` is the own one, as the others have it.
+        """
+        for robot, report in heard.items():
+            if robot < self._robot and self._robot in report.frames:
+                self.found[robot] = inverse(report.frames[self._robot])
+            elif robot > self._robot and account is not None and report.account is not None:
+                self._look(time_s, account, report)
+        for robot, report in heard.items():  # by way of another
+            if robot in self.found:
+                for other, frame in report.frames.items():
+                    if other != self._robot and other not in self.found:
+                        self.found[other] = compose(self.found[robot], frame)
+
+    def _look(self, time_s: float, account: Account, report: Report) -> None:
+        assert report.account is not None
+        robot = report.account.robot
+        patience = _LOOK_AGAIN_S if robot in self.found else _TRY_AGAIN_S
+        if time_s - self._looked_s.get(robot, -math.inf) < patience:
+            return
+        self._looked_s[robot] = time_s
+        prior = self._rough.get(robot)
+        if prior is None and self._start_cov is not None:
+            prior = np.zeros(3), self._start_cov
+        chart = report.chart
+        grids = None if chart is None else (self._backend.grid, chart.grid(self._backend.grid.resolution))
+        found = align(account, report.account, grids=grids, prior=prior)
+        if found is not None:
+            self.found[robot] = found.pose

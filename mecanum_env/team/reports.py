@@ -1,0 +1,29 @@
+"""What a robot tells the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from slam.teams.account import Account
+from slam.teams.merged_grid import Chart
+
+__all__ = ["Report"]
+
+Array = NDArray[np.float64]
+
+
+class Report(NamedTuple):
+    """What a robot tells of itself, in the frame of its own belief: nothing in it that others told."""
+
+    time_s: float
+    pose: Array  # (3,)
+    pose_cov: Array  # (3, 3)
+    goal: Array | None  # (2,) [m]
+    chart_s: float  # when chart and account were made
+    chart: Chart | None
+    account: Account | None  # where frames have to be found
+    frames: Mapping[int, Array]  # poses (3,) of others' frames, as far as it found them
