@@ -115,6 +115,10 @@ class Knowledge:
         self._grid.follow()
         return self._grid
 
+    def frame_of(self, robot: int) -> Array | None:
+        """Return the pose ``(3,)`` of a robot's frame in the own one, None where no map can be placed by it."""
+        return np.zeros(3) if self._frames is None else self._frames.found.get(robot)
+
     def teammates(self, time_s: float) -> tuple[Teammate, ...]:
         """Return the others of whom it is known where they are, or were."""
         found = []

@@ -19,10 +19,12 @@ class Explored:
     recordings: list[Recording]
 
 
-def explore_together(out: Path, *, robots: int = 3, steps: int = STEPS, **team: Any) -> Explored:
+def explore_together(
+    out: Path, *, robots: int = 3, steps: int = STEPS, slam: str | None = None, **team: Any
+) -> Explored:
     """Let robots with the nearest-frontier agent explore an apartment for so many steps."""
     setting = read_team(robots=robots, **team)
-    episode = prepare(setting, out=out, rooms="apartment", seed=3, max_steps=steps)
+    episode = prepare(setting, out=out, rooms="apartment", seed=3, max_steps=steps, slam=slam)
     recorder = TeamRecorder()
     run(episode, lambda **_: None, [recorder])
     return Explored(episode, recorder.recordings())

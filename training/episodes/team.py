@@ -26,7 +26,8 @@ from training.runs.running import plain
 from training.runs.signals import interrupt_flag
 
 __all__ = [
-    "FILES", "ROBOT_FILE", "TeamEpisode", "TeamWitness", "files_of", "prepare", "read_team", "run", "tell_goal",
+    "FILES", "LANDMARKS", "ROBOT_FILE", "TeamEpisode", "TeamWitness", "files_of", "prepare", "read_team", "run",
+    "tell_goal",
 ]  # fmt: skip
 
 FILES = ("map.pgm", "map.yaml", "team.png", "config.toml", "report.html", "metrics.json")
@@ -35,6 +36,9 @@ FILES = ("map.pgm", "map.yaml", "team.png", "config.toml", "report.html", "metri
 # An episode with several agents ends as the one does that did worst.
 _WORST_FIRST = ("stuck", "unreachable", "covered", "returned")
 
+
+LANDMARKS = "landmarks.db"
+"""The landmarks of all, where backends keep the covariance that it takes to merge them."""
 
 ROBOT_FILE = re.compile(r"(trajectory_(true|estimate)|landmarks|map)_robot_\d+\.(tum|db|pgm|yaml)")
 """What the names of :func:`files_of` look like."""
@@ -140,7 +144,7 @@ def prepare(
         In one line: which option, file or name is wrong, and what to do.
     """
     with bad_input():
-        files = [*FILES, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
+        files = [*FILES, LANDMARKS, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
         world, run, plan = asked_for(
             out=out, files=files, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed,
             floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,

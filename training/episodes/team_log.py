@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,15 +13,21 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from mecanum_env.episode import score_map
 from mecanum_env.team.team import Team
+from slam.geometry import compose, inverse
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics import measures
+from slam.teams.account import Account
+from slam.teams.alignment import align
+from slam.teams.fusion import MergedMap, fuse
 from slam.teams.merged_grid import Chart, MergedGrid
 
-__all__ = ["TeamLog", "team_map", "team_metrics"]
+__all__ = ["TeamLog", "team_landmarks", "team_map", "team_metrics"]
 
 Array = NDArray[np.float64]
 
 _FIRST_EVERY_S = 1.0  # what several see for the first time within so long is shared between them
+_LOOK_NEAR = np.diag([0.1, 0.1, 0.02]) ** 2  # of a frame that is known, when landmarks are compared [m, m, rad]
+_EXACT = 1e-8 * np.eye(3)  # never exactly zero
 _SUMS = ("path_length_m", "collisions", "relocalisations", "landmarks", "lost_s")
 _MEANS = ("corner_mean_m", "final_position_error_m", "final_heading_error_rad", "anees", "health_mean")
 
@@ -103,12 +110,49 @@ def team_map(team: Team) -> tuple[OccupancyGrid, list[int]]:
     first, *others = team.members
     if team.joint is not None:
         return first.grid, list(range(len(team.members)))
-    frames = first.knowledge.frames
-    known = [member for member in others if member.number in frames]
+    frames = _frames_known(team)
     merged = MergedGrid(first.backend.grid)
-    merged.take({m.number: (Chart.of(m.backend.grid), frames[m.number]) for m in known})
+    merged.take({
+        m.number: (Chart.of(m.backend.grid), frames[m.number] if frames[m.number].any() else None)
+        for m in others
+        if m.number in frames
+    })  # fmt: skip
     merged.follow()
-    return merged, [0, *(member.number for member in known)]
+    return merged, list(frames)
+
+
+def team_landmarks(team: Team) -> MergedMap | None:
+    """Return the landmarks of all robots that are in :func:`team_map`, those that are the same as one.
+
+    None where backends keep no joint covariance, and of a joint belief, which has them already.
+    """
+    frames = _frames_known(team)
+    if team.joint is not None:
+        return None
+    try:
+        accounts = [Account.of(k, team.time_s, team.members[k].backend) for k in frames]
+    except ValueError:
+        return None
+    alignments = []
+    for a, b in combinations(accounts, 2):
+        where = compose(inverse(frames[a.robot]), frames[b.robot])
+        grids = [team.members[account.robot].backend.grid for account in (a, b)]
+        alignments.append(align(a, b, grids=(grids[0], grids[1]), prior=(where, _LOOK_NEAR)))
+    found = [one for one in alignments if one is not None]
+    if team.team.starts_exact:
+        return fuse(accounts, found, frames={k: (pose, _EXACT) for k, pose in frames.items()})
+    tied = {0}
+    for one in sorted(found, key=lambda one: (one.a, one.b)) * len(accounts):
+        tied |= {one.a, one.b} if {one.a, one.b} & tied else set()
+    kept = [one for one in found if one.a in tied]
+    return fuse([account for account in accounts if account.robot in tied], kept)
+
+
+def _frames_known(team: Team) -> dict[int, Array]:
+    """Return the poses of the robots' frames in the first one's, as far as that robot knows them."""
+    knowledge = team.members[0].knowledge
+    found = {k: knowledge.frame_of(k) for k in range(1, len(team.members))}
+    return {0: np.zeros(3)} | {k: pose for k, pose in found.items() if pose is not None}
 
 
 def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:

@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from mecanum_env.team.picture import render_team
 from slam.formats import atomic_write, write_map_server, write_tum
+from slam.landmarks.database import write_landmark_map
 from training.episodes.explore import ENDINGS, EXTRAS
 from training.episodes.recording import Recording
-from training.episodes.team import FILES, TeamEpisode, files_of
-from training.episodes.team_log import team_map
+from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
+from training.episodes.team_log import team_landmarks, team_map
 from training.episodes.team_recording import TeamRecorder
 from training.runs.running import written_together
 from training.views.episode_files import PeriodicSaver, config_text, leftovers, place_of, write_landmarks
@@ -47,6 +49,16 @@ class TeamSaver(PeriodicSaver):
 def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recording]) -> dict[str, Any]:
     team = episode.team
     write_map_server(folder / "map", team_map(team)[0])
+    merged = team_landmarks(team)
+    if merged is not None:
+        write_landmark_map(
+            folder / LANDMARKS, merged.points, cov=merged.point_covs, ids=np.arange(len(merged.points)),
+            joint_cov=merged.points_cov, kinds=merged.kinds,
+            angles=merged.directions, times_seen=merged.times_seen, seen_by=merged.seen_by,
+            backend=episode.config.slam,
+        )  # fmt: skip
+    elif team.joint is not None:
+        write_landmarks(folder / LANDMARKS, team.members[0])
     for member in team.members:
         k, record = member.number, member.truth.record
         write_tum(folder / f"trajectory_true_robot_{k}.tum", record.times, record.true_poses)

@@ -21,7 +21,7 @@ from tests.training.cli.test_explore import run
 from training.cli import main
 from training.episodes import team as task
 from training.episodes.explore import FILES as SINGLE_FILES
-from training.episodes.team import FILES, files_of
+from training.episodes.team import FILES, LANDMARKS, files_of
 from training.episodes.team_recording import TeamRecorder
 from training.views.team_files import TeamSaver
 
@@ -29,7 +29,7 @@ SHORT = ["explore", "--rooms", "rectangular", "--seed", "3", "--max-steps", "15"
 
 
 def files(robots: int) -> list[str]:
-    return sorted([*FILES, *(name for k in range(robots) for name in files_of(k))])
+    return sorted([*FILES, LANDMARKS, *(name for k in range(robots) for name in files_of(k))])
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +57,8 @@ def test_every_file_is_there_and_of_the_episode(out: Path) -> None:
         assert np.sqrt(np.mean(apart**2)) == pytest.approx(robot["ate_rmse_m"], abs=1e-6)
         landmarks = read_landmark_map(out / f"landmarks_robot_{k}.db").landmarks
         assert len(landmarks) == robot["landmarks"]
+    together = read_landmark_map(out / LANDMARKS)
+    assert set(together.sightings["robot"].tolist()) == {0, 1}
     merged, own = (read_map_server(out / f"{name}.yaml")[0] for name in ("map", "map_robot_0"))
     assert np.count_nonzero(merged != -1) >= np.count_nonzero(own != -1) > 0
     assert from_toml(out / "config.toml").coverage_target == 0.95
@@ -64,7 +66,7 @@ def test_every_file_is_there_and_of_the_episode(out: Path) -> None:
 
 def test_the_config_repeats_the_episode(out: Path, tmp_path: Path) -> None:
     assert main(["explore", "--config", str(out / "config.toml"), "--out", str(tmp_path)]) == 0
-    for name in set(files(2)) - {"metrics.json", "landmarks_robot_0.db", "landmarks_robot_1.db"}:
+    for name in set(files(2)) - {"metrics.json"}:
         assert (tmp_path / name).read_bytes() == (out / name).read_bytes(), name
 
 
@@ -80,8 +82,8 @@ def test_files_of_another_episode_are_taken_away(tmp_path: Path, capsys: pytest.
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == metrics_of(tmp_path)
     assert main([*SHORT, *there]) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*SINGLE_FILES, *mine])
-    assert main([*SHORT, "--robots", "2", *there]) == 0
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*files(2), *mine])
+    assert main([*SHORT, "--robots", "2", "--slam", "odometry", *there]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted({*files(2), *mine} - {LANDMARKS})
 
 
 @pytest.mark.parametrize(("how", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

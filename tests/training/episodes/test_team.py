@@ -11,10 +11,11 @@ import pytest
 from mecanum_env.team.config import TeamConfig
 from slam.geometry import compose
 from slam.grids.occupancy import FREE
+from slam.metrics.measures import corner_deviation
 from tests.training.team_episode import STEPS, Explored, explore_together
 from training.episodes import explore as single
 from training.episodes import team as task
-from training.episodes.team_log import team_map
+from training.episodes.team_log import team_landmarks, team_map
 from training.runs.errors import BadInput
 
 
@@ -81,6 +82,22 @@ def test_the_map_of_all_holds_each_robots_own_and_needs_to_know_their_frames(
     apart = explore_together(tmp_path, robots=2, steps=1, unknown_starts=True, communication="none")
     merged, together = team_map(apart.episode.team)
     assert together == [0] and merged.known_cells == apart.episode.team.members[0].backend.grid.known_cells
+
+
+def test_landmarks_of_all_are_merged_where_they_are_the_same(explored: Explored, tmp_path: Path) -> None:
+    team = explored.episode.team
+    merged = team_landmarks(team)
+    assert merged is not None and merged.robots == (0, 1, 2)
+    each = [len(member.backend.belief.landmarks) for member in team.members]
+    assert max(each) <= len(merged.points) < sum(each), "some are the same"
+    assert sum(map(len, merged.seen_by)) == sum(each)
+    assert corner_deviation(merged.points, team.ground.corners).mean < 0.03
+    # Where frames have to be found, only what is tied to the first robot's.
+    apart = explore_together(tmp_path, robots=2, steps=1, unknown_starts=True, communication="none")
+    alone = team_landmarks(apart.episode.team)
+    assert alone is not None and alone.robots == (0,)
+    without = explore_together(tmp_path, robots=2, steps=1, slam="odometry")
+    assert team_landmarks(without.episode.team) is None
 
 
 def test_frames_are_where_the_robots_started(tmp_path: Path) -> None:
