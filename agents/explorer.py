@@ -150,7 +150,14 @@ class Explorer(Agent):
         return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
 
     def _candidates(self, belief: Belief) -> Candidates:
-        cost_map = self._cost_maps.of(belief)
+        found = self._candidates_on(self._cost_maps.of(belief))
+        # A door may be closed by nothing but the margin for a position that is unsure.
+        if self._ending == "unreachable" and not np.isfinite(found.costs).any():
+            sure = self._cost_maps.of(belief, sigma_m=0.0)
+            found = self._candidates_on(sure)
+        return found
+
+    def _candidates_on(self, cost_map: CostMap) -> Candidates:
         watch = self._watch_kept()
         frontiers = find(cost_map, self._frontier_config, watch)
         # Ways are searched for as far as they are asked for: on a large map most frontiers are far away.

@@ -124,8 +124,11 @@ class CostMaps:
         self._weight: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
         self._start = NOTHING  # where the robot was let out of where it stood
 
-    def of(self, belief: Belief) -> CostMap:
-        """Return the planning grid of a belief; its arrays are written into when the next is asked for."""
+    def of(self, belief: Belief, sigma_m: float | None = None) -> CostMap:
+        """Return the planning grid of a belief; its arrays are written into when the next is asked for.
+
+        The position counts as known to ``sigma_m`` where that is given, else as the belief says.
+        """
         config, robot, grid = self._config, self._robot, belief.grid
         wanted = min(config.resolution_m, robot.circumscribed_radius_m / 3.0)
         factor = max(1, round(wanted / grid.resolution))
@@ -144,7 +147,8 @@ class CostMaps:
         x, y = float(belief.pose[0]), float(belief.pose[1])
         row = min(max(int((y - low) // resolution), 1), blocks.classes.shape[0] - 2)
         col = min(max(int((x - left) // resolution), 1), blocks.classes.shape[1] - 2)
-        weight = self._weigh(blocks, changed, resolution, position_sigma(belief.pose_cov))
+        sigma_m = position_sigma(belief.pose_cov) if sigma_m is None else sigma_m
+        weight = self._weigh(blocks, changed, resolution, sigma_m)
         # Wherever the robot stands, it is allowed to stand, and to leave.
         reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
         highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)

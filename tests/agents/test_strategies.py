@@ -8,7 +8,7 @@ import pytest
 import agents
 from mecanum_env.config import RobotConfig
 from slam.grids.occupancy import FREE, UNKNOWN
-from tests.agents.grids import belief_of, drive, fill, half_known, room
+from tests.agents.grids import belief_of, drive, fill, half_known, room, two_rooms
 
 WEIGHING = ("cost-utility", "next-best-view")
 # These maps stand still: with the usual range their frontiers would count as seen from where the robot stands.
@@ -153,3 +153,18 @@ def test_more_places_than_are_weighed_are_drawn_by_the_seed():
     assert len(drawn[0]) == 5
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert not np.array_equal(drawn[0], drawn[2])
+
+
+@pytest.mark.parametrize("name", ["nearest-frontier", "brisk-tour"])
+def test_a_door_that_the_margin_for_an_unsure_position_closes_is_gone_through(name):
+    classes = two_rooms(0.0)
+    fill(classes, 3.9, 1.65, 4.1, 2.25, FREE)  # 0.3 m to either side: enough for the body, but not with the margin
+    for sigma in (0.001, 1.0):
+        agent = agents.make(name, config={"frontiers": SHORT})
+        belief = belief_of(classes, (1.0, 2.0, 0.0), sigma=sigma)
+        agent.reset(belief)
+        goal = agent.choose(belief)
+        assert goal is not None
+        assert goal.pose[0] > 4.5
+    assert agent.choose(belief_of(two_rooms(0.4), (1.0, 2.0, 0.0), sigma=1.0)) is None
+    assert agent.status == "unreachable"
