@@ -35,7 +35,7 @@ from slam.teams.centralised import JointEkf
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
 from training.runs.errors import bad_input
-from training.runs.options import Seeds, Workers
+from training.runs.options import Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
 from training.studies.exploring import AGENT
 
@@ -205,13 +205,15 @@ def study(
     start_sigma_deg: Annotated[float, typer.Option(min=1e-6, help="Of their headings there [degrees].")] = 0.5,
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     workers: Workers = None,
+    ray: Ray = None,
 ) -> None:
     """Explore apartments by several robots; compare one filter for all with a filter each."""
     with bad_input():
         chosen = parse_seeds(seeds)
         make_config(noise=noise)
+    who = workers_of(workers, ray)
     turn = math.radians(start_sigma_deg)
     jobs: list[Job] = [(seed, robots, steps, start_sigma_m, turn, noise) for seed in chosen]
-    rows = list(resume(out / STORE, jobs, explore, workers=workers, what="episodes").values())
+    rows = list(resume(out / STORE, jobs, explore, workers=who, what="episodes").values())
     print(table(rows))
     atomic_write(out / FILES[0], json.dumps({"jobs": jobs, "rows": rows}, indent=1).encode())
