@@ -194,4 +194,5 @@ class Member(ExploreEnv):
         own = self.backend.belief
         if self._team.robots == 1:
             return own
-        return own.in_team(self.knowledge.grid, self.knowledge.teammates(self._steps * self.config.step_s))
+        teammates = self.knowledge.teammates(self._steps * self.config.step_s)
+        return own.in_team(self.number, self.knowledge.grid, teammates)

@@ -48,7 +48,7 @@ class PlainFollower(PathFollower):
             speed = 0.0
         most = min(config.turn_rate_rad_s, self._robot.max_turn_rate_rad_s)
         turn = float(np.clip(config.turn_gain * error, -most, most))
-        return self._send(speed * direction, turn, pose, near, gap, hits(observation, self._lidar))
+        return self._send(speed * direction, turn, pose, near, gap, hits(observation, self._lidar), np.zeros((0, 3)))
 
     def _locate(self, position: Array) -> float:
         end = int(np.searchsorted(self._arc, self._arc[self._index] + 1.0)) + 1
