@@ -199,7 +199,7 @@ class PathFollower:
     def _sides(self, belief: Belief, near: LocalMap) -> Array:
         """Return the lines ``(k, 3)`` that part the robot from others nearby, in the body frame."""
         gap = self.config.robot_gap_m
-        return parting_lines(belief, near, gap_m=gap, speed_m_s=self._robot.max_speed_m_s)
+        return parting_lines(belief, near, self._half, gap_m=gap, speed_m_s=self._robot.max_speed_m_s)
 
     def _map_gap(self, belief: Belief) -> float:
         """Return what the body keeps from the map [m]: the more, the less sure the position is."""

@@ -243,7 +243,7 @@ def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
             room = d - nx * x - ny * y - body
             if k == 0:
                 now[i] = room
-            elif room < min(0.0, now[i] - 0.002):
+            elif room < min(0.0, now[i]) - 1e-6:
                 return False
     return True
 

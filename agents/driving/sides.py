@@ -1,10 +1,11 @@
 """What parts a robot from others nearby: each keeps to its own half of the way between them.
 
 A robot that brakes for another as though that stood still is hit by it where both drive. Both cannot know what the
-other is about to do; but each can see to it that it comes to a stand on its own side of the line halfway between
+other is about to do; but each can see to it that it comes to a stand on its own side of a line halfway between
 them, and then they do not touch, whatever each does. Zhou, Wang, Bandyopadhyay and Schwager, "Fast, on-line
 collision avoidance for dynamic vehicles using buffered Voronoi cells", IEEE RA-L 2017: such lines bound the cell;
-here the body is a rectangle that brakes (:func:`agents.driving.safety.safe_twist`).
+here bodies are rectangles that brake (:func:`agents.driving.safety.safe_twist`), and the line lies halfway between
+their nearest points.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import math
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from agents.driving.safety import LocalMap
@@ -27,11 +29,12 @@ _OLD_S = 1.5  # what is older says no longer where a robot is
 _ROUND_M = 0.6  # how far round a corner two robots may be in each other's way
 
 
-def parting_lines(belief: Belief, near: LocalMap, *, gap_m: float, speed_m_s: float) -> Array:
+def parting_lines(belief: Belief, near: LocalMap, half: Array, *, gap_m: float, speed_m_s: float) -> Array:
     """Return the lines ``(k, 3)`` that the robot's body must not cross, as rows nx, ny, d: n·p ≤ d.
 
-    In the body frame [m]; one for each robot that is on the map nearby and that no wall keeps away. ``gap_m`` is what
-    the body keeps from it, ``speed_m_s`` what another may have driven since it was where it is believed to be.
+    In the body frame [m]; one for each robot that is on the map nearby and that no wall keeps away. ``half`` ``(2,)``
+    are half the length and width [m] of all bodies, ``gap_m`` is what the body keeps from the line, ``speed_m_s`` at
+    what speed another may have driven on since it was where it is believed to be.
     """
     if not belief.teammates:
         return _NONE
@@ -45,9 +48,46 @@ def parting_lines(belief: Belief, near: LocalMap, *, gap_m: float, speed_m_s: fl
         apart = math.hypot(dx, dy)
         if not 1e-6 < apart < reach or mate.age_s > _OLD_S or _walled_off(near, (x, y), (x + dx, y + dy)):
             continue
-        half = 0.5 * (apart - speed_m_s * mate.age_s) - gap_m
-        lines.append(((c * dx + s * dy) / apart, (c * dy - s * dx) / apart, half))
+        ahead, aside = c * dx + s * dy, c * dy - s * dx
+        nx, ny, own, free = _parting(half, ahead, aside, float(mate.pose[2]) - heading)
+        lines.append((nx, ny, own + 0.5 * (free - speed_m_s * mate.age_s) - gap_m))
     return np.array(lines) if lines else _NONE
+
+
+@njit(cache=True, nogil=True)
+def _parting(half: Array, x: float, y: float, turn: float) -> tuple[float, float, float, float]:
+    """Return the direction in which two bodies are farthest apart, in the frame of the first.
+
+    The second is at x, y [m], turned by ``turn`` [rad]. The direction is a side's normal or goes from corner to corner.
+
+    Returns
+    -------
+    tuple
+        Unit vector, how far the first body reaches along it, and the free way from there to the second [m]: the
+        distance between the bodies, negative where they overlap.
+    """
+    c, s = math.cos(turn), math.sin(turn)
+    best_x, best_y, best_own, best = 1.0, 0.0, 0.0, -np.inf
+    for k in range(20):
+        if k < 4:
+            nx, ny = (1.0, 0.0) if k == 0 else (0.0, 1.0) if k == 1 else (c, s) if k == 2 else (-s, c)
+            if nx * x + ny * y < 0.0:
+                nx, ny = -nx, -ny
+        else:
+            i, j = (k - 4) // 4, (k - 4) % 4
+            bx, by = half[0] * (1 - 2 * (j & 1)), half[1] * (1 - (j & 2))
+            nx = x + c * bx - s * by - half[0] * (1 - 2 * (i & 1))
+            ny = y + s * bx + c * by - half[1] * (1 - (i & 2))
+            length = math.hypot(nx, ny)
+            if length < 1e-9:
+                continue
+            nx, ny = nx / length, ny / length
+        own = half[0] * abs(nx) + half[1] * abs(ny)
+        other = half[0] * abs(c * nx + s * ny) + half[1] * abs(c * ny - s * nx)
+        free = nx * x + ny * y - own - other
+        if free > best:
+            best_x, best_y, best_own, best = nx, ny, own, free
+    return best_x, best_y, best_own, best
 
 
 def _walled_off(near: LocalMap, a: tuple[float, float], b: tuple[float, float]) -> bool:

@@ -6,7 +6,7 @@ own part. Ties go to the lower number.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from agents.explorer import Candidates
 from agents.view_points.sight import view_points
 from agents.ways.giving_way import costs_from
 from agents.ways.planning import TravelCosts
-from slam.belief import Belief
+from slam.belief import Belief, Teammate
 
 __all__ = ["Crew", "muster"]
 
@@ -35,6 +35,14 @@ class Crew:
     cells: Cells  # (n, 2) where each piece is looked at from by the robot that is nearest to it
     travel: TravelCosts  # of the first robot: from the same tree all work out the same
 
+    def of(self, kept: NDArray[np.bool_]) -> Crew:
+        """Return the crew with some of the pieces ``(n,)`` alone."""
+        column = np.where(kept, np.cumsum(kept) - 1, -1)
+        bound = np.where(self.bound >= 0, np.append(column, -1)[self.bound], -1)
+        return replace(
+            self, pieces=self.pieces[kept], costs=self.costs[:, kept], cells=self.cells[kept], bound=bound
+        )
+
     def held(self, hold_m: float) -> Array:
         """Return the costs ``(k, n)`` with what each robot is on its way to nearer by so much [weighted m]."""
         costs = self.costs.copy()
@@ -44,16 +52,21 @@ class Crew:
 
 
 def muster(
-    belief: Belief, found: Candidates, *, trust_s: float, range_m: float, beyond_m: float, same_m: float
-) -> Crew | None:
+    belief: Belief, found: Candidates, goal: Array | None, left: NDArray[np.bool_], *, trust_s: float, range_m: float,
+    beyond_m: float, same_m: float,
+) -> Crew | None:  # fmt: skip
     """Return who is counted on, or ``None`` where this robot is alone or has nowhere to go.
+
+    Of itself it reckons as the others do of it: from the same costs all come to the same.
 
     Parameters
     ----------
-    belief
-        What this robot knows.
-    found
-        Its candidates; those with an infinite cost are not shared out.
+    belief, found
+        What this robot knows, and its candidates.
+    goal
+        ``(2,)`` where it has told the others that it goes [m].
+    left
+        ``(m,)`` which candidates there is something to see at.
     trust_s
         How long after it was last heard or seen another robot is counted on [s].
     range_m, beyond_m
@@ -61,29 +74,30 @@ def muster(
     same_m
         A goal nearer than this [m] to the place where a piece is looked at from is that place.
     """
-    pieces = np.flatnonzero(np.isfinite(found.costs))
-    mates = [mate for mate in belief.teammates if mate.age_s <= trust_s]
-    if not mates or not len(pieces):
+    pieces = np.flatnonzero(left)
+    own = Teammate(belief.robot, np.asarray(belief.pose), 0.0, goal)
+    mates = sorted([own, *(mate for mate in belief.teammates if mate.age_s <= trust_s)], key=lambda mate: mate.robot)
+    if len(mates) == 1 or not len(pieces):
         return None
-    cost_map = found.cost_map
     targets, normals = found.frontiers.targets[pieces], found.frontiers.normals[pieces]
-    ahead = -1 if found.current is None else int(np.searchsorted(pieces, found.current))
-    rows = {belief.robot: (found.costs[pieces], found.cells[pieces], ahead, found.travel)}
+    rows = []
     for mate in mates:
-        travel = costs_from(cost_map, np.asarray(mate.pose)[:2])
+        travel = costs_from(found.cost_map, np.asarray(mate.pose)[:2])
         if travel is None:
             continue
-        cells, costs = view_points(cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m)
-        if np.isfinite(costs).any():
-            bound = -1
-            if mate.goal is not None:
-                away = np.where(np.isfinite(costs), np.hypot(*(cost_map.to_points(cells) - mate.goal).T), np.inf)
-                bound = int(np.argmin(away)) if away.min() <= same_m else -1
-            rows[mate.robot] = costs, cells, bound, travel
-    robots = sorted(rows)
-    if len(robots) == 1:
+        cells, costs = view_points(
+            found.cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m
+        )
+        bound = -1
+        if mate.goal is not None and np.isfinite(costs).any():
+            away = np.hypot(*(found.cost_map.to_points(cells) - mate.goal).T)
+            away[~np.isfinite(costs)] = np.inf
+            bound = int(np.argmin(away)) if away.min() <= same_m else -1
+        rows.append((mate.robot, costs, cells, bound, travel))
+    robots = [row[0] for row in rows]
+    if belief.robot not in robots or len(robots) == 1:
         return None
-    costs = np.array([rows[k][0] for k in robots])
-    cells = np.array([rows[k][1] for k in robots])[np.argmin(costs, axis=0), np.arange(len(pieces))]
-    bound = np.array([rows[k][2] for k in robots])
-    return Crew(np.array(robots), robots.index(belief.robot), pieces, costs, bound, cells, rows[robots[0]][3])
+    costs = np.array([row[1] for row in rows])
+    cells = np.array([row[2] for row in rows])[np.argmin(costs, axis=0), np.arange(len(pieces))]
+    bound = np.array([row[3] for row in rows])
+    return Crew(np.array(robots), robots.index(belief.robot), pieces, costs, bound, cells, rows[0][4])

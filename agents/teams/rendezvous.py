@@ -1,14 +1,17 @@
-"""The team's tour with appointments: robots that do not hear each other come together and tell what they know.
+"""The team's tour with appointments: robots that do not hear each other meet again, and tell what they have seen.
 
-At fixed times, all begin to leave off in time to be at the meeting place, where the robots stood at the beginning;
-whoever hears all others need not come. After Hourani, Hauck and Jennings, "Serial rendezvous of robots", and
-de Hoog, Cameron and Visser, "Autonomous multi-robot exploration in communication-limited environments", TAROS 2010.
+All agree on it beforehand, and so no message is needed: every so often they meet where they stood at the beginning,
+and each leaves off in time to be there. Who hears all the others has met them wherever they are. Appointments are
+the simplest way of exploring together under limited range (Roy and Dudek, "Collaborative robot exploration and
+rendezvous", Autonomous Robots 2001).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,19 +22,19 @@ from agents.ways.planning import travel_costs
 from slam.belief import Belief
 from slam.settings import positive
 
-__all__ = ["AppointmentConfig", "Rendezvous", "RendezvousConfig"]
+__all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AppointmentConfig:
+class AppointmentsConfig:
     """When robots meet."""
 
-    every_s: float = 90.0  # between two appointments
-    wait_s: float = 15.0  # for those that are late
-    heard_s: float = 2.0  # robots heard so lately need not meet
-    speed_m_s: float = 0.5  # at which the way there is driven, about
+    every_s: float = 60.0  # from the beginning on
+    wait_s: float = 10.0  # for those that are late
+    heard_s: float = 2.0  # who was heard so lately is there
+    speed_m_s: float = 0.4  # at which the way there is driven, about
 
     def __post_init__(self) -> None:
         positive(self)
@@ -41,40 +44,76 @@ class AppointmentConfig:
 class RendezvousConfig(TeamTourConfig):
     """The team's tour, and when it is broken off."""
 
-    appointments: AppointmentConfig = field(default_factory=AppointmentConfig)
+    appointments: AppointmentsConfig = field(default_factory=AppointmentsConfig)
 
 
 class Rendezvous(TeamTour):
-    """Explores as ``team-tour`` does, and keeps appointments with the robots that it does not hear."""
+    """Explores as ``team-tour`` does, and meets the robots that it does not hear; with nothing left to do, too."""
 
     config: RendezvousConfig
     config_type = RendezvousConfig
 
     def _forget(self) -> None:
         super()._forget()
-        self._place: Array | None = None  # (2,) where to meet
+        self._place: Array | None = None  # (2,) where they meet
         self._team: set[int] = set()  # numbers of all others that were ever known
-        self._kept = 0  # the last appointment that is done with
-        self._meeting = False
+        self._next = 1  # number of the next appointment
+        self._meeting = False  # on its way there, or waiting
 
     def choose(self, belief: Belief) -> Goal | None:
-        """Return the meeting place, where it is time; else the next view point."""
+        """Return the next view point, or the meeting place when it is time."""
         if self._place is None:
-            known = [belief.pose[:2], *(mate.pose[:2] for mate in belief.teammates)]
-            self._place = np.mean(known, axis=0)
+            stood = np.array([belief.pose[:2], *(mate.pose[:2] for mate in belief.teammates)], np.float64)
+            self._place = stood.mean(axis=0)
         self._team |= {mate.robot for mate in belief.teammates}
-        goal = self._appointment(belief)
-        self._meeting = goal is not None
-        return super().choose(belief) if goal is None else goal
-
-    def _appointment(self, belief: Belief) -> Goal | None:
-        """Return the way to the next appointment, or ``None`` while there is time left or none is needed."""
-        config, now = self.config.appointments, self._time
+        config = self.config.appointments
         heard = {mate.robot for mate in belief.teammates if mate.age_s <= config.heard_s}
-        number = self._kept + 1
-        if heard >= self._team or now > number * config.every_s + config.wait_s:
-            # Met, or waited in vain: the next one is the next that is still to come.
-            if now >= number * config.every_s - self._lead_s(belief):
-                self._kept = max(number, math.floor(now / config.every_s))
-            return None
-        return None
+        at_s = self._next * config.every_s
+        if heard == self._team:  # as good as met
+            self._next = max(self._next, math.floor(self._time / config.every_s + 0.5) + 1)
+        elif self._time > at_s + config.wait_s:  # in vain
+            self._next = math.floor(self._time / config.every_s) + 1
+        else:
+            goal, cost = self._way_there(belief)
+            if self._time + cost / config.speed_m_s >= at_s:
+                return self._set_off(goal, cost)
+        if self._meeting:
+            self._target, self._meeting = None, False
+        goal = super().choose(belief)
+        if goal is None and heard != self._team and self._time < self._next * config.every_s + config.wait_s:
+            return self._set_off(*self._way_there(belief))  # the others may know of more
+        return goal
+
+    def _way_there(self, belief: Belief) -> tuple[Goal, float]:
+        """Return the meeting place as a goal, or the place nearest to it that can be reached, and what it costs."""
+        assert self._place is not None
+        cost_map = self._cost_maps.of(belief)
+        travel = travel_costs(cost_map)
+        reached = np.argwhere(np.isfinite(travel.cost))
+        away = np.hypot(*(cost_map.to_points(reached) - self._place).T)
+        row, column = reached[int(np.argmin(away))].tolist()
+        path = self._path(cost_map, travel, (row, column), belief)
+        goal = Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path)
+        return goal, float(travel.cost[row, column])
+
+    def _set_off(self, goal: Goal, cost: float) -> Goal:
+        if not self._meeting:
+            self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
+            self._arrived_for = 0.0
+        self._target, self._meeting, self._status = self._place, True, "driving"
+        return goal
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action on the way to the goal, choosing a goal when one is due."""
+        action = super().act(observation, belief)
+        if self._meeting and self._status == "driving":
+            self._status = "meeting"
+        return action
+
+    def _is_frontier(self, belief: Belief, point: Array) -> bool:
+        return self._meeting or super()._is_frontier(belief, point)
+
+    def _watch(self, belief: Belief) -> None:
+        """Take no note of what it sees from the meeting place, nor of standing there."""
+        if not self._meeting:
+            super()._watch(belief)

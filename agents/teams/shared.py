@@ -28,9 +28,9 @@ class SharingConfig:
 
     trust_s: float = 20.0  # how long a robot that is no longer heard is counted on, where it was
     most: int = 40  # pieces of frontier that are shared out: those nearest to any robot
-    service_m_m2: float = 0.3  # what a square metre of new area counts for, as a way
+    service_m_m2: float = 0.0  # what a square metre of new area counts for, as a way
     depth_m: float = 3.0  # how far behind a frontier new area is expected
-    hold_m: float = 1.0  # shorter is the way to what a robot is on its way to: parts that change hands cost turns
+    hold_m: float = 3.0  # shorter is the way to what a robot is on its way to: parts that change hands cost turns
 
     def __post_init__(self) -> None:
         positive(self, "trust_s", "most", "depth_m")
@@ -57,13 +57,19 @@ class Shared(Explorer):
 
     def _own_part(self, found: Candidates, belief: Belief) -> Candidates:
         """Return the candidates that fall to this robot; where none does, all: it goes along with another."""
+        patience, troubles = self.config.patience, self._troubles.near(found.frontiers.targets)
+        left = np.array([t is None or t.looks < patience.looks for t in troubles], dtype=np.bool_)
         crew = muster(
-            belief, found, trust_s=self._sharing().trust_s, range_m=self._watch_kept().range_m,
-            beyond_m=self.config.frontiers.beyond_m, same_m=self.config.patience.same_m,
+            belief, found, None if self._goal is None else self._goal.pose[:2], left, trust_s=self._sharing().trust_s,
+            range_m=self._watch_kept().range_m, beyond_m=self.config.frontiers.beyond_m, same_m=patience.same_m,
         )  # fmt: skip
         if crew is None:
             return found
-        own = crew.pieces[self._owned(crew, found)]
+        # The farther the way, the more there must be to see: for whoever is nearest.
+        extents = found.frontiers.extents[found.frontiers.target_labels[crew.pieces]]
+        crew = crew.of(extents >= self._frontier_config.wanted_extent(crew.costs.min(axis=0)) - 1e-9)
+        own = crew.pieces[self._owned(crew, found)] if len(crew.pieces) else crew.pieces
+        own = own[np.isfinite(found.costs[own])]
         if not len(own):
             return found
         costs = np.full_like(found.costs, np.inf)

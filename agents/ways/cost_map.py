@@ -71,6 +71,7 @@ class CostMap:
     origin: tuple[float, float]  # lower-left corner of cell (0, 0) in the belief's frame [m]
     start: tuple[int, int]  # the robot's cell
     suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
+    plain: NDArray[np.float32]  # (rows, cols) the weight as it is for whatever robot: wherever they all stand
 
     def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
@@ -149,6 +150,7 @@ class CostMaps:
         row = min(max(int((y - low) // resolution), 1), blocks.classes.shape[0] - 2)
         col = min(max(int((x - left) // resolution), 1), blocks.classes.shape[1] - 2)
         weight = self._weigh(blocks, changed, resolution, position_sigma(belief.pose_cov))
+        plain = weight.copy() if belief.teammates else weight
         self._passing = self._beside_others(belief, (left, low), resolution, weight)
         # Wherever the robot stands, it is allowed to stand, and to leave.
         reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
@@ -159,7 +161,7 @@ class CostMaps:
         )  # fmt: skip
         self._passing.append(Box(row, col, row + 1, col + 1).grown(math.ceil(reach)))
         return CostMap(
-            blocks.classes, blocks.clearance, weight, resolution, (left, low), (row, col), blocks.suspect
+            blocks.classes, blocks.clearance, weight, resolution, (left, low), (row, col), blocks.suspect, plain
         )
 
     def _beside_others(

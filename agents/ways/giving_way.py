@@ -82,7 +82,7 @@ class GivingWay:
             return None
         self._held_s += step_s
         behind = idle or (mate.robot < belief.robot and mate.goal is not None)
-        if self._held_s < (config.patience_s if behind else config.firm_s):
+        if self._held_s + 1e-9 < (config.patience_s if behind else config.firm_s):
             return None
         self._held_s = 0.0
         return mate
@@ -127,12 +127,15 @@ def _way(cost_map: CostMap, mate: Teammate) -> NDArray[np.int64]:
 
 
 def costs_from(cost_map: CostMap, point: Array, *, within_m: float = 0.6) -> TravelCosts | None:
-    """Return the travel costs from elsewhere ``(2,)`` [m]: the nearest cell to it where a robot may be, if any is."""
+    """Return the travel costs from elsewhere ``(2,)`` [m], of a robot that is alone there.
+
+    From the nearest cell to it where a robot may be; ``None`` where there is none so near.
+    """
     span = math.ceil(within_m / cost_map.resolution)
     row, col = (int(v) for v in cost_map.to_cells(np.asarray(point, np.float64)[None])[0])
     low_r, low_c = max(row - span, 0), max(col - span, 0)
-    cells = np.argwhere(cost_map.weight[low_r : row + span + 1, low_c : col + span + 1] > 0.0) + (low_r, low_c)
+    cells = np.argwhere(cost_map.plain[low_r : row + span + 1, low_c : col + span + 1] > 0.0) + (low_r, low_c)
     if not len(cells):
         return None
     start = cells[int(np.argmin(((cells - (row, col)) ** 2).sum(axis=1)))]
-    return travel_costs(replace(cost_map, start=(int(start[0]), int(start[1]))))
+    return travel_costs(replace(cost_map, weight=cost_map.plain, start=(int(start[0]), int(start[1]))))
