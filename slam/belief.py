@@ -78,14 +78,14 @@ class Belief:
         return belief
 
     def in_team(self, robot: int, grid: OccupancyGrid, teammates: tuple[Teammate, ...]) -> Belief:
-        """Return the belief of a team's robot with this number: the team's map in place of its own, and the others."""
+        """Return the belief of a team's robot of this number: with the team's map, and the others."""
         if self._read is None:
             return replace(self, grid=grid, teammates=teammates, robot=robot)
         names = _POSTPONED[:5]
         return Belief.postponed(
             lambda: {name: getattr(self, name) for name in names}, lambda: self.landmark_cov,
-            lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid, health=self.health,
-            teammates=teammates, robot=robot,
+            lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid,
+            health=self.health, teammates=teammates, robot=robot,
         )  # fmt: skip
 
     @property

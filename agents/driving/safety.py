@@ -1,7 +1,7 @@
 """The last check before a twist goes out: the body, braking from it, must come onto nothing.
 
-Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind. And each of two robots
-keeps to its own side of what parts them (:mod:`agents.driving.sides`), so that both can brake, whatever they do.
+Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind. And each of two
+robots keeps to its own side of what parts them (:mod:`agents.driving.sides`): both can brake, whatever they do.
 """
 
 from __future__ import annotations
@@ -137,9 +137,10 @@ def safe_twist(
             continue
         map_now, map_ahead, scan_now, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
         # Already too near: any motion that brings it no nearer is allowed, or it would never get away.
-        if map_ahead >= min(map_gap, map_now - 0.002) and scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002):
-            if len(sides) == 0 or _keeps_side(candidate, sides, guard):
-                return candidate
+        clear = map_ahead >= min(map_gap, map_now - 0.002)
+        clear &= scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002)
+        if clear and (len(sides) == 0 or _keeps_side(candidate, sides, guard)):
+            return candidate
     return np.zeros(3)
 
 
@@ -211,7 +212,8 @@ def body_gaps(
 @njit(cache=True, nogil=True)
 def _braking_s(twist: Array, guard: Guard) -> float:
     """Return how long it takes to brake from a twist [s], speed or turn, whichever takes longer."""
-    return max(math.hypot(twist[0], twist[1]) / guard.braking_m_s2, abs(twist[2]) / guard.turn_braking_rad_s2)
+    speed = math.hypot(twist[0], twist[1])
+    return float(max(speed / guard.braking_m_s2, abs(twist[2]) / guard.turn_braking_rad_s2))
 
 
 @njit(cache=True, nogil=True)
@@ -219,12 +221,12 @@ def _held_s(t: float, twist: Array, guard: Guard) -> float:
     """Return the way covered after a time [s], as seconds at the full twist: uniform braking after the hold."""
     lag, braking = guard.lag_s, _braking_s(twist, guard)
     late = max(t - lag, 0.0)
-    return min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0)
+    return float(min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0))
 
 
 @njit(cache=True, nogil=True)
 def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
-    """Tell whether the body, braking from a twist, crosses none of the lines; or, where it has, goes no farther."""
+    """Tell whether the body, braking from a twist, crosses no line; or, where it has, goes no farther."""
     total = guard.lag_s + _braking_s(twist, guard)
     now = np.empty(len(sides))
     x, y, theta, last = 0.0, 0.0, 0.0, 0.0

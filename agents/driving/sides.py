@@ -32,9 +32,9 @@ _ROUND_M = 0.6  # how far round a corner two robots may be in each other's way
 def parting_lines(belief: Belief, near: LocalMap, half: Array, *, gap_m: float, speed_m_s: float) -> Array:
     """Return the lines ``(k, 3)`` that the robot's body must not cross, as rows nx, ny, d: n·p ≤ d.
 
-    In the body frame [m]; one for each robot that is on the map nearby and that no wall keeps away. ``half`` ``(2,)``
-    are half the length and width [m] of all bodies, ``gap_m`` is what the body keeps from the line, ``speed_m_s`` at
-    what speed another may have driven on since it was where it is believed to be.
+    In the body frame [m]; one for each robot that is on the map nearby and that no wall keeps away. ``half``
+    ``(2,)`` are half the length and width [m] of all bodies, ``gap_m`` is what the body keeps from the line,
+    ``speed_m_s`` at what speed another may have driven on since it was where it is believed to be.
     """
     if not belief.teammates:
         return _NONE
@@ -58,7 +58,8 @@ def parting_lines(belief: Belief, near: LocalMap, half: Array, *, gap_m: float, 
 def _parting(half: Array, x: float, y: float, turn: float) -> tuple[float, float, float, float]:
     """Return the direction in which two bodies are farthest apart, in the frame of the first.
 
-    The second is at x, y [m], turned by ``turn`` [rad]. The direction is a side's normal or goes from corner to corner.
+    The second is at x, y [m], turned by ``turn`` [rad]. The direction is a side's normal, or goes from corner to
+    corner.
 
     Returns
     -------

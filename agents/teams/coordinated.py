@@ -1,10 +1,10 @@
-"""Targets worth less where others will look: Burgard, Moors, Stachniss and Schneider, "Coordinated multi-robot
-exploration", IEEE Transactions on Robotics 2005, algorithm 1.
+"""Targets are worth less where others will look (Burgard et al., 2005).
 
-Robots and targets are paired one after the other, the pair first whose utility less the price of the way, U − β V,
-is largest; each target that is given away lowers the utility of those in sight of it, the more the nearer they are:
-by the share 1 − d / d_max of what is seen at a distance d. Here a robot that has announced its goal keeps it, and
-U is what ``cost-utility`` counts, square metres of new area.
+Burgard, Moors, Stachniss and Schneider, "Coordinated multi-robot exploration", IEEE Transactions on Robotics 2005,
+algorithm 1: robots and targets are paired one after the other, the pair first whose utility less the price of the
+way, U − β V, is largest; each target that is given away lowers the utility of those in sight of it, the more the
+nearer they are, by the share 1 − d / d_max at a distance d. Here a robot that has announced its goal keeps it,
+and U is what ``cost-utility`` counts, square metres of new area.
 """
 
 from __future__ import annotations

@@ -52,8 +52,8 @@ class Crew:
 
 
 def muster(
-    belief: Belief, found: Candidates, goal: Array | None, left: NDArray[np.bool_], *, trust_s: float, range_m: float,
-    beyond_m: float, same_m: float,
+    belief: Belief, found: Candidates, goal: Array | None, left: NDArray[np.bool_], *, trust_s: float,
+    range_m: float, beyond_m: float, same_m: float,
 ) -> Crew | None:  # fmt: skip
     """Return who is counted on, or ``None`` where this robot is alone or has nowhere to go.
 
@@ -76,7 +76,9 @@ def muster(
     """
     pieces = np.flatnonzero(left)
     own = Teammate(belief.robot, np.asarray(belief.pose), 0.0, goal)
-    mates = sorted([own, *(mate for mate in belief.teammates if mate.age_s <= trust_s)], key=lambda mate: mate.robot)
+    mates = sorted(
+        [own, *(mate for mate in belief.teammates if mate.age_s <= trust_s)], key=lambda mate: mate.robot
+    )
     if len(mates) == 1 or not len(pieces):
         return None
     targets, normals = found.frontiers.targets[pieces], found.frontiers.normals[pieces]
@@ -85,19 +87,20 @@ def muster(
         travel = costs_from(found.cost_map, np.asarray(mate.pose)[:2])
         if travel is None:
             continue
-        cells, costs = view_points(
-            found.cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m
-        )
-        bound = -1
+        cells, costs = view_points(found.cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m)
+        ahead = -1
         if mate.goal is not None and np.isfinite(costs).any():
             away = np.hypot(*(found.cost_map.to_points(cells) - mate.goal).T)
             away[~np.isfinite(costs)] = np.inf
-            bound = int(np.argmin(away)) if away.min() <= same_m else -1
-        rows.append((mate.robot, costs, cells, bound, travel))
+            ahead = int(np.argmin(away)) if away.min() <= same_m else -1
+        rows.append((mate.robot, costs, cells, ahead, travel))
     robots = [row[0] for row in rows]
     if belief.robot not in robots or len(robots) == 1:
         return None
-    costs = np.array([row[1] for row in rows])
-    cells = np.array([row[2] for row in rows])[np.argmin(costs, axis=0), np.arange(len(pieces))]
-    bound = np.array([row[3] for row in rows])
-    return Crew(np.array(robots), robots.index(belief.robot), pieces, costs, bound, cells, rows[0][4])
+    all_costs = np.array([row[1] for row in rows])
+    return Crew(
+        robots=np.array(robots), own=robots.index(belief.robot), pieces=pieces, costs=all_costs,
+        bound=np.array([row[3] for row in rows]),
+        cells=np.array([row[2] for row in rows])[np.argmin(all_costs, axis=0), np.arange(len(pieces))],
+        travel=rows[0][4],
+    )  # fmt: skip

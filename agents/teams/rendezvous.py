@@ -1,9 +1,9 @@
 """The team's tour with appointments: robots that do not hear each other meet again, and tell what they have seen.
 
-All agree on it beforehand, and so no message is needed: every so often they meet where they stood at the beginning,
-and each leaves off in time to be there. Who hears all the others has met them wherever they are. Appointments are
-the simplest way of exploring together under limited range (Roy and Dudek, "Collaborative robot exploration and
-rendezvous", Autonomous Robots 2001).
+All agree on it beforehand, so that no message is needed: every so often they meet where they stood at the
+beginning, and each leaves off in time to be there. Who hears all the others has met them wherever they are.
+Appointments are the simplest way of exploring together under limited range (Roy and Dudek, "Collaborative robot
+exploration and rendezvous", Autonomous Robots 2001).
 """
 
 from __future__ import annotations
@@ -74,9 +74,9 @@ class Rendezvous(TeamTour):
         elif self._time > at_s + config.wait_s:  # in vain
             self._next = math.floor(self._time / config.every_s) + 1
         else:
-            goal, cost = self._way_there(belief)
+            there, cost = self._way_there(belief)
             if self._time + cost / config.speed_m_s >= at_s:
-                return self._set_off(goal, cost)
+                return self._set_off(there, cost)
         if self._meeting:
             self._target, self._meeting = None, False
         goal = super().choose(belief)
@@ -85,7 +85,7 @@ class Rendezvous(TeamTour):
         return goal
 
     def _way_there(self, belief: Belief) -> tuple[Goal, float]:
-        """Return the meeting place as a goal, or the place nearest to it that can be reached, and what it costs."""
+        """Return the meeting place, or the place nearest to it that can be reached, as a goal, and its cost."""
         assert self._place is not None
         cost_map = self._cost_maps.of(belief)
         travel = travel_costs(cost_map)

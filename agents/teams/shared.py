@@ -1,4 +1,4 @@
-"""An explorer that keeps to its own part of what is left: the frontiers that fall to it when tours are shared out."""
+"""An explorer that keeps to its part of what is left: what falls to it when tours are shared out."""
 
 from __future__ import annotations
 
@@ -53,15 +53,17 @@ class Shared(Explorer):
         area = expected_area(
             found.cost_map, cells, range_m=self._lidar.range_max_m, depth_m=config.depth_m, rays=60
         )
-        return near[share_tours(starts, distance, config.service_m_m2 * area) == crew.own]
+        owner = share_tours(starts, distance, config.service_m_m2 * area)
+        return np.asarray(near[owner == crew.own])
 
     def _own_part(self, found: Candidates, belief: Belief) -> Candidates:
         """Return the candidates that fall to this robot; where none does, all: it goes along with another."""
         patience, troubles = self.config.patience, self._troubles.near(found.frontiers.targets)
         left = np.array([t is None or t.looks < patience.looks for t in troubles], dtype=np.bool_)
         crew = muster(
-            belief, found, None if self._goal is None else self._goal.pose[:2], left, trust_s=self._sharing().trust_s,
-            range_m=self._watch_kept().range_m, beyond_m=self.config.frontiers.beyond_m, same_m=patience.same_m,
+            belief, found, None if self._goal is None else self._goal.pose[:2], left,
+            trust_s=self._sharing().trust_s, range_m=self._watch_kept().range_m,
+            beyond_m=self.config.frontiers.beyond_m, same_m=patience.same_m,
         )  # fmt: skip
         if crew is None:
             return found

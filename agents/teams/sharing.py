@@ -1,4 +1,4 @@
-"""Places shared out among robots: one each at the least total cost, or tours for all that end at about one time."""
+"""Places shared out: one for each robot at the least total cost, or tours that end at about one time."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POWER = 3.0  # of the tours' lengths, summed up: the higher, the more the longe
 
 
 def assign(costs: Array) -> Indices:
-    """Return for each robot ``(k,)`` the column of its place, −1 for none: the least total of ``costs`` ``(k, n)``.
+    """Return the column of each robot's place ``(k,)``, −1 for none: the least total of ``costs`` ``(k, n)``.
 
     As many robots as can get one do. The Hungarian method's problem (Kuhn, 1955).
     """
@@ -44,9 +44,9 @@ def tour_length(start: Array, distance: Array, service: Array, tour: Indices) ->
 def share_tours(starts: Array, distance: Array, service: Array) -> Indices:
     """Return the robot ``(n,)`` that each place goes to, so that all tours end at about one time.
 
-    Several travelling salesmen without a way back, who want the last of them to be done early: the sum of the third
-    powers of their tours' lengths is made small, by cheapest insertion, the place first that any robot ends soonest
-    with, and then by moving single places between tours and within.
+    Several travelling salesmen without a way back, who want the last of them to be done early: the sum of the
+    third powers of their tours' lengths is made small, by cheapest insertion, the place first that any robot ends
+    soonest with, and then by moving single places between tours and within.
 
     Parameters
     ----------

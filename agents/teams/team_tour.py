@@ -23,7 +23,7 @@ class TeamTourConfig(BriskTourConfig):
 
 
 class TeamTour(Shared, BriskTour):
-    """Goes to the first place of the best tour over its own part of all that is left; alone, it is ``brisk-tour``."""
+    """Goes to the first place of the best tour over its part of all that is left; alone it is ``brisk-tour``."""
 
     config: TeamTourConfig
     config_type = TeamTourConfig

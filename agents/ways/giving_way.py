@@ -87,8 +87,10 @@ class GivingWay:
         self._held_s = 0.0
         return mate
 
-    def refuge(self, cost_map: CostMap, belief: Belief, mate: Teammate) -> tuple[TravelCosts, tuple[int, int]] | None:
-        """Return the nearest place beside another's way, and travel costs; ``None`` where it stands there, or none is.
+    def refuge(
+        self, cost_map: CostMap, belief: Belief, mate: Teammate
+    ) -> tuple[TravelCosts, tuple[int, int]] | None:
+        """Return travel costs, and the nearest place beside another's way; ``None``: it stands there, or none is.
 
         Where the other's goal is not known, beside the other.
         """
@@ -134,7 +136,8 @@ def costs_from(cost_map: CostMap, point: Array, *, within_m: float = 0.6) -> Tra
     span = math.ceil(within_m / cost_map.resolution)
     row, col = (int(v) for v in cost_map.to_cells(np.asarray(point, np.float64)[None])[0])
     low_r, low_c = max(row - span, 0), max(col - span, 0)
-    cells = np.argwhere(cost_map.plain[low_r : row + span + 1, low_c : col + span + 1] > 0.0) + (low_r, low_c)
+    cells = np.argwhere(cost_map.plain[low_r : row + span + 1, low_c : col + span + 1] > 0.0)
+    cells += np.array([low_r, low_c])
     if not len(cells):
         return None
     start = cells[int(np.argmin(((cells - (row, col)) ** 2).sum(axis=1)))]

@@ -24,6 +24,7 @@ def test_suite_in_a_team_of_three(name):
     def actions() -> list[np.ndarray]:
         team = Team(robots=3, rooms="maze", team={"communication": {"model": "range"}})
         sent = explore(team, name, seed=4, steps=100)
+        assert [member.belief.robot for member in team.members] == [0, 1, 2]
         if name in PLANNING:
             assert touched(team) == 0
         return sent
