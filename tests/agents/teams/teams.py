@@ -21,11 +21,10 @@ def hall(width_m: float, height_m: float, start: tuple[float, float, float] = (1
     return FloorPlan(name="hall", walls=walls, free=free, resolution=0.05, start=start)
 
 
-def crew_of(team: Team, name: str, seed: int) -> dict[int, Agent]:
-    made = {}
+def crew_of(team: Team, name: str, seed: int, config: Mapping | None = None) -> dict[int, Agent]:
+    made, of = {}, team.config
     for member in team.members:
-        config = team.config
-        agent = agents.make(name, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+        agent = agents.make(name, config=config, robot=of.robot, lidar=of.lidar, step_s=of.step_s)
         agent.reset(member.belief, seed)
         made[member.number] = agent
     return made

@@ -12,7 +12,7 @@ from mecanum_env.team.team import Team
 from slam.belief import Teammate
 from slam.grids.occupancy import UNKNOWN
 from tests.agents.grids import belief_of, fill, room
-from tests.agents.teams.teams import explore, touched
+from tests.agents.teams.teams import crew_of, explore, run, touched
 
 NAMES = agents.names()
 TEAMS = ("assigned", "coordinated", "rendezvous", "team-frontier", "team-tour")
@@ -78,3 +78,22 @@ def test_alone_it_is_the_strategy_that_it_is_made_of(name, alone):
         return explore(Team(robots=1, rooms="apartment"), name, seed=3, steps=40)
 
     np.testing.assert_array_equal(actions(name), actions(alone))
+
+
+def test_robots_that_do_not_hear_each_other_meet_when_it_is_time():
+    communication = {"model": "range", "range_m": 3.0}
+    apart: list[bool] = []
+    team = Team(robots=3, rooms="maze", team={"communication": communication})
+    observed = team.reset(seed=1)
+    crew = crew_of(team, "rendezvous", 1, config={"appointments": {"every_s": 16.0}})
+
+    def act(k, seen, belief):
+        if k == 0:
+            apart.append(len(set(team.groups.tolist())) > 1)
+        return crew[k].act(seen, belief)
+
+    run(team, act, observed, 280)
+    assert any(apart[80:140])  # they had lost each other …
+    together = [k for k in range(140, 280) if not apart[k]]
+    assert together and together[0] <= 270  # … and met, when it was time or soon after
+    assert touched(team) == 0
