@@ -20,7 +20,9 @@ __all__ = ["check", "make", "names"]
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
     "active": "agents.active:ActiveSlam",
+    "assigned": "agents.teams.assigned:Assigned",
     "brisk-tour": "agents.brisk_tour:BriskTour",
+    "coordinated": "agents.teams.coordinated:Coordinated",
     "cost-utility": "agents.cost_utility:CostUtility",
     "explore-and-return": "agents.explore_and_return:ExploreAndReturn",
     "learned-tour": "agents.learned_tour:LearnedTour",
@@ -29,7 +31,10 @@ _REGISTRY = {
     "ppo": "agents.ppo:Ppo",
     "ppo-frontier": "agents.ppo_frontier:PpoFrontier",
     "random": "agents.random:RandomAgent",
+    "rendezvous": "agents.teams.rendezvous:Rendezvous",
     "rrt": "agents.rrt:Rrt",
+    "team-frontier": "agents.teams.team_frontier:TeamFrontier",
+    "team-tour": "agents.teams.team_tour:TeamTour",
     "tour": "agents.tour:Tour",
 }
 

@@ -21,6 +21,7 @@ from agents.view_points.gain import expected_area
 from agents.view_points.sight import Track, Watch, view_points
 from agents.view_points.troubles import Troubles
 from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig, belief_classes
+from agents.ways.giving_way import GivingWay, GivingWayConfig
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
@@ -62,6 +63,7 @@ class ExplorerConfig:
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     patience: PatienceConfig = field(default_factory=PatienceConfig)
+    giving_way: GivingWayConfig = field(default_factory=GivingWayConfig)  # in a team
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +114,7 @@ class Explorer(Agent):
         self._lost_for = 0.0
         self._troubles = Troubles(0.6 * self.config.patience.same_m)
         self._ending = "covered"  # why there is nothing left to choose, once there is nothing
+        self._giving_way = GivingWay(self.config.giving_way, self._robot)
         self._track = Track()  # sensor poses that frontiers were seen from
 
     # ---- choosing ------------------------------------------------------------------------------------------
@@ -155,7 +158,7 @@ class Explorer(Agent):
         if self._ending == "unreachable" and not np.isfinite(found.costs).any():
             sure = self._cost_maps.of(belief, sigma_m=0.0)
             found = self._candidates_on(sure)
-        return found
+        return self._own_part(found, belief) if belief.teammates else found
 
     def _candidates_on(self, cost_map: CostMap) -> Candidates:
         watch = self._watch_kept()
@@ -174,6 +177,10 @@ class Explorer(Agent):
             farthest = float(np.sort(known)[min(asked, len(known)) - 1])
             self._within_m = max(1.2 * farthest, self._least_within_m)
         return Candidates(cost_map, travel, frontiers, cells, costs, self._current(frontiers, costs))
+
+    def _own_part(self, found: Candidates, belief: Belief) -> Candidates:
+        """Return the candidates with infinite costs of those that are left to other robots: of none here."""
+        return found
 
     def _costs_asked(self) -> int | None:
         """Return of how many of the candidates, the cheapest, the strategy asks costs and cells; None: of all.
@@ -256,6 +263,11 @@ class Explorer(Agent):
             return self._wait(observation, belief)
         self._lost_for = 0.0
         self._keep_watch(belief)
+        if belief.teammates and self._makes_way(belief):
+            self._time += self._step_s
+            self._anchored_at = self._time
+            self._status = "giving way"
+            return self._to_action(self._follower.follow(observation, belief))
         if self._due(belief):
             self._goal = self.choose(belief)
             self._chosen_at = self._time
@@ -276,6 +288,29 @@ class Explorer(Agent):
             twist = self._follower.follow(observation, belief)
         self._watch(belief)
         return self._to_action(twist)
+
+    def _makes_way(self, belief: Belief) -> bool:
+        """Whether the robot is out of its own way for another; sets off, where it is to begin."""
+        giving, now = self._giving_way, self._time
+        if now < giving.until_s:
+            return True
+        speed = None if self._goal is None else self._follower.speed_m_s
+        mate = giving.asked(belief, speed, self._step_s)
+        if mate is None:
+            return False
+        if self._target is not None:  # what the other stands before is put last for a while
+            self._troubles.note(self._target).avoid_until_s = now + giving.config.avoid_s
+        self._target, self._chosen_at = None, -math.inf
+        cost_map = self._cost_maps.of(belief)
+        found = giving.refuge(cost_map, belief, mate)
+        if found is None:
+            return False
+        travel, cell = found
+        path = self._path(cost_map, travel, cell, belief)
+        giving.until_s = now + giving.config.pass_s + float(travel.cost[cell]) / giving.config.speed_m_s
+        self._goal = Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path)
+        self._follower.set_path(path, None)
+        return True
 
     def _wait(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Stand still while the belief is lost; after a while creep to where the scan has most room.
@@ -332,7 +367,8 @@ class Explorer(Agent):
         if (stuck or now > self._deadline) and now >= self._recover_until:
             trouble = self._troubles.note(self._target)
             trouble.avoid_until_s = now + patience.avoid_s * 2.0**trouble.failures
-            trouble.failures += 1
+            if self._giving_way.nearest(belief, self.config.giving_way.near_m) is None:
+                trouble.failures += 1  # else it was another robot that stood in the way
             self._anchored_at = now
             self._deadline = math.inf
             self._target = None

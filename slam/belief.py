@@ -53,6 +53,7 @@ class Belief:
     health: float = 1.0  # probability that the true pose lies within the 99.7 % region of pose and pose_cov
     whole_cov: Array | None = None  # joint_cov with the walls' (α, r) behind the points: (3 + 2n + 2k, …)
     teammates: tuple[Teammate, ...] = ()  # those of whom it knows where they are, by rising number
+    robot: int = 0  # its own number in the team
     _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array], Callable[[], Array]] | None = field(
         default=None, repr=False, compare=False
     )  # see postponed
@@ -76,15 +77,15 @@ class Belief:
             object.__delattr__(belief, name)
         return belief
 
-    def in_team(self, grid: OccupancyGrid, teammates: tuple[Teammate, ...]) -> Belief:
-        """Return the belief with a team's map in place of its own, and the others."""
+    def in_team(self, robot: int, grid: OccupancyGrid, teammates: tuple[Teammate, ...]) -> Belief:
+        """Return the belief of a team's robot of this number: with the team's map, and the others."""
         if self._read is None:
-            return replace(self, grid=grid, teammates=teammates)
+            return replace(self, grid=grid, teammates=teammates, robot=robot)
         names = _POSTPONED[:5]
         return Belief.postponed(
             lambda: {name: getattr(self, name) for name in names}, lambda: self.landmark_cov,
             lambda: np.asarray(self.whole_cov), pose=self.pose, pose_cov=self.pose_cov, grid=grid,
-            health=self.health, teammates=teammates,
+            health=self.health, teammates=teammates, robot=robot,
         )  # fmt: skip
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
 from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points
+from agents.driving.sides import parting_lines
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
@@ -49,6 +50,7 @@ class ControlConfig:
     map_gap_m: float = 0.04  # between body and occupied cells, and 2σ of the position more, capped
     max_sigma_gap_m: float = 0.05  # the planner's cap: where a path is planned, it can be driven
     scan_gap_m: float = 0.04  # between body and what the scan hit
+    robot_gap_m: float = 0.05  # between body and the line that parts it from another robot
     arrival_m_s: float = 0.2  # speed at which the goal is reached; what is left is braked away there
     arrived_m: float = 0.12
     arrived_rad: float = 0.2
@@ -130,6 +132,11 @@ class PathFollower:
         self.arrived = False
         self.remaining_m = 0.0
 
+    @property
+    def speed_m_s(self) -> float:
+        """Of the last twist that was sent; where it has arrived, as though it drove."""
+        return math.inf if self.arrived else math.hypot(*self._velocity)
+
     def set_path(self, path: Array, heading: float | None) -> None:
         """Follow ``path`` ``(n, 2)`` and end with ``heading`` [rad], or with any where it is ``None``."""
         self._path = np.ascontiguousarray(path, dtype=np.float64)
@@ -155,13 +162,15 @@ class PathFollower:
             self._robot.circumscribed_radius_m + gap,
             self._pace,
         )
-        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+        sides = self._sides(belief, near)
+        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar), sides)
 
     def drive(self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the twist ``(3,)`` nearest to a velocity ``(2,)`` in the belief's frame that is safe."""
         pose = np.asarray(belief.pose, dtype=np.float64)
         near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
-        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar))
+        sides = self._sides(belief, near)
+        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar), sides)
 
     def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
@@ -186,7 +195,8 @@ class PathFollower:
         worth = np.minimum(room, _CREEP_ROOM_M) * (2.0 + np.cos(angles - self._creeping))
         self._creeping = angle = float(angles[int(np.argmax(worth))])
         velocity = _CREEP_M_S * np.array([math.cos(angle), math.sin(angle)])
-        return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, hits)
+        near = local_map(belief, WINDOW_M)
+        return self._send(velocity, 0.0, pose, near, -math.inf, hits, self._sides(belief, near))
 
     def _creep_back(self, pose: Array, belief: Belief) -> Array:
         """Return the twist ``(3,)`` that creeps to the last place that it crept over, and from there on back."""
@@ -197,21 +207,29 @@ class PathFollower:
         way = np.array(self._crept[-1]) - pose[:2]
         self._creeping = math.atan2(way[1], way[0])
         velocity = _CREEP_M_S * way / math.hypot(*way)
-        return self._send(velocity, 0.0, pose, local_map(belief, WINDOW_M), -math.inf, np.zeros((0, 2)))
+        near = local_map(belief, WINDOW_M)
+        return self._send(velocity, 0.0, pose, near, -math.inf, np.zeros((0, 2)), self._sides(belief, near))
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""
         return local_map(belief, WINDOW_M).at(points)
+
+    def _sides(self, belief: Belief, near: LocalMap) -> Array:
+        """Return the lines ``(k, 3)`` that part the robot from others nearby, in the body frame."""
+        gap = self.config.robot_gap_m
+        return parting_lines(belief, near, self._half, gap_m=gap, speed_m_s=self._robot.max_speed_m_s)
 
     def _map_gap(self, belief: Belief) -> float:
         """Return what the body keeps from the map [m]: the more, the less sure the position is."""
         sigma = position_sigma(belief.pose_cov)
         return self.config.map_gap_m + min(2.0 * sigma, self.config.max_sigma_gap_m)
 
-    def _send(self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, hits: Array) -> Array:
+    def _send(
+        self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, hits: Array, sides: Array
+    ) -> Array:
         """Smooth, bound and check a wanted velocity (belief frame) and turn rate; remember what goes out."""
         sent, self._velocity, self.blocked = send(
-            velocity, turn, self._velocity, self._turn, pose, near, gap, hits, self._motors, self._guard
+            velocity, turn, self._velocity, self._turn, pose, near, gap, hits, sides, self._motors, self._guard
         )
         self._turn = float(sent[2])
         return np.asarray(sent)

@@ -124,11 +124,12 @@ def aim(
 @njit(cache=True, nogil=True)
 def send(
     velocity: Array, turn: float, last_velocity: Array, last_turn: float, pose: Array, near: LocalMap,
-    map_gap: float, hits: Array, motors: Motors, guard: Guard,
+    map_gap: float, hits: Array, sides: Array, motors: Motors, guard: Guard,
 ) -> tuple[Array, Array, bool]:  # fmt: skip
     """Smooth, bound and check a wanted velocity ``(2,)`` [m/s] and turn rate [rad/s].
 
-    ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] what the scan shows.
+    ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] what the scan shows, ``sides``
+    ``(k, 3)`` are the lines that part it from other robots; see :func:`agents.driving.safety.safe_twist`.
 
     Returns
     -------
@@ -150,7 +151,7 @@ def send(
     demand = abs(twist[0]) + abs(twist[1]) + motors.lever_m * abs(twist[2])
     if demand > motors.max_speed_m_s:
         twist *= motors.max_speed_m_s / demand
-    sent = safe_twist(twist, pose, near, map_gap, hits, guard)
+    sent = safe_twist(twist, pose, near, map_gap, hits, sides, guard)
     heading = pose[2] + 0.5 * sent[2] * motors.step_s
     c, s = math.cos(heading), math.sin(heading)
     velocity_sent = np.array([c * sent[0] - s * sent[1], s * sent[0] + c * sent[1]])

@@ -1,6 +1,7 @@
 """The last check before a twist goes out: the body, braking from it, must come onto nothing.
 
-Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind.
+Two witnesses are heard: the belief's map, and the newest scan, which the map may lag behind. And each of two
+robots keeps to its own side of what parts them (:mod:`agents.driving.sides`): both can brake, whatever they do.
 """
 
 from __future__ import annotations
@@ -120,10 +121,14 @@ def _hits(share: Array, directions: Array, offset_m: float, range_min_m: float, 
 
 
 @njit(cache=True, nogil=True)
-def safe_twist(twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: Array, guard: Guard) -> Array:
+def safe_twist(
+    twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: Array, sides: Array, guard: Guard
+) -> Array:
     """Return the first of a twist ``(3,)`` and its tamer kin whose braking distance is clear; zero if none.
 
-    ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] scan points in the body frame.
+    ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] scan points in the body frame,
+    ``sides`` ``(k, 3)`` the lines not to be crossed, one for each robot nearby: n·p ≤ d as rows nx, ny, d [m],
+    also in the body frame.
     """
     kin = _tamer_kin(twist)
     for k in range(len(kin)):
@@ -132,7 +137,9 @@ def safe_twist(twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: 
             continue
         map_now, map_ahead, scan_now, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
         # Already too near: any motion that brings it no nearer is allowed, or it would never get away.
-        if map_ahead >= min(map_gap, map_now - 0.002) and scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002):
+        clear = map_ahead >= min(map_gap, map_now - 0.002)
+        clear &= scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002)
+        if clear and (len(sides) == 0 or _keeps_side(candidate, sides, guard)):
             return candidate
     return np.zeros(3)
 
@@ -167,20 +174,15 @@ def body_gaps(
     tuple
         Gap to the map now, gap to the map ahead, gap to the scan now, gap to the scan ahead.
     """
-    lag, rim, half = guard.lag_s, guard.rim, guard.half
-    speed = math.hypot(twist[0], twist[1])
-    braking = max(speed / guard.braking_m_s2, abs(twist[2]) / guard.turn_braking_rad_s2)
-    total = lag + braking
+    rim, half = guard.rim, guard.half
+    total = guard.lag_s + _braking_s(twist, guard)
     map_now = map_ahead = scan_now = scan_ahead = np.inf
     x, y, theta = 0.0, 0.0, 0.0  # of the predicted body in the present body frame
     last = 0.0
     heading = pose[2]
     cos_b, sin_b = math.cos(heading), math.sin(heading)
     for k in range(_POSES):
-        t = total * k / (_POSES - 1)
-        # Distance covered so far, as seconds at the full twist: uniform braking after the hold.
-        late = max(t - lag, 0.0)
-        held = min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0)
+        held = _held_s(total * k / (_POSES - 1), twist, guard)
         dt, last = held - last, held
         middle = theta + 0.5 * dt * twist[2]
         x += dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
@@ -205,6 +207,47 @@ def body_gaps(
         else:
             map_ahead, scan_ahead = min(map_ahead, map_gap), min(scan_ahead, scan_gap)
     return map_now, map_ahead, scan_now, scan_ahead
+
+
+@njit(cache=True, nogil=True)
+def _braking_s(twist: Array, guard: Guard) -> float:
+    """Return how long it takes to brake from a twist [s], speed or turn, whichever takes longer."""
+    speed = math.hypot(twist[0], twist[1])
+    return float(max(speed / guard.braking_m_s2, abs(twist[2]) / guard.turn_braking_rad_s2))
+
+
+@njit(cache=True, nogil=True)
+def _held_s(t: float, twist: Array, guard: Guard) -> float:
+    """Return the way covered after a time [s], as seconds at the full twist: uniform braking after the hold."""
+    lag, braking = guard.lag_s, _braking_s(twist, guard)
+    late = max(t - lag, 0.0)
+    return float(min(t, lag) + (late - 0.5 * late * late / braking if braking > 0.0 else 0.0))
+
+
+@njit(cache=True, nogil=True)
+def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
+    """Tell whether the body, braking from a twist, crosses no line; or, where it has, goes no farther."""
+    total = guard.lag_s + _braking_s(twist, guard)
+    now = np.empty(len(sides))
+    x, y, theta, last = 0.0, 0.0, 0.0, 0.0
+    for k in range(_POSES):
+        held = _held_s(total * k / (_POSES - 1), twist, guard)
+        dt, last = held - last, held
+        middle = theta + 0.5 * dt * twist[2]
+        x += dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
+        y += dt * (math.sin(middle) * twist[0] + math.cos(middle) * twist[1])
+        theta += dt * twist[2]
+        c, s = math.cos(theta), math.sin(theta)
+        for i in range(len(sides)):
+            nx, ny, d = sides[i]
+            # The body's corner that is farthest along the line's normal.
+            body = guard.half[0] * abs(c * nx + s * ny) + guard.half[1] * abs(c * ny - s * nx)
+            room = d - nx * x - ny * y - body
+            if k == 0:
+                now[i] = room
+            elif room < min(0.0, now[i]) - 1e-6:
+                return False
+    return True
 
 
 @njit(cache=True, nogil=True)

@@ -30,6 +30,7 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _ALL = slice(None)
+_OLD_S = 5.0  # what is older says no longer where a robot is in the way
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,9 @@ class PlannerConfig:
     near_cost: float = 1.0  # added to the price of a metre at the comfortable clearance
     tight_cost: float = 3.0  # added again at the tight clearance
     path_spacing_m: float = 0.1
+    robot_cost: float = 6.0  # added to the price of a metre where another robot is nearer than would do to pass …
+    robot_margin_m: float = 0.1  # … which is both bodies' radii and this …
+    robots_within_m: float = 3.0  # … if it is no farther than this: what is farther off will have moved on
 
     def __post_init__(self) -> None:
         not_negative(self)
@@ -67,6 +71,7 @@ class CostMap:
     origin: tuple[float, float]  # lower-left corner of cell (0, 0) in the belief's frame [m]
     start: tuple[int, int]  # the robot's cell
     suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
+    plain: NDArray[np.float32]  # (rows, cols) the weight as it is for whatever robot: wherever they all stand
 
     def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
@@ -122,7 +127,7 @@ class CostMaps:
         self._kept: KeptBlocks | None = None
         self._box, self._levels = NOTHING, (0.0, 0.0, 0.0)  # of the weights
         self._weight: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
-        self._start = NOTHING  # where the robot was let out of where it stood
+        self._passing: list[Box] = []  # where the robot was let out of where it stood, and others made it dearer
 
     def of(self, belief: Belief, sigma_m: float | None = None) -> CostMap:
         """Return the planning grid of a belief; its arrays are written into when the next is asked for.
@@ -149,6 +154,8 @@ class CostMaps:
         col = min(max(int((x - left) // resolution), 1), blocks.classes.shape[1] - 2)
         sigma_m = position_sigma(belief.pose_cov) if sigma_m is None else sigma_m
         weight = self._weigh(blocks, changed, resolution, sigma_m)
+        plain = weight.copy() if belief.teammates else weight
+        self._passing = self._beside_others(belief, (left, low), resolution, weight)
         # Wherever the robot stands, it is allowed to stand, and to leave.
         reach = (robot.circumscribed_radius_m + 2.0 * resolution) / resolution
         highest = 2.0 * (1.0 + config.near_cost + config.tight_cost)
@@ -156,10 +163,32 @@ class CostMaps:
             blocks.classes, blocks.clearance, weight, row, col, reach, robot.circumscribed_radius_m / resolution,
             highest,
         )  # fmt: skip
-        self._start = Box(row, col, row + 1, col + 1).grown(math.ceil(reach))
+        self._passing.append(Box(row, col, row + 1, col + 1).grown(math.ceil(reach)))
         return CostMap(
-            blocks.classes, blocks.clearance, weight, resolution, (left, low), (row, col), blocks.suspect
+            blocks.classes, blocks.clearance, weight, resolution, (left, low), (row, col), blocks.suspect, plain
         )
+
+    def _beside_others(
+        self, belief: Belief, corner: tuple[float, float], resolution: float, weight: NDArray[np.float32]
+    ) -> list[Box]:
+        """Make ways dearer where they lead through other robots; return the boxes of cells in which they do."""
+        config, boxes = self._config, []
+        for mate in belief.teammates:
+            x, y = (float(v) for v in mate.pose[:2])
+            away = math.hypot(x - float(belief.pose[0]), y - float(belief.pose[1]))
+            if away > config.robots_within_m or mate.age_s > _OLD_S:
+                continue
+            reach = (self._robot.inscribed_radius_m + mate.radius_m + config.robot_margin_m) / resolution
+            at = (y - corner[1]) / resolution, (x - corner[0]) / resolution
+            row, col = math.floor(at[0]), math.floor(at[1])
+            box = Box(row, col, row + 1, col + 1).grown(math.ceil(reach)).within(Box(0, 0, *weight.shape))
+            if not box.empty:
+                rows, cols = np.ogrid[box.row0 : box.row1, box.col0 : box.col1]
+                near = np.hypot(rows + 0.5 - at[0], cols + 0.5 - at[1]) <= reach
+                part = weight[box.slices]
+                part[near & (part > 0.0)] += np.float32(config.robot_cost)
+                boxes.append(box)
+        return boxes
 
     def _weigh(self, blocks: Blocks, changed: list[Box], resolution: float, sigma_m: float) -> NDArray[np.float32]:
         """Return the price of a metre in each block, weighed anew where it may be another."""
@@ -174,7 +203,7 @@ class CostMaps:
             self._weight = np.zeros(blocks.classes.shape, dtype=np.float32)
             parts = [inside]
         else:
-            parts = [part.grown(math.ceil(near)) for part in changed] + [self._start]
+            parts = [part.grown(math.ceil(near)) for part in changed] + self._passing
         self._box, self._levels = self._kept.box, levels
         for part in parts:
             part = part.within(inside)

@@ -212,4 +212,4 @@ class Member(ExploreEnv):
         own = self.backend.belief
         if self._team.robots == 1:
             return own
-        return own.in_team(self.knowledge.grid, self._teammates())
+        return own.in_team(self.number, self.knowledge.grid, self._teammates())

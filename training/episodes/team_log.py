@@ -164,7 +164,7 @@ def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
     times, coverage = log.times, log.coverage
     merged, together = team_map(team)
     first = team.members[0]
-    score = score_map(first.truth.ground, first.backend.belief.in_team(merged, ()))
+    score = score_map(first.truth.ground, first.backend.belief.in_team(0, merged, ()))
     robots: list[dict[str, Any]] = [dict(member.episode_metrics()) for member in team.members]
     sums = {name: sum(robot[name] for robot in robots) for name in _SUMS}
     means = {name: _mean([robot[name] for robot in robots]) for name in _MEANS}

@@ -48,7 +48,8 @@ class PlainFollower(PathFollower):
             speed = 0.0
         most = min(config.turn_rate_rad_s, self._robot.max_turn_rate_rad_s)
         turn = float(np.clip(config.turn_gain * error, -most, most))
-        return self._send(speed * direction, turn, pose, near, gap, hits(observation, self._lidar))
+        seen = hits(observation, self._lidar)
+        return self._send(speed * direction, turn, pose, near, gap, seen, np.zeros((0, 3)))
 
     def _locate(self, position: Array) -> float:
         end = int(np.searchsorted(self._arc, self._arc[self._index] + 1.0)) + 1
@@ -140,7 +141,9 @@ class PlainFollower(PathFollower):
                 best, least = wanted, covered
         return best
 
-    def _send(self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, seen: Array) -> Array:
+    def _send(
+        self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, seen: Array, sides: Array
+    ) -> Array:
         config = self.config
         change = velocity - self._velocity
         step = float(np.hypot(*change))

@@ -35,7 +35,7 @@ def random_grid(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def plain_cost_map(classes: np.ndarray, weight: np.ndarray, start: tuple[int, int]) -> CostMap:
     nowhere = np.zeros(classes.shape, dtype=np.bool_)
-    return CostMap(classes, weight, weight, 0.1, (0.0, 0.0), start, nowhere)
+    return CostMap(classes, weight, weight, 0.1, (0.0, 0.0), start, nowhere, weight)
 
 
 @settings(max_examples=80, deadline=None)

@@ -54,6 +54,7 @@ def test_travel_costs_against_scipy(seed, rows, cols, share):
         origin=(0.0, 0.0),
         start=start,
         suspect=np.zeros(weight.shape, dtype=np.bool_),
+        plain=weight,
     )
     travel = travel_costs(cost_map)
     np.testing.assert_allclose(travel.cost, oracle(weight.astype(np.float64), start, 0.1), rtol=1e-4)

@@ -1,0 +1,85 @@
+"""An explorer that keeps to its part of what is left: what falls to it when tours are shared out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.explorer import Candidates, Explorer
+from agents.teams.crew import Crew, muster
+from agents.teams.sharing import share_tours
+from agents.view_points.gain import expected_area
+from agents.ways.travel import between
+from slam.belief import Belief
+from slam.settings import not_negative, positive
+
+__all__ = ["Shared", "SharingConfig"]
+
+Array = NDArray[np.float64]
+
+_FAR = 1e6  # [m] farther than anything is
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharingConfig:
+    """How what is left is shared out."""
+
+    trust_s: float = 20.0  # how long a robot that is no longer heard is counted on, where it was
+    most: int = 40  # pieces of frontier that are shared out: those nearest to any robot
+    service_m_m2: float = 0.0  # what a square metre of new area counts for, as a way
+    depth_m: float = 3.0  # how far behind a frontier new area is expected
+    hold_m: float = 3.0  # shorter is the way to what a robot is on its way to: parts that change hands cost turns
+
+    def __post_init__(self) -> None:
+        positive(self, "trust_s", "most", "depth_m")
+        not_negative(self, "service_m_m2", "hold_m")
+
+
+class Shared(Explorer):
+    """To be put before a strategy: leaves it the candidates that fall to this robot."""
+
+    def _sharing(self) -> SharingConfig:
+        """Return how what is left is shared out."""
+        return SharingConfig()
+
+    def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
+        """Return the crew's columns that fall to this robot: the tour that does when all are shared out."""
+        config = self._sharing()
+        near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]
+        starts, cells = np.minimum(crew.held(config.hold_m)[:, near], _FAR), crew.cells[near]
+        distance = np.nan_to_num(between(found.cost_map, crew.travel, cells, searched=0), nan=_FAR, posinf=_FAR)
+        area = expected_area(
+            found.cost_map, cells, range_m=self._lidar.range_max_m, depth_m=config.depth_m, rays=60
+        )
+        owner = share_tours(starts, distance, config.service_m_m2 * area)
+        return np.asarray(near[owner == crew.own])
+
+    def _own_part(self, found: Candidates, belief: Belief) -> Candidates:
+        """Return the candidates that fall to this robot; where none does, all: it goes along with another."""
+        patience, troubles = self.config.patience, self._troubles.near(found.frontiers.targets)
+        left = np.array([t is None or t.looks < patience.looks for t in troubles], dtype=np.bool_)
+        crew = muster(
+            belief, found, None if self._goal is None else self._goal.pose[:2], left,
+            trust_s=self._sharing().trust_s, range_m=self._watch_kept().range_m,
+            beyond_m=self.config.frontiers.beyond_m, same_m=patience.same_m,
+        )  # fmt: skip
+        if crew is None:
+            return found
+        # The farther the way, the more there must be to see: for whoever is nearest.
+        extents = found.frontiers.extents[found.frontiers.target_labels[crew.pieces]]
+        crew = crew.of(extents >= self._frontier_config.wanted_extent(crew.costs.min(axis=0)) - 1e-9)
+        own = crew.pieces[self._owned(crew, found)] if len(crew.pieces) else crew.pieces
+        own = own[np.isfinite(found.costs[own])]
+        if not len(own):
+            return found
+        costs = np.full_like(found.costs, np.inf)
+        costs[own] = found.costs[own]
+        current = found.current
+        if current is not None and not np.isfinite(costs[current]):
+            self._target = current = None  # handed over: that is not the same as looked at
+        return replace(found, costs=costs, current=current)
+
+    def _costs_asked(self) -> int | None:
+        return None  # what is near to another robot may be far from this one

@@ -1,0 +1,144 @@
+"""Who gives way where two robots hold each other up, and where to.
+
+The lower number has right of way: the other drives to the nearest place beside the way that the first one takes,
+and waits there. Both work it out by themselves. One that has nothing to do gives way to all that have. One with
+right of way does so, too, if it is held up for longer: the other may have no place to go.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.ways.cost_map import CostMap
+from agents.ways.planning import TravelCosts, travel_costs, way_cells
+from mecanum_env.config import RobotConfig
+from slam.belief import Belief, Teammate
+from slam.settings import positive
+
+__all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
+
+Array = NDArray[np.float64]
+
+_SLOW_M_S = 0.06  # that is held up
+
+
+@dataclass(frozen=True, kw_only=True)
+class GivingWayConfig:
+    """When a robot gives way, and for how long."""
+
+    near_m: float = 1.3  # between centres: nearer than this robots can hold each other up
+    patience_s: float = 0.8  # with one that has right of way
+    firm_s: float = 4.0  # with one that has not
+    idle_near_m: float = 2.0  # one without a goal looks out for others as far as this
+    pass_s: float = 3.0  # to wait beside the way
+    speed_m_s: float = 0.4  # at which it drives there, about
+    beside_m: float = 0.1  # between the bodies when one passes, both turned as it likes
+    far_m: float = 15.0  # [weighted m] that a place may be off
+    avoid_s: float = 10.0  # how long what lies beyond the other is put last
+
+    def __post_init__(self) -> None:
+        positive(self)
+
+
+class GivingWay:
+    """One robot's patience with the others.
+
+    Attributes
+    ----------
+    until_s : float
+        Until when it is giving way [s].
+    """
+
+    def __init__(self, config: GivingWayConfig, robot: RobotConfig) -> None:
+        self.config, self._radius_m = config, robot.circumscribed_radius_m
+        self.until_s = -math.inf
+        self._held_s = 0.0
+
+    def nearest(self, belief: Belief, within_m: float) -> Teammate | None:
+        """Return the nearest of the other robots within a distance [m]."""
+        x, y = float(belief.pose[0]), float(belief.pose[1])
+        found, least = None, within_m
+        for mate in belief.teammates:
+            away = math.hypot(float(mate.pose[0]) - x, float(mate.pose[1]) - y)
+            if mate.age_s <= 1.0 and away < least:
+                found, least = mate, away
+        return found
+
+    def asked(self, belief: Belief, speed_m_s: float | None, step_s: float) -> Teammate | None:
+        """Return the robot to give way to now, if any: asked once a step.
+
+        ``speed_m_s`` is at what speed it drives to its goal, ``None`` where it has none.
+        """
+        config = self.config
+        idle = speed_m_s is None
+        mate = self.nearest(belief, config.idle_near_m if idle else config.near_m)
+        if mate is None or (mate.goal is None if idle else speed_m_s is not None and speed_m_s > _SLOW_M_S):
+            self._held_s = 0.0
+            return None
+        self._held_s += step_s
+        behind = idle or (mate.robot < belief.robot and mate.goal is not None)
+        if self._held_s + 1e-9 < (config.patience_s if behind else config.firm_s):
+            return None
+        self._held_s = 0.0
+        return mate
+
+    def refuge(
+        self, cost_map: CostMap, belief: Belief, mate: Teammate
+    ) -> tuple[TravelCosts, tuple[int, int]] | None:
+        """Return travel costs, and the nearest place beside another's way; ``None``: it stands there, or none is.
+
+        Where the other's goal is not known, beside the other.
+        """
+        reach = (self._radius_m + mate.radius_m + self.config.beside_m) / cost_map.resolution
+        open_ = np.ones(cost_map.weight.shape, np.uint8)
+        open_[tuple(_way(cost_map, mate).T)] = 0
+        beside = cv2.distanceTransform(open_, cv2.DIST_L2, cv2.DIST_MASK_5) >= reach
+        if beside[cost_map.start]:
+            return None
+        # Not through the others: they stand there.
+        weight = cost_map.weight.copy()
+        rows, cols = np.ogrid[: weight.shape[0], : weight.shape[1]]
+        for other in belief.teammates:
+            row, col = (int(v) for v in cost_map.to_cells(np.asarray(other.pose)[None, :2])[0])
+            weight[(rows - row) ** 2 + (cols - col) ** 2 <= (0.7 * reach) ** 2] = 0.0
+        here = cost_map.start
+        weight[here] = max(float(weight[here]), 1.0)
+        travel = travel_costs(replace(cost_map, weight=weight))
+        costs = np.where(beside & (weight > 0.0), travel.cost, np.inf)
+        best = np.unravel_index(int(np.argmin(costs)), costs.shape)
+        if not costs[best] <= self.config.far_m:
+            return None
+        return travel, (int(best[0]), int(best[1]))
+
+
+def _way(cost_map: CostMap, mate: Teammate) -> NDArray[np.int64]:
+    """Return the cells ``(n, 2)`` that another's centre will pass over, as far as is known."""
+    here = cost_map.to_cells(np.asarray(mate.pose)[None, :2])
+    if mate.goal is None:
+        return here
+    travel = costs_from(cost_map, np.asarray(mate.pose)[:2])
+    goal = cost_map.to_cells(np.asarray(mate.goal)[None])[0]
+    if travel is None or not np.isfinite(travel.cost[tuple(goal)]):
+        return here
+    return np.vstack([here, way_cells(travel, (int(goal[0]), int(goal[1])))])
+
+
+def costs_from(cost_map: CostMap, point: Array, *, within_m: float = 0.6) -> TravelCosts | None:
+    """Return the travel costs from elsewhere ``(2,)`` [m], of a robot that is alone there.
+
+    From the nearest cell to it where a robot may be; ``None`` where there is none so near.
+    """
+    span = math.ceil(within_m / cost_map.resolution)
+    row, col = (int(v) for v in cost_map.to_cells(np.asarray(point, np.float64)[None])[0])
+    low_r, low_c = max(row - span, 0), max(col - span, 0)
+    cells = np.argwhere(cost_map.plain[low_r : row + span + 1, low_c : col + span + 1] > 0.0)
+    cells += np.array([low_r, low_c])
+    if not len(cells):
+        return None
+    start = cells[int(np.argmin(((cells - (row, col)) ** 2).sum(axis=1)))]
+    return travel_costs(replace(cost_map, weight=cost_map.plain, start=(int(start[0]), int(start[1]))))

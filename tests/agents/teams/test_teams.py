@@ -1,0 +1,99 @@
+"""What every agent owes in a team, and what the strategies for teams do."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import agents
+from mecanum_env.team.team import Team
+from slam.belief import Teammate
+from slam.grids.occupancy import UNKNOWN
+from tests.agents.grids import belief_of, fill, room
+from tests.agents.teams.teams import crew_of, explore, run, touched
+
+NAMES = agents.names()
+TEAMS = ("assigned", "coordinated", "rendezvous", "team-frontier", "team-tour")
+PLANNING = tuple(name for name in NAMES if name not in ("random", "ppo"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_suite_in_a_team_of_three(name):
+    def actions() -> list[np.ndarray]:
+        team = Team(robots=3, rooms="maze", team={"communication": {"model": "range"}})
+        sent = explore(team, name, seed=4, steps=100)
+        assert [member.belief.robot for member in team.members] == [0, 1, 2]
+        if name in PLANNING:
+            assert touched(team) == 0
+        return sent
+
+    first, again = actions(), actions()
+    assert len(first) == 100
+    for sent, same in zip(first, again, strict=True):
+        assert sent.shape == (3, 3) and sent.dtype == np.float32 and (np.abs(sent) <= 1.0).all()
+        np.testing.assert_array_equal(sent, same)
+
+
+def crossroads() -> np.ndarray:
+    """A known middle with four arms that go on into the unknown."""
+    classes = room(12.0, 12.0)
+    fill(classes, 0.0, 0.0, 12.0, 12.0)
+    fill(classes, 5.0, 1.0, 7.0, 11.0, 0)
+    fill(classes, 1.0, 5.0, 11.0, 7.0, 0)
+    for x, y in ((5.0, 0.0), (5.0, 11.0)):
+        fill(classes, x, y, x + 2.0, y + 1.0, UNKNOWN)
+    for x, y in ((0.0, 5.0), (11.0, 5.0)):
+        fill(classes, x, y, x + 1.0, y + 2.0, UNKNOWN)
+    return classes
+
+
+def goals(name: str, poses: list[tuple[float, float, float]], config=None) -> np.ndarray:
+    """Where robots at these poses, who know of each other, go; each decides by itself."""
+    chosen = []
+    for k, pose in enumerate(poses):
+        mates = tuple(Teammate(j, np.array(p), 0.0) for j, p in enumerate(poses) if j != k)
+        belief = replace(belief_of(crossroads(), pose), teammates=mates, robot=k)
+        agent = agents.make(name, config=config)
+        agent.reset(belief, 0)
+        goal = agent.choose(belief)
+        assert goal is not None
+        chosen.append(goal.pose[:2])
+    return np.array(chosen)
+
+
+@pytest.mark.parametrize("name", TEAMS)
+def test_each_goes_to_an_arm_of_its_own(name):
+    short = {"frontiers": {"view_range_m": 1.5}}
+    config = {"driver": short} if name == "team-frontier" else short
+    at = goals(name, [(6.0, 6.0, 0.0), (5.6, 5.2, 0.0), (6.5, 6.6, 0.0), (5.4, 6.5, 0.0)], config)
+    apart = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))[np.triu_indices(4, 1)]
+    assert apart.min() > 2.0, at
+
+
+@pytest.mark.parametrize(("name", "alone"), [("team-tour", "brisk-tour"), ("team-frontier", "ppo-frontier")])
+def test_alone_it_is_the_strategy_that_it_is_made_of(name, alone):
+    def actions(name: str) -> list[np.ndarray]:
+        return explore(Team(robots=1, rooms="apartment"), name, seed=3, steps=40)
+
+    np.testing.assert_array_equal(actions(name), actions(alone))
+
+
+def test_robots_that_do_not_hear_each_other_meet_when_it_is_time():
+    communication = {"model": "range", "range_m": 3.0}
+    apart: list[bool] = []
+    team = Team(robots=3, rooms="maze", team={"communication": communication})
+    observed = team.reset(seed=1)
+    crew = crew_of(team, "rendezvous", 1, config={"appointments": {"every_s": 16.0}})
+
+    def act(k, seen, belief):
+        if k == 0:
+            apart.append(len(set(team.groups.tolist())) > 1)
+        return crew[k].act(seen, belief)
+
+    run(team, act, observed, 280)
+    assert any(apart[80:140])  # they had lost each other …
+    together = [k for k in range(140, 280) if not apart[k]]
+    assert together and together[0] <= 270  # … and met, when it was time or soon after
+    assert touched(team) == 0
