@@ -40,6 +40,7 @@ STUDIES = {
         "faults made mid-episode: is the belief lost, does it know, is it found again?",
     ),
     "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
+    "team-cost": ("training.studies.teams.cost", "what a step takes against the number of robots"),
     "team-filters": (
         "training.studies.teams.filters",
         "robots that map one building: one filter for all, or one each",
