@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.arguments import make_config
+from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
 from mecanum_env.physics.fleet import Fleet
@@ -88,7 +89,7 @@ class Team:
         self.joint: JointEkf | None = None
         """The one filter of a joint belief."""
         if self.team.belief == "joint":
-            if settings.get("slam", _JOINT) != _JOINT:
+            if self.config.slam not in (_JOINT, EnvConfig().slam):  # the default stands for none
                 raise ValueError(f"a joint belief is {_JOINT} over all robots; slam must be left out or be that")
             self.config = replace(self.config, slam=_JOINT)
             settings_of_all = from_mapping(EkfLinesConfig, backend_settings(self.config))

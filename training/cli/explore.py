@@ -52,6 +52,7 @@ def explore(
     range_m: opt.Range = None,
     starts: opt.Starts = None,
     unknown_starts: opt.UnknownStarts = False,
+    joint_belief: opt.JointBelief = False,
     as_json: opt.Json = False,
 ) -> None:
     """Explore rooms for one episode, until the agent has nothing left to explore.
@@ -85,7 +86,7 @@ def explore(
 
     team = read_team(
         config, robots=robots, communication=communication, range_m=range_m, starts=starts,
-        unknown_starts=unknown_starts,
+        unknown_starts=unknown_starts, joint_belief=joint_belief,
     )  # fmt: skip
     if team.robots > 1:
         single = {"--video-substeps": video_substeps, "--mcap": mcap, "--rerun": rerun}
@@ -95,8 +96,9 @@ def explore(
         explore_team(team, given, video=video, as_json=as_json)
         return
     opt.refuse_team_options(
-        communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
-    )
+        communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts,
+        joint_belief=joint_belief,
+    )  # fmt: skip
     from training.episodes import explore as task
     from training.episodes.recording import Recorder
     from training.runs.signals import interrupt_flag

@@ -100,6 +100,7 @@ class TeamEpisode:
 def read_team(
     config: Path | None = None, *, robots: int | None = None, communication: str | None = None,
     range_m: float | None = None, starts: str | None = None, unknown_starts: bool = False,
+    joint_belief: bool = False,
 ) -> TeamConfig:  # fmt: skip
     """Return the team that a config file's [run] table names, the options before it; of neither, one robot.
 
@@ -111,7 +112,10 @@ def read_team(
     with bad_input():
         past = read_config(config, {"team": (dict,)})[1].get("team", {}) if config is not None else {}
         heard = {"model": communication, "range_m": range_m}
-        given = {"robots": robots, "starts": starts, "known_starts": False if unknown_starts else None}
+        given = {
+            "robots": robots, "starts": starts, "known_starts": False if unknown_starts else None,
+            "belief": "joint" if joint_belief else None,
+        }  # fmt: skip
         settings = {"robots": 1} | past | _known(given)
         if _known(heard):
             settings["communication"] = dict(past.get("communication", {})) | _known(heard)

@@ -63,6 +63,9 @@ Starts = Annotated[
     str | None, typer.Option(help="Where several robots start: together or scattered.  [default: together]")
 ]
 UnknownStarts = Annotated[bool, typer.Option("--unknown-starts", help="No robot knows where the others start.")]
+JointBelief = Annotated[
+    bool, typer.Option("--joint-belief", help="One filter over all robots, which hear all and know all starts.")
+]
 Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  [default: one a core]")]
 
 
@@ -99,12 +102,13 @@ def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
 
 
 def refuse_team_options(
-    *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool
-) -> None:
+    *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool,
+    joint_belief: bool = False,
+) -> None:  # fmt: skip
     """Raise :class:`BadInput` for an option of several robots where there is one."""
     given = {
         "--communication": communication, "--range": range_m, "--starts": starts,
-        "--unknown-starts": unknown_starts or None,
+        "--unknown-starts": unknown_starts or None, "--joint-belief": joint_belief or None,
     }  # fmt: skip
     for name, value in given.items():
         if value is not None:
