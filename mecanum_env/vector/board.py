@@ -27,6 +27,7 @@ _NUMBERS = ("coverage", "path_length_m", "time_s", "position_error_m", "heading_
 _POSE = "true_pose"
 _TERMS = tuple(reward_terms(RewardConfig(), StepOutcome(0.0, 0.0, 0.0, 0, 0.0, 0.0)))
 _SHARED = {*_NUMBERS, _POSE, "reward_terms"}
+_UNPAID_KEYS = len(_SHARED) - 1
 _numbers_of = itemgetter(*_NUMBERS)
 
 # An environment's numbers are one line of memory, so that one call writes them.
@@ -104,7 +105,9 @@ class Page:
             self._raw, self._first + row * _LINE.itemsize, reward, *_numbers_of(info), *info[_POSE].tolist(),
             *(_UNPAID if terms is None else terms.values()), terminated, truncated, True, terms is not None,
         )  # fmt: skip
-        return {} if info.keys() <= _SHARED else {k: value for k, value in info.items() if k not in _SHARED}
+        if len(info) == (_UNPAID_KEYS if terms is None else _UNPAID_KEYS + 1):
+            return {}
+        return {key: value for key, value in info.items() if key not in _SHARED}
 
     def show(self, row: int, observation: Observation) -> None:
         """Write an environment's observation."""
@@ -122,7 +125,7 @@ class Page:
     def infos(self, *, copy: bool) -> dict[str, Any]:
         """Return the infos of all environments that have one, as Gymnasium's vector environments do."""
         infos: dict[str, Any] = _copied(self._infos) if copy else self._infos.copy()
-        if self._paid.any():
+        if True in self._paid.tolist():
             infos["reward_terms"] = _copied(self._terms) if copy else self._terms.copy()
             infos["_reward_terms"] = self._paid.copy() if copy else self._paid
         return infos
@@ -170,12 +173,18 @@ class Board:
             np.ndarray(shape, dtype, raw) for raw, shape, dtype in (memory["actions"], memory["orders"])
         )
         self.pages = [Page(number, memory) for number in range(_PAGES)]
+        self._turns: list[int] = [*range(self.spare)]
 
     spare = _PAGES - 1
 
     def free_page(self) -> int:
-        """Return which page can be written."""
-        return next((number for number in range(self.spare) if self.pages[number].free), self.spare)
+        """Return which page can be written; mostly it is the one before the last one."""
+        turns = self._turns
+        for k, number in enumerate(turns):
+            if self.pages[number].free:
+                turns.insert(1, turns.pop(k))
+                return number
+        return self.spare
 
 
 def _copied(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
