@@ -74,7 +74,8 @@ def _drivers(settings: dict[str, Any], seeds: Sequence[int]) -> dict[str, tuple[
                 begin = clock()
                 one.step(action)
                 took[step, k] = clock() - begin
-        return took.sum(axis=1)
+        times: Times = took.sum(axis=1)
+        return times
 
     def driver(envs: Any) -> Callable[[Actions], Times]:
         def drive(actions: Actions) -> Times:
