@@ -59,20 +59,26 @@ class _Seat:
         self.ended = False
         self.ready: _Ready | None = None
         self.seen: Observation | None = {}  # the last observation; None where it is on the board alone
-        inner = env.unwrapped
-        assert isinstance(inner, ExploreEnv)
-        self.inner = inner
-        # Only where nobody stands between who might keep what is on the board.
-        bare = env if env is inner else env.env if isinstance(env, gymnasium.wrappers.TimeLimit) else None
-        self._places = [
-            {key: array[row] for key, array in page.observations.items()} if bare is inner else None
-            for page in board.pages
-        ]
+        # Only where nobody stands between who might keep what is on the board, or show something else.
+        inner = env.env if isinstance(env, gymnasium.wrappers.TimeLimit) else env
+        self._bare = inner if type(inner) is ExploreEnv else None
+        self._places = [{key: array[row] for key, array in page.observations.items()} for page in board.pages]
 
     def point_at(self, page: int | None) -> Observation | None:
         """Have the environment fill its row of a page, if it can; return that."""
-        self.inner.canvas = place = None if page is None else self._places[page]
+        if self._bare is None:
+            return None
+        self._bare.canvas = place = None if page is None else self._places[page]
         return place
+
+    def last_seen(self) -> Observation:
+        """Return what the environment last showed; what is on the board the caller may have changed."""
+        if self.ready is not None:
+            return self.ready.last
+        if self.seen is not None or self._bare is None:
+            return self.seen or {}
+        self.point_at(None)
+        return self._bare.observe()
 
 
 class Share:
@@ -116,7 +122,7 @@ class Share:
         for seat in self._seats:
             if seat.ended and seat.ready is None:
                 state = seat.env.unwrapped.np_random.bit_generator.state
-                last = self._last(seat)
+                last = seat.last_seen()
                 seat.point_at(None)
                 observation, info = seat.env.reset()
                 seat.ready = _Ready(observation, info, last, state)
@@ -127,7 +133,7 @@ class Share:
         for seat in self._seats:
             if seat.row not in seeds:
                 self._board.pages[page].write_nothing(seat.row)
-                self._board.pages[page].show(seat.row, seat.ready.last if seat.ready else self._last(seat))
+                self._board.pages[page].show(seat.row, seat.last_seen())
             elif more := self._reset(page, seat, seeds[seat.row], options):
                 rest[seat.row] = more
         return rest
@@ -148,16 +154,10 @@ class Share:
             seat.seen = None if place is not None else observation
         return self._board.pages[page].write(seat.row, seat.seen, info, reward, terminated, truncated)
 
-    @staticmethod
-    def _last(seat: _Seat) -> Observation:
-        """Return what an environment last showed; what is on the board the caller may have changed."""
-        if seat.seen is not None:
-            return seat.seen
-        seat.point_at(None)
-        return seat.inner.observe()
-
     def call(self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> list[Any]:
         """Return an attribute of every environment, or what it returns where it is a method."""
+        for seat in self._seats:
+            seat.point_at(None)  # whatever is called, it writes on no page
         found = [seat.env.get_wrapper_attr(name) for seat in self._seats]
         return [value(*args, **kwargs) if callable(value) else value for value in found]
 

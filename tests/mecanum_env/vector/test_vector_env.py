@@ -13,6 +13,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import mecanum_env  # noqa: F401 - registers the environments
+from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlanError
 from mecanum_env.vector.vector_env import ExploreVectorEnv
 
@@ -157,6 +158,30 @@ def test_a_reset_of_some_shows_the_others_as_they_are_whatever_the_caller_has_wr
     theirs.close()
 
 
+class _Nearsighted(ExploreEnv):
+    """Shows another observation than it is asked to fill, and keeps the one before."""
+
+    def observe(self) -> Any:
+        seen = dict(super().observe())
+        return seen | {"scan": np.minimum(seen["scan"], 0.5)}
+
+
+def _nearsighted() -> gym.Env[Any, Any]:
+    return _Nearsighted(rooms="rectangular", slam="ekf", config={"time_limit_s": 1.2})
+
+
+def test_an_environment_of_ones_own_shows_what_it_shows() -> None:
+    ours, theirs = ExploreVectorEnv(2, make=_nearsighted, workers=2), gym.vector.SyncVectorEnv([_nearsighted] * 2)
+    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
+    for _ in range(3):
+        actions = np.full((2, 3), 0.5, np.float32)
+        assert_same(ours.step(actions), theirs.step(actions))
+    mask = {"reset_mask": np.array([True, False])}
+    assert_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)))
+    ours.close()
+    theirs.close()
+
+
 def test_attributes_of_each(envs: ExploreVectorEnv) -> None:
     envs.reset(seed=4)
     assert envs.np_random_seed == (4, 5, 6)
@@ -164,6 +189,11 @@ def test_attributes_of_each(envs: ExploreVectorEnv) -> None:
     envs.set_attr("mark", [1, 2, 3])
     assert envs.get_attr("mark") == (1, 2, 3)
     assert [metrics["steps"] for metrics in envs.call("episode_metrics")] == [0, 0, 0]
+    shown, *_ = envs.step(np.full((3, 3), 0.5, np.float32))
+    kept = {key: value.copy() for key, value in shown.items()}
+    for _ in range(2):  # behind the back of the board
+        envs.call("step", np.full(3, 0.5, np.float32))
+    assert_same(shown, kept)
     with pytest.raises(ValueError, match="2 values for 3"):
         envs.set_attr("mark", [1, 2])
 
