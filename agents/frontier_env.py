@@ -93,7 +93,7 @@ class _Beneath(ExploreEnv):
 
     planned_path: NDArray[np.float64] | None = None  # the driver's, for the frames
 
-    def _observe(self) -> Any:
+    def observe(self) -> Any:
         share = self.scan.ranges / self.scan.range_max
         robot = self.config.robot
         limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])

@@ -58,6 +58,11 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     config, rooms, slam, robot, lidar, noise, reward, odometry_filter
         See :func:`mecanum_env.arguments.make_config`.
 
+    Attributes
+    ----------
+    canvas : dict or None
+        Arrays of the observation space that ``reset`` and ``step`` fill and return from now on; None: new ones.
+
     Notes
     -----
     ``reset(seed=…, options=…)`` takes the options ``floor_plan`` (a :class:`FloorPlan` or a file),
@@ -95,6 +100,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._filter = make_odometry_filter(self.config.odometry_filter, self.config.odometry_filter_config)
         self._viewer = make_viewer(render_mode, fps=self.metadata["render_fps"])
         self._ready = False
+        self.canvas: Observation | None = None
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
 
@@ -114,7 +120,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._set_up(plan, episode_seed)
         info = self._first_look()
         self._viewer.show(self)
-        return self._observe(), info
+        return self.observe(), info
 
     def _set_up(self, plan: FloorPlan, episode_seed: int, floor: Floor | None = None) -> None:
         """Place the robot in the plan, on the floor of another robot if there is one; nothing is sensed yet."""
@@ -175,7 +181,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             info["is_success"] = bool(success)
             info["episode_metrics"] = self.episode_metrics()
         self._viewer.show(self)
-        return self._observe(), float(sum(info["reward_terms"].values())), bool(terminated), False, info
+        return self.observe(), float(sum(info["reward_terms"].values())), bool(terminated), False, info
 
     def _perceive(self, collisions: int) -> dict[str, Any]:
         """Sense what a step brought, believe it, and return its info; there were so many collisions before."""
@@ -310,7 +316,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             "nees": nees,
         }
 
-    def _observe(self) -> Observation:
+    def observe(self) -> Observation:
+        """Return the observation that the last ``reset`` or ``step`` did."""
         limit = self._step_limit or self.config.time_limit_s / self.config.step_s
         return observe(
             self.config,
@@ -321,6 +328,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             pose_cov=self._pose_cov,
             twist=self._odometry.numbers,
             time_used=self._steps / limit,
+            out=self.canvas,
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -82,6 +83,7 @@ def observe(
     pose_cov: Array,
     twist: tuple[float, float, float],
     time_used: float,
+    out: Observation | None = None,
 ) -> Observation:
     """Return what the agent sees, all of it from sensors and belief.
 
@@ -95,87 +97,86 @@ def observe(
         Of the odometry: vx, vy [m/s], ω [rad/s].
     time_used : float
         Fraction of the episode's time used.
+    out : dict, optional
+        Contiguous arrays of :func:`observation_space` to fill and return; new ones if left out.
     """
     robot = config.robot
     row0, col0 = grid.lattice_origin
     vx, vy, omega = twist
-    maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
-    ranges = np.empty(len(scan.ranges), np.float32)
-    numbers = np.empty(16, np.float32)
-    landmarks = np.empty((config.max_landmarks_observed, 6), np.float32)
+    seen: dict[str, Any] = _blank(len(scan.ranges), config.max_landmarks_observed) if out is None else out
     _fill(
-        maps, ranges, numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution, grid.overview_sums,
-        grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov, vx / robot.max_speed_m_s,
-        vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used, grid.known_area_m2,
+        seen["map_local"], seen["map_global"], seen["scan"], seen["pose"], seen["pose_cov"], seen["twist"],
+        seen["progress"], seen["health"], grid.log_odds, grid.visited, row0, col0, grid.resolution,
+        grid.overview_sums, grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov,
+        vx / robot.max_speed_m_s, vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used,
+        grid.known_area_m2, backend.health,
     )  # fmt: skip
-    numbers[15] = backend.health
-    backend.near_landmarks(landmarks)
+    backend.near_landmarks(seen["landmarks"])
+    return seen
+
+
+def _blank(beams: int, landmarks: int) -> dict[str, Any]:
     return {
-        "map_local": maps[0],
-        "map_global": maps[1],
-        "scan": ranges,
-        "pose": numbers[:4],
-        "pose_cov": numbers[4:10],
-        "landmarks": landmarks,
-        "twist": numbers[10:13],
-        "progress": numbers[13:15],
-        "health": numbers[15:],
+        "map_local": np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8),
+        "map_global": np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8),
+        "scan": np.empty(beams, np.float32),
+        "pose": np.empty(4, np.float32),
+        "pose_cov": np.empty(6, np.float32),
+        "landmarks": np.empty((landmarks, 6), np.float32),
+        "twist": np.empty(3, np.float32),
+        "progress": np.empty(2, np.float32),
+        "health": np.empty(1, np.float32),
     }
 
 
 def draw_maps(grid: OccupancyGrid, pose: Array) -> Observation:
     """Return an observation's ``map_local``, ``map_global`` and ``pose``, of a map and a pose ``(3,)`` alone."""
-    maps = np.empty((2, 3, MAP_SIZE, MAP_SIZE), np.uint8)
-    numbers = np.empty(15, np.float32)
+    out = _blank(0, 0)
     row0, col0 = grid.lattice_origin
     _fill(
-        maps, np.empty(0, np.float32), numbers, grid.log_odds, grid.visited, row0, col0, grid.resolution,
+        out["map_local"], out["map_global"], out["scan"], out["pose"], out["pose_cov"], out["twist"],
+        out["progress"], out["health"], grid.log_odds, grid.visited, row0, col0, grid.resolution,
         grid.overview_sums, grid.overview_block, np.empty(0), 1.0, np.asarray(pose, dtype=np.float64),
-        np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0,
+        np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     )  # fmt: skip
-    return {"map_local": maps[0], "map_global": maps[1], "pose": numbers[:4]}
+    return {key: out[key] for key in ("map_local", "map_global", "pose")}
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
-    maps: NDArray[np.uint8], ranges_out: NDArray[np.float32], numbers: NDArray[np.float32],
-    log_odds: NDArray[np.int8], trail: NDArray[np.uint8], row0: int, col0: int, resolution: float,
-    overview: NDArray[np.int32], block: int, ranges: Array, range_max: float, pose: Array, cov: Array,
-    vx: float, vy: float, omega: float, time_used: float, known_area_m2: float,
+    map_local: NDArray[np.uint8], map_global: NDArray[np.uint8], scan_out: NDArray[np.float32],
+    pose_out: NDArray[np.float32], cov_out: NDArray[np.float32], twist_out: NDArray[np.float32],
+    progress_out: NDArray[np.float32], health_out: NDArray[np.float32], log_odds: NDArray[np.int8],
+    trail: NDArray[np.uint8], row0: int, col0: int, resolution: float, overview: NDArray[np.int32], block: int,
+    ranges: Array, range_max: float, pose: Array, cov: Array, vx: float, vy: float, omega: float,
+    time_used: float, known_area_m2: float, health: float,
 ) -> None:  # fmt: skip
     """Fill everything but the landmarks, in one call."""
     centre_x, centre_y, half = _map_frame(row0, col0, overview.shape[1], overview.shape[2], block, resolution)
-    _fill_local(maps[0], log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
-    _fill_global(maps[1], overview, block, (pose[0] - centre_x) / half, (pose[1] - centre_y) / half)
-    _fill_numbers(
-        numbers, ranges_out, ranges, range_max, pose, cov, centre_x, centre_y, half, vx, vy, omega, time_used,
-        known_area_m2 / (4.0 * half * half),
-    )  # fmt: skip
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _fill_numbers(
-    out: NDArray[np.float32], scan_out: NDArray[np.float32], ranges: Array, range_max: float, pose: Array,
-    cov: Array, centre_x: float, centre_y: float, half: float, vx: float, vy: float, omega: float,
-    time_used: float, known: float,
-) -> None:  # fmt: skip
+    x, y = (pose[0] - centre_x) / half, (pose[1] - centre_y) / half
+    _fill_local(map_local, log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
+    _fill_global(map_global, overview, block, x, y)
     for i in range(ranges.shape[0]):
         # A lost beam says as little as one that nothing returned: 1.
         r = ranges[i] / range_max
         scan_out[i] = r if r < 1.0 else 1.0
-    out[0] = min(max((pose[0] - centre_x) / half, -1.0), 1.0)
-    out[1] = min(max((pose[1] - centre_y) / half, -1.0), 1.0)
-    out[2], out[3] = math.cos(pose[2]), math.sin(pose[2])
-    k = 4
+    pose_out[0], pose_out[1] = _within(x, 1.0), _within(y, 1.0)
+    pose_out[2], pose_out[3] = math.cos(pose[2]), math.sin(pose[2])
+    k = 0
     for i in range(3):
         for j in range(i, 3):
-            out[k] = min(max(cov[i, j], -_COV_LIMIT), _COV_LIMIT)
+            cov_out[k] = _within(cov[i, j], _COV_LIMIT)
             k += 1
-    out[10] = min(max(vx, -_TWIST_LIMIT), _TWIST_LIMIT)
-    out[11] = min(max(vy, -_TWIST_LIMIT), _TWIST_LIMIT)
-    out[12] = min(max(omega, -_TWIST_LIMIT), _TWIST_LIMIT)
-    out[13] = min(max(time_used, 0.0), 1.0)
-    out[14] = min(max(known, 0.0), 1.0)
+    twist_out[0], twist_out[1] = _within(vx, _TWIST_LIMIT), _within(vy, _TWIST_LIMIT)
+    twist_out[2] = _within(omega, _TWIST_LIMIT)
+    progress_out[0] = min(max(time_used, 0.0), 1.0)
+    progress_out[1] = min(max(known_area_m2 / (4.0 * half * half), 0.0), 1.0)
+    health_out[0] = health
+
+
+@njit(nogil=True, error_model="numpy", inline="always")
+def _within(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -189,7 +189,8 @@ class WheelEncoders:
             slip = _read_noisy_encoders(turned, rng.words, dt, self._fixed, self._last, twist)
         else:
             slip = _read_encoders(turned, rng.standard_normal(4), dt, self._fixed, self._last, twist)
-        return Odometry(twist, dt, slip)
+        vx, vy, omega = twist.tolist()
+        return Odometry((vx, vy, omega), dt, slip)
 
 
 class FilteredEncoders:

@@ -125,7 +125,7 @@ class Member(ExploreEnv):
 
     def observe(self) -> Observation:
         """Return the observation of what is sensed, believed and known of the team now."""
-        observation = self._observe()
+        observation = super().observe()
         if self._team.robots > 1:
             observation["teammates"] = self._observed_teammates()
         return observation

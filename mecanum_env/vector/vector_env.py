@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 from collections.abc import Callable, Sequence
+from copy import copy as shallow_copy
 from copy import deepcopy
 from functools import partial
-from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
+from itertools import pairwise
 from typing import Any, cast
 
 import gymnasium
@@ -21,17 +20,14 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from mecanum_env.env import ExploreEnv
-from mecanum_env.vector import workers as told
 from mecanum_env.vector.board import Board
-from mecanum_env.vector.workers import Share
+from mecanum_env.vector.workers import CALL, LISTEN, RESET, SET, STEP, Answer, Share, Worker
 
 __all__ = ["ExploreVectorEnv"]
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Observations = dict[str, NDArray[Any]]
-
-_PATIENCE_S = 10.0  # for a worker to quit
 
 
 class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
@@ -101,22 +97,18 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         self.observation_space = batch_space(observation, num_envs)
         self.action_space = batch_space(action, num_envs)
         processes = multiprocessing.get_context(context)
-        self._board = Board(processes, num_envs, observation, action)
         make = partial(_limited, make, max_episode_steps)
-        shares = np.array_split(np.arange(num_envs), min(cores if workers is None else workers, num_envs))
-        self._rows = [share.tolist() for share in shares]
-        self._own: Share | None = Share(make, self._board, 0, len(self._rows[0]), mode)
-        self._pipes: list[Connection] = []
-        self._processes: list[BaseProcess] = []
-        for rows in self._rows[1:]:
-            ours, theirs = processes.Pipe()
-            process = processes.Process(  # type: ignore[attr-defined]
-                target=told.work, args=(theirs, make, self._board, rows[0], len(rows), mode), daemon=True
-            )
-            process.start()
-            theirs.close()
-            self._pipes.append(ours)
-            self._processes.append(process)
+        shares = min(cores if workers is None else workers, num_envs)
+        # The first is the caller's, who has more to do than its share: where they differ, the smaller one.
+        edges = [num_envs * k // shares for k in range(shares + 1)]
+        self._rows = [range(first, last) for first, last in pairwise(edges)]
+        self._board = board = Board(processes, num_envs, observation, action, shares - 1)
+        # With arrays of its own on that memory: who holds the board's is counted.
+        self._own: Share | None = Share(make, shallow_copy(board), 0, len(self._rows[0]), mode)
+        self._workers = [
+            Worker(processes, number, make, board, rows[0], len(rows), mode)
+            for number, rows in enumerate(self._rows[1:])
+        ]
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
 
@@ -138,9 +130,10 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         chosen = np.ones(self.num_envs, np.bool_) if mask is None else mask
         if not np.any(chosen):
             raise ValueError("reset_mask chooses no environment")
-        parts = [({k: seeds[k] for k in rows if chosen[k]}, options or None) for rows in self._rows]
-        infos = self._infos(self._ask(told.RESET, parts))
-        return self._observations(), infos
+        page = self._turn()
+        parts = [(page, {k: seeds[k] for k in rows if chosen[k]}, options or None) for rows in self._rows]
+        infos = self._infos(page, self._ask(RESET, parts))
+        return self._observations(page), infos
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
         """Step every environment by its row of the actions ``(num_envs, a)``."""
@@ -148,9 +141,10 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         if np.shape(actions) != board.actions.shape:
             raise ValueError(f"actions must be {board.actions.shape}, got {np.shape(actions)}")
         board.actions[:] = actions
-        infos = self._infos(self._ask(told.STEP, [()] * len(self._rows)))
+        number = self._turn()
+        page, infos = board.pages[number], self._infos(number, self._step(number))
         return (
-            self._observations(), board.rewards.copy(), board.terminated.copy(), board.truncated.copy(), infos,
+            self._observations(number), page.rewards.copy(), page.terminated.copy(), page.truncated.copy(), infos,
         )  # fmt: skip
 
     def render(self) -> tuple[Any, ...] | None:
@@ -159,7 +153,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return an attribute of each environment, or what it returns where it is a method."""
-        answers = self._ask(told.CALL, [(name, args, kwargs)] * len(self._rows))
+        answers = self._ask(CALL, [(name, args, kwargs)] * len(self._rows))
         return tuple(value for answer in answers for value in answer)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -171,7 +165,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         each = list(values) if isinstance(values, list | tuple) else [values] * self.num_envs
         if len(each) != self.num_envs:
             raise ValueError(f"{len(each)} values for {self.num_envs} environments")
-        self._ask(told.SET, [(name, {k: each[k] for k in rows}) for rows in self._rows])
+        self._ask(SET, [(name, {k: each[k] for k in rows}) for rows in self._rows])
 
     @property  # type: ignore[misc]
     def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
@@ -185,36 +179,39 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Have the workers quit; those that do not are ended."""
-        for pipe in getattr(self, "_pipes", []):
-            with contextlib.suppress(OSError):
-                pipe.send((told.QUIT,))
-            pipe.close()
-        for process in getattr(self, "_processes", []):
-            process.join(_PATIENCE_S)
-            if process.is_alive():
-                process.kill()
-                process.join()
+        for worker in getattr(self, "_workers", []):
+            worker.quit()
         if (own := getattr(self, "_own", None)) is not None:
             own.close()
-        self._pipes, self._processes, self._own = [], [], None
+        self._workers, self._own = [], None
 
     # ---- between caller and workers ------------------------------------------------------------------------
 
+    def _step(self, page: int) -> list[Any]:
+        """Step all shares onto a page; return what it has no place for."""
+        self._board.orders[0] = page
+        return self._all(STEP, (page,), Worker.step, Worker.stepped)
+
     def _ask(self, command: str, parts: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """Give every worker its part of a command; return their results, or raise what one of them raised."""
+        """Give every share its part of a command; return their results."""
+        self._board.orders[0] = LISTEN
+        rest = iter(parts[1:])
+        return self._all(command, parts[0], lambda worker: worker.tell(command, *next(rest)), Worker.told)
+
+    def _all(
+        self, command: str, part: tuple[Any, ...], begin: Callable[[Worker], None], end: Callable[[Worker], Answer]
+    ) -> list[Any]:
+        """Have the workers begin, do the caller's own part, and return all results, or raise what one raised."""
         if self._own is None:
             raise gymnasium.error.ClosedEnvironmentError("the environments are closed")
-        answers: list[tuple[Exception | None, Any]] = []
         try:
-            for pipe, part in zip(self._pipes, parts[1:], strict=True):
-                pipe.send((command, *part))
+            for worker in self._workers:
+                begin(worker)
             try:
-                answers.append((None, getattr(self._own, command)(*parts[0])))
+                answers: list[Answer] = [(None, getattr(self._own, command)(*part))]
             except Exception as error:  # the others' answers first
-                answers.append((error, None))
-            for pipe in self._pipes:
-                told.attend(pipe)
-                answers.append(pipe.recv())
+                answers = [(error, None)]
+            answers += [end(worker) for worker in self._workers]
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self.close()
             raise RuntimeError("a worker process has ended; make the environments anew") from error
@@ -223,12 +220,15 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
                 raise raised
         return [result for _, result in answers]
 
-    def _observations(self) -> Observations:
-        shared = self._board.observations
-        return {key: value.copy() for key, value in shared.items()} if self.copy else dict(shared)
+    def _turn(self) -> int:
+        """Return the page to write next: where the caller keeps what it is given, one that it holds nothing of."""
+        return self._board.free_page() if self.copy else self._board.spare
 
-    def _infos(self, rests: list[dict[int, dict[str, Any]]]) -> dict[str, Any]:
-        infos = self._board.infos()
+    def _observations(self, page: int) -> Observations:
+        return self._board.pages[page].lend(copy=self.copy and page == self._board.spare)
+
+    def _infos(self, page: int, rests: list[dict[int, dict[str, Any]]]) -> dict[str, Any]:
+        infos = self._board.pages[page].infos(copy=page == self._board.spare)
         for rest in rests:
             for row, more in rest.items():
                 infos = self._add_info(infos, more, row)

@@ -19,6 +19,7 @@ import mecanum_env
 import slam
 from mecanum_env import rooms
 from mecanum_env.config import EnvConfig, to_toml
+from mecanum_env.env import ExploreEnv
 from mecanum_env.ground_truth import Coverage
 
 IDS = ["mecanum_env/Explore-v0", "mecanum_env/ExploreWheels-v0"]
@@ -302,3 +303,26 @@ def test_observations_are_fresh_arrays() -> None:
     for key, value in kept.items():
         np.testing.assert_array_equal(first[key], value)
     np.testing.assert_array_equal(info["true_pose"], true_pose)
+
+
+def test_observations_are_filled_into_the_canvas_and_are_the_same() -> None:
+    env = gym.make(IDS[0], rooms="rectangular", slam="ekf")
+    env.reset(seed=4)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (6, 3)).astype(np.float32)
+    expected = [env.step(action)[0] for action in actions]
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    space = inner.observation_space
+    assert isinstance(space, gym.spaces.Dict)
+    canvas = {key: np.full(box.shape or (), 9, box.dtype) for key, box in space.items()}
+    inner.canvas = canvas
+    assert env.reset(seed=4)[0] is canvas
+    for action, want in zip(actions, expected, strict=True):
+        got = env.step(action)[0]
+        assert got is canvas and got.keys() == want.keys()
+        for key, value in want.items():
+            np.testing.assert_array_equal(got[key], value)
+        again = inner.observe()
+        assert again is canvas
+    inner.canvas = None
+    assert not np.shares_memory(inner.observe()["scan"], canvas["scan"])

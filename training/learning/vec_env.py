@@ -77,11 +77,15 @@ class ExploreVecEnv(VecEnv):
     def _of_each(self, infos: dict[str, Any]) -> list[dict[str, Any]]:
         """Return every environment's own info of those that Gymnasium keeps as arrays with masks."""
         each: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        rows: dict[int, list[int]] = {}  # of each mask: most keys have the same one
         for key, values in infos.items():
-            if key.startswith("_") or f"_{key}" not in infos:
+            mask = infos.get(f"_{key}")
+            if mask is None or key.startswith("_"):
                 continue
+            if id(mask) not in rows:
+                rows[id(mask)] = np.flatnonzero(mask).tolist()
             parts = self._of_each(values) if isinstance(values, dict) else values.tolist()
-            for k in np.flatnonzero(infos[f"_{key}"]).tolist():
+            for k in rows[id(mask)]:
                 each[k][key] = parts[k]
         return each
 

@@ -40,7 +40,7 @@ _STAGES: tuple[tuple[str, str, str], ...] = (
     ("key scans", "backend.key_scans", "redraw_if_moved"),
     ("update, rest", "backend", "update"),
     ("coverage", "_coverage", "update"),
-    ("observation", "", "_observe"),
+    ("observation", "", "observe"),
     ("info", "", "_info"),
     ("reward", "", "_outcome"),
 )

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +13,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 import mecanum_env  # noqa: F401 - registers the environments
+from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlanError
 from mecanum_env.vector.vector_env import ExploreVectorEnv
 
@@ -115,6 +118,70 @@ def test_copies_last_and_views_do_not(envs: ExploreVectorEnv) -> None:
     views.close()
 
 
+def test_what_is_held_is_not_written_again() -> None:
+    """However little of a step the caller keeps: one array, a view of a view, one column of the infos."""
+    envs, kept = batch(workers=2), []
+    observations, infos = envs.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for k in range(24):
+        held = [
+            observations["scan"], observations["map_local"][1, 0][:3], infos["coverage"][1:], infos["_nees"],
+            infos["true_pose"].T, infos.get("reward_terms", {}).get("area", np.zeros(0)),
+            memoryview(observations["pose"]),
+        ][k % 7]  # fmt: skip
+        kept.append((held, np.array(held)))
+        if k % 3 == 2:
+            kept = kept[1:]
+        observations, *_, infos = envs.step(rng.uniform(-1, 1, (3, 3)).astype(np.float32))
+        for held, then in kept:
+            np.testing.assert_array_equal(held, then)
+    envs.close()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_reset_of_some_shows_the_others_as_they_are_whatever_the_caller_has_written(mode: AutoresetMode) -> None:
+    ours, theirs = batch(workers=2, autoreset_mode=mode), like(mode=mode)
+    got, want = ours.reset(seed=5)[0], theirs.reset(seed=5)[0]
+    for k in range(13):
+        actions = np.full((3, 3), 0.3, np.float32)
+        for mask in (np.arange(3) == k % 3, np.arange(3) != k % 3):
+            if k in (2, 12):  # in the last, all have ended
+                for value in got.values():
+                    value[:] = 1
+                once, again = ours.reset(options={"reset_mask": mask}), theirs.reset(options={"reset_mask": mask})
+                assert_same(once, again)
+                got = once[0]
+        if k < 12:
+            got, want = ours.step(actions)[0], theirs.step(actions)[0]
+            assert_same(got, want)
+    ours.close()
+    theirs.close()
+
+
+class _Nearsighted(ExploreEnv):
+    """Shows another observation than it is asked to fill, and keeps the one before."""
+
+    def observe(self) -> Any:
+        seen = dict(super().observe())
+        return seen | {"scan": np.minimum(seen["scan"], 0.5)}
+
+
+def _nearsighted() -> gym.Env[Any, Any]:
+    return _Nearsighted(rooms="rectangular", slam="ekf", config={"time_limit_s": 1.2})
+
+
+def test_an_environment_of_ones_own_shows_what_it_shows() -> None:
+    ours, theirs = ExploreVectorEnv(2, make=_nearsighted, workers=2), gym.vector.SyncVectorEnv([_nearsighted] * 2)
+    assert_same(ours.reset(seed=1), theirs.reset(seed=1))
+    for _ in range(3):
+        actions = np.full((2, 3), 0.5, np.float32)
+        assert_same(ours.step(actions), theirs.step(actions))
+    mask = {"reset_mask": np.array([True, False])}
+    assert_same(ours.reset(options=dict(mask)), theirs.reset(options=dict(mask)))
+    ours.close()
+    theirs.close()
+
+
 def test_attributes_of_each(envs: ExploreVectorEnv) -> None:
     envs.reset(seed=4)
     assert envs.np_random_seed == (4, 5, 6)
@@ -122,6 +189,11 @@ def test_attributes_of_each(envs: ExploreVectorEnv) -> None:
     envs.set_attr("mark", [1, 2, 3])
     assert envs.get_attr("mark") == (1, 2, 3)
     assert [metrics["steps"] for metrics in envs.call("episode_metrics")] == [0, 0, 0]
+    shown, *_ = envs.step(np.full((3, 3), 0.5, np.float32))
+    kept = {key: value.copy() for key, value in shown.items()}
+    for _ in range(2):  # behind the back of the board
+        envs.call("step", np.full(3, 0.5, np.float32))
+    assert_same(shown, kept)
     with pytest.raises(ValueError, match="2 values for 3"):
         envs.set_attr("mark", [1, 2])
 
@@ -169,7 +241,7 @@ def test_without_autoreset_a_step_after_the_end_is_an_error() -> None:
 def test_closing_ends_the_processes_and_so_does_a_dead_one() -> None:
     envs = batch(workers=3)
     envs.reset(seed=0)
-    processes = list(envs._processes)
+    processes = [worker.process for worker in envs._workers]
     envs.close()
     envs.close()
     assert not any(process.is_alive() for process in processes)
@@ -177,12 +249,22 @@ def test_closing_ends_the_processes_and_so_does_a_dead_one() -> None:
         envs.reset(seed=0)
     envs = batch(workers=3)
     envs.reset(seed=0)
-    processes = list(envs._processes)
+    processes = [worker.process for worker in envs._workers]
     os.kill(processes[0].pid or 0, signal.SIGKILL)
     with pytest.raises(RuntimeError, match="worker process has ended"):
         for _ in range(3):
             envs.step(np.zeros((3, 3), np.float32))
     assert not any(process.is_alive() for process in processes)
+
+
+def test_a_program_that_closes_nothing_ends() -> None:
+    program = (
+        "from mecanum_env.vector.vector_env import ExploreVectorEnv\n"
+        "envs = ExploreVectorEnv(2, workers=2, context='fork', rooms='rectangular', slam='odometry')\n"
+        "kept = [envs]; kept.append(kept); envs.reset(seed=0); print('done')"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
+    assert ended.stdout == "done\n"
 
 
 def test_wheels_frames_and_spawned_processes() -> None:

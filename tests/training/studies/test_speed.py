@@ -61,6 +61,8 @@ def test_many_environments_at_once(capsys: pytest.CaptureFixture[str]) -> None:
     result = json.loads(capsys.readouterr().out)
     assert result["steps_per_second"].keys() == {"one", "sync", "async", "vector_entry_point"}
     assert result["steps"] == 10 and result["ratio_to_one"]["one"] == 1.0
+    undisturbed = result["steps_per_second_undisturbed"]
+    assert all(undisturbed[way] >= rate for way, rates in result["rounds"].items() for rate in rates)
     assert main(["speed", "--envs", "2", *settings]) == 0
     assert "vector_entry_point" in capsys.readouterr().out
     assert main(["speed", "--envs", "0"]) == 2
