@@ -32,6 +32,7 @@ __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
 Array = NDArray[np.float64]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
+_REMOTE_RAYS = 60
 _LOST = 0.1  # health of a belief below which it is no good for driving
 
 
@@ -41,6 +42,9 @@ class PatienceConfig:
 
     replan_s: float = 1.0
     min_replan_s: float = 0.3  # between two choices, whatever happens
+    far_m: float = 15.0  # to a goal farther off, where less than …
+    news_m2: float = 0.1  # … has come to light since it was chosen, the robot drives on for …
+    stale_s: float = 5.0  # … so long before it chooses anew
     settle_s: float = 0.2  # how long to look from a view point before it counts as looked from
     looks: int = 1  # at one piece of frontier before it is let be
     stuck_s: float = 4.0  # without moving or turning: recover
@@ -105,6 +109,7 @@ class Explorer(Agent):
         self._within_m = self._least_within_m  # [weighted m] that the next choice is likely to ask ways for
         self._time = 0.0
         self._chosen_at = -math.inf
+        self._chosen_on = 0  # known cells
         self._target: Array | None = None  # the frontier point behind the goal
         self._deadline = math.inf
         self._arrived_for = 0.0
@@ -206,6 +211,7 @@ class Explorer(Agent):
         given_up = failures >= config.patience.attempts
         if not (worth & np.isfinite(costs) & ~given_up & (looks < config.patience.looks)).any():
             worth |= self._may_open(cost_map, frontiers)
+        worth &= ~self._too_far(cost_map, frontiers, costs, worth & ~given_up)
         costs[~worth] = np.inf
         left = worth & (looks < config.patience.looks)
         self._ending = "stuck" if (left & given_up).any() else "unreachable" if left.any() else "covered"
@@ -221,6 +227,18 @@ class Explorer(Agent):
         config = self.config.frontiers
         cells = cost_map.to_cells(frontiers.targets)
         return expected_area(cost_map, cells, range_m=0.5 * config.view_range_m) >= config.opening_m2
+
+    def _too_far(
+        self, cost_map: CostMap, frontiers: Frontiers, costs: Array, asked: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return which of the pieces asked about ``(m,)`` show too little for so long a way."""
+        config = self.config.frontiers
+        remote = np.flatnonzero(asked & np.isfinite(costs) & (costs > config.remote_m))
+        cells = cost_map.to_cells(frontiers.targets[remote])
+        shown = expected_area(cost_map, cells, range_m=config.view_range_m, rays=_REMOTE_RAYS)
+        out = np.zeros(len(costs), dtype=np.bool_)
+        out[remote] = shown < config.remote_m2_m * (costs[remote] - config.remote_m)
+        return out
 
     def _watch_kept(self) -> Watch:
         # Beams fall no farther apart than a cell of the planning grid.
@@ -270,7 +288,7 @@ class Explorer(Agent):
             return self._to_action(self._follower.follow(observation, belief))
         if self._due(belief):
             self._goal = self.choose(belief)
-            self._chosen_at = self._time
+            self._chosen_at, self._chosen_on = self._time, belief.grid.known_cells
             if self._goal is not None:
                 # Who sees all round need not turn to look.
                 all_round = self._lidar.field_of_view_deg >= 360.0
@@ -328,11 +346,21 @@ class Explorer(Agent):
     def _due(self, belief: Belief) -> bool:
         patience = self.config.patience
         waited = self._time - self._chosen_at + 1e-9
-        if waited >= patience.replan_s or self._chosen_at == -math.inf:
+        if self._chosen_at == -math.inf:
+            return True
+        if waited >= patience.replan_s and (waited >= patience.stale_s or not self._as_chosen(belief)):
             return True
         if waited < patience.min_replan_s or self._goal is None:
             return False
         return self._follower.blocked or self._target is None or not self._is_frontier(belief, self._target)
+
+    def _as_chosen(self, belief: Belief) -> bool:
+        """Whether the robot is far from its goal yet, and the map shows what it showed when that was chosen."""
+        if self._goal is None:
+            return False
+        away = math.hypot(*(self._goal.pose[:2] - belief.pose[:2]).tolist())
+        news_m2 = (belief.grid.known_cells - self._chosen_on) * belief.grid.resolution**2
+        return away > self.config.patience.far_m and abs(news_m2) < self.config.patience.news_m2
 
     def _is_frontier(self, belief: Belief, point: Array) -> bool:
         """Whether any real stretch of frontier is left around the point, on the fine grid."""

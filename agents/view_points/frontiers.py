@@ -26,6 +26,8 @@ class FrontierConfig:
     min_extent_m: float = 0.4  # longer side of a cluster's bounding box; at most the body's width
     far_extent_m: float = 0.7  # the same at a travel cost of far_m and beyond; at most twice the body's width
     far_m: float = 6.0  # [weighted m]; up to there in proportion
+    remote_m: float = 30.0  # [weighted m]; what is farther off must show, or it is not worth the way, …
+    remote_m2_m: float = 0.05  # … so much of the unknown for each metre beyond
     opening_m2: float = 2.0  # unknown in view from one that is smaller, for it to be gone to at last
     min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
     min_unknown_width_m: float = 0.3  # thinner ones are the insides of walls

@@ -220,6 +220,8 @@ def walls_first(
             continue
         if first or second:
             _loosen(row, lines[one if first else two])
+        if row[7] != 0.0:  # where a surface seems to end lasts, too
+            row[2:5] *= lasting
         count += 1
     return count
 

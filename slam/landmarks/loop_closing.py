@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 _LAST_SEEN = 5  # column of marks
 _OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company
 _HOLD = 3  # other landmarks seen, that old ones can wait for company
-_ALONE = 5.0  # times ``sigma`` to which one must be expected to be taken without company
+_ALONE = 2.0  # times ``sigma`` to which one must be expected to be taken without company
 _LEAST = 3  # old landmarks that the others predict narrowly, for them all to be taken
 
 
