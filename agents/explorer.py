@@ -152,6 +152,17 @@ class Explorer(Agent):
         spacing = self.config.planner.path_spacing_m
         return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
 
+    def _way_near(self, point: Array, belief: Belief) -> tuple[Array, float, float]:
+        """Return the path ``(n, 2)`` [m] to the reachable place nearest to a point, its cost and that distance."""
+        cost_map = self._cost_maps.of(belief)
+        travel = travel_costs(cost_map)
+        reached = np.argwhere(np.isfinite(travel.cost))
+        away = np.hypot(*(cost_map.to_points(reached) - point).T)
+        nearest = int(np.argmin(away))
+        row, column = reached[nearest].tolist()
+        path = self._path(cost_map, travel, (row, column), belief)
+        return path, float(travel.cost[row, column]), float(away[nearest])
+
     def _candidates(self, belief: Belief) -> Candidates:
         found = self._candidates_on(self._cost_maps.of(belief))
         # A door may be closed by nothing but the margin for a position that is unsure.

@@ -23,7 +23,7 @@ from slam.motion import OdometryNoise
 from slam.settings import require
 from slam.types import Observations, Odometry, Scan
 
-__all__ = ["Backend", "BackendConfig", "found_cov"]
+__all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
 
 Array = NDArray[np.float64]
 
@@ -284,6 +284,27 @@ class Backend(abc.ABC):
         """Go on from a pose ``(3,)`` that a scan was found to be taken from."""
         self._place(pose, cov + found_cov())
         self._update(scan)
+
+
+class SurfaceBackend(Backend):
+    """A backend without landmarks: ``landmarks`` of its belief are empty, and ``observe`` refuses."""
+
+    observes_landmarks = False
+    relocalises = True
+    maps: ClassVar[str]
+    """Its name and what it maps instead, in words."""
+
+    def observe(self, observations: Observations) -> None:
+        """Refuse: its maps have no use for landmark observations."""
+        raise ValueError(
+            f"{self.maps}, not landmarks: it takes scans (`update`), not landmark observations; "
+            "use ekf or fastslam2 for those"
+        )
+
+    @property
+    def belief(self) -> Belief:
+        """Pose and grid; landmarks are empty, and there is no joint covariance."""
+        return Belief.without_landmarks(self.pose, self.pose_cov, self.grid, self.health)
 
 
 def found_cov() -> Array:

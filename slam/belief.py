@@ -59,6 +59,14 @@ class Belief:
     )  # see postponed
 
     @classmethod
+    def without_landmarks(cls, pose: Array, pose_cov: Array, grid: OccupancyGrid, health: float = 1.0) -> Belief:
+        """Return a belief of a pose and a map alone."""
+        return cls(
+            pose=pose, pose_cov=pose_cov, landmarks=np.zeros((0, 2)), landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64), grid=grid, health=health,
+        )  # fmt: skip
+
+    @classmethod
     def postponed(
         cls, landmarks: Callable[[], dict[str, Any]], landmark_cov: Callable[[], Array],
         whole_cov: Callable[[], Array], **known: Any,

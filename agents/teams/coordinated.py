@@ -42,9 +42,6 @@ class Coordinated(Shared, CostUtility):
     config: CoordinatedConfig
     config_type = CoordinatedConfig
 
-    def _sharing(self) -> SharingConfig:
-        return self.config.sharing
-
     def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
         """Return the column that is paired with this robot."""
         config, cost_map = self.config, found.cost_map

@@ -143,7 +143,6 @@ def write_landmark_map(
     seen_by: Sequence[Iterable[int]] | None = None,
     backend: str = "",
     frame: str = "start",
-    neighbours: int = 8,
 ) -> None:
     """Write the cartographic database; the same arguments give the same content.
 
@@ -167,8 +166,6 @@ def write_landmark_map(
         Which robots have each landmark in their maps, where several made the map together.
     backend, frame : str
         Who estimated this, and in which frame: by default that of the robot's start.
-    neighbours : int
-        Relations are kept to so many nearest neighbours of each landmark.
 
     Raises
     ------
@@ -192,7 +189,7 @@ def write_landmark_map(
     seen = _column("times_seen", times_seen, np.zeros(n, np.int64))
     if joint is not None:
         joint = joint.reshape(n, 2, n, 2)[order][:, :, order].reshape(2 * n, 2 * n)
-    pairs, *measures = relate(xy[order], covs[order], joint_cov=joint, neighbours=neighbours)
+    pairs, *measures = relate(xy[order], covs[order], joint_cov=joint)
     moments = np.column_stack([xy, covs[:, 0, 0], covs[:, 1, 1], covs[:, 0, 1]]).tolist()
     rows = [
         (int(names[i]), _KIND_NAMES[int(kind[i])], *moments[i], _or_null(angle[i]), int(seen[i])) for i in order

@@ -16,8 +16,7 @@ import numpy as np
 import agents
 from agents.base import ENDINGS as AGENT_ENDINGS
 from agents.base import Agent, Goal
-from mecanum_env import rooms as room_registry
-from mecanum_env.arguments import make_config
+from mecanum_env.arguments import make_config, make_plan
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
@@ -191,7 +190,7 @@ def asked_for(
     if coverage_target is not None:
         world = replace(world, coverage_target=coverage_target)
     check_writable(out, files)
-    plan = _make_plan(world, run["seed"])
+    plan = make_plan(world, run["seed"])
     limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
     return world, run | {"max_steps": limit}, plan
 
@@ -201,12 +200,6 @@ def make_agent(name: str, env: ExploreEnv) -> Agent:
     config = env.config
     body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
     return KnownMap(env.truth.ground, **body) if name == KNOWN_MAP else agents.make(name, **body)
-
-
-def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:
-    if config.floor_plan is not None:
-        return room_registry.load(config.floor_plan, seed=seed)
-    return room_registry.make(config.rooms, seed=seed, config=config.rooms_config)
 
 
 def _read_run_table(path: Path) -> dict[str, Any]:

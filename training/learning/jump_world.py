@@ -83,10 +83,7 @@ class JumpWorld(ChoiceEnv):
     @property
     def belief(self) -> Belief:
         """The true pose, and the map as the scans drew it."""
-        return Belief(
-            pose=self._pose, pose_cov=_POSE_COV, landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)), landmark_ids=np.zeros(0, np.int64), grid=self._grid,
-        )  # fmt: skip
+        return Belief.without_landmarks(self._pose, _POSE_COV, self._grid)
 
     @property
     def ground(self) -> GroundTruth:
