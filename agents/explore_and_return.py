@@ -19,10 +19,9 @@ from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
-
-Array = NDArray[np.float64]
 
 _HOME = np.zeros(3)  # the belief's frame is that of the start pose
 

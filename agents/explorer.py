@@ -26,10 +26,9 @@ from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
-
-Array = NDArray[np.float64]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
 _LOST = 0.1  # health of a belief below which it is no good for driving

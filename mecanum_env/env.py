@@ -32,11 +32,9 @@ from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.odometry.filters import make_odometry_filter
 from slam.settings import unknown_name
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["ExploreEnv"]
-
-Array = NDArray[np.float64]
 
 ACTIONS = {"twist": 3, "wheels": 4}
 

@@ -21,11 +21,9 @@ from slam.health.relocalisation import RelocalisationConfig
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
+from slam.types import Array
 
 __all__ = ["Belief", "Teammate"]
-
-Array = NDArray[np.float64]
 
 
 _POSTPONED = (

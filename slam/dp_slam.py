@@ -36,11 +36,9 @@ from slam.particles.resampling import (
 )
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import require
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]
-
-Array = NDArray[np.float64]
 
 _LEAD_SHARE = 0.5  # the map's particle is followed until another weighs more than twice as much
 

@@ -37,11 +37,10 @@ from slam.particles.resampling import (
     systematic,
 )
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 

@@ -23,10 +23,10 @@ from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _FIRST_LEG_M = 0.5  # of a way: where it turns to first

@@ -22,10 +22,9 @@ from agents.stations.lattice import in_sight
 from agents.teams.crew import Crew
 from agents.teams.shared import Shared, SharingConfig
 from agents.view_points.gain import expected_area
+from slam.types import Array
 
 __all__ = ["Coordinated", "CoordinatedConfig", "pair_off"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

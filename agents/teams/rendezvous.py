@@ -20,10 +20,9 @@ from agents.base import Goal
 from agents.teams.team_tour import TeamTour, TeamTourConfig
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

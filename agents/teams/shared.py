@@ -17,8 +17,6 @@ from slam.settings import not_negative, positive
 
 __all__ = ["Shared", "SharingConfig"]
 
-Array = NDArray[np.float64]
-
 _FAR = 1e6  # [m] farther than anything is
 
 

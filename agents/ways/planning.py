@@ -16,10 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
+from slam.types import Array
 
 __all__ = ["TravelCosts", "cell_before", "resample", "shortest_path", "travel_costs", "way_cells"]
-
-Array = NDArray[np.float64]
 
 # Neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8.
 _D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])

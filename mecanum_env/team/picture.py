@@ -13,13 +13,13 @@ from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned
 from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_readouts
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.types import Array
 
 if TYPE_CHECKING:
     from mecanum_env.team.team import Team
 
 __all__ = ["COLOURS", "draw_maps", "render_team"]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLOURS = (

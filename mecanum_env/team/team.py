@@ -28,10 +28,9 @@ from slam.metrics.chi_square import chi2_quantile
 from slam.settings import from_mapping, require, unknown_name
 from slam.teams.account import Account
 from slam.teams.centralised import JointEkf
+from slam.types import Array
 
 __all__ = ["Outcome", "Team"]
-
-Array = NDArray[np.float64]
 
 _JOINT = "ekf-lines"
 _GATE = chi2_quantile(0.999, 3)  # of a sighting

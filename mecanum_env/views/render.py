@@ -36,14 +36,13 @@ from mecanum_env.views.paint import (
 from slam.belief import Belief
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = [
     "FRAME_SHAPE", "Shown", "blank_frame", "frontier_cells", "panels", "render_frame", "view_of_truth",
     "write_readouts",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 FRAME_SHAPE = (720, 1280)

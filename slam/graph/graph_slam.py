@@ -21,11 +21,9 @@ from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
 from slam.motion import predict_robot
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["GraphSlam"]
-
-Array = NDArray[np.float64]
 
 _SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
 _KNOWN, _SOONER = 0.7, 0.4  # share of a scan that is known, below which the next key scan comes so much sooner

@@ -28,11 +28,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.formats import replacing
-from slam.types import CONCAVE, CONVEX
+from slam.types import CONCAVE, CONVEX, Array
 
 __all__ = ["SCHEMA_VERSION", "LandmarkMap", "read_landmark_map", "relate", "write_landmark_map"]
-
-Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 2
 """That of what is written. Version 1 had no ``sightings``, and is read as if there were none."""

@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 from slam.geometry import compose, inverse, transform_points
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.metrics.measures import align_se2
+from slam.types import Array
 
 __all__ = ["Elsewhere", "KnownIds"]
-
-Array = NDArray[np.float64]
 
 _LATELY = 24  # sightings that are looked back upon
 _LONGEST_WAY_M = 1.0  # of the robot since a sighting that still counts: odometry alone relates the two

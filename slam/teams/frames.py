@@ -6,15 +6,13 @@ A frame is a pose ``(3,)`` of b in a: x, y [m], θ [rad]; what is given in b com
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import compose, inverse, rotation, transform_points, wrap
+from slam.types import Array
 
 __all__ = [
     "compose_jacobians", "ends_into", "inverse_jacobian", "points_into", "pose_into", "walls_into",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 
 def compose_jacobians(pose_a_b: Array, pose_b_c: Array) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.metrics.measures import ate_aligned
+from slam.types import Array
 from training.episodes.explore import Course, Episode, prepare, run
 from training.runs.errors import one_line
 from training.runs.running import plain
@@ -23,7 +24,6 @@ __all__ = [
     "row_metrics", "run_job", "run_single", "small_png", "way",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Curve = NDArray[np.float32]
 Key = tuple[str, str, int, str, str] | tuple[str, str, int, str, str, int, str]
 """Suite, place, seed, agent, backend; of a team also the number of its robots and its communication."""

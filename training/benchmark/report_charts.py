@@ -10,15 +10,14 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from slam.types import Array
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
 from training.figures.statistics import Interval
 
 __all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts"]
 
-Array = NDArray[np.float64]
 Along = Literal["time_s", "path_length_m"]
 Line = tuple[str, list[tuple[int, Interval]]]  # name, and its figure for each number of robots
 

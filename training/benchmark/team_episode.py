@@ -7,18 +7,16 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.picture import draw_maps
 from slam.metrics.measures import ate_aligned
+from slam.types import Array
 from training.benchmark import episode as single
 from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
 from training.episodes.team import TeamEpisode, prepare, run
 
 __all__ = ["TeamJob", "run_job"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import UNKNOWN, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 if TYPE_CHECKING:
     from agents.base import Goal
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorded", "Recorder", "Recording", "TeamRecorder"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 _Notes = dict[int, NDArray[Any]]  # by the step that they were noted in

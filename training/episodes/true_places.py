@@ -19,10 +19,10 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.types import Array
 
 __all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 TILE = 6

@@ -15,12 +15,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam.types import Array
+
 __all__ = [
     "CONFIDENCE", "NONE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval",
     "iqm", "mean_interval", "median", "ratio_of_sums", "resampled_indices",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 CONFIDENCE = 0.95

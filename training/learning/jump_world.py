@@ -14,7 +14,6 @@ from typing import Any, SupportsInt
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.frontier_env import ChoiceEnv, Observation
 from agents.learned.chooser import Chooser, ChooserConfig
@@ -27,11 +26,9 @@ from slam.features.extraction import FeatureExtractor
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import OccupancyGrid
 from slam.settings import from_mapping
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["COVERED", "JumpWorld"]
-
-Array = NDArray[np.float64]
 
 COVERED = 0.95
 """Coverage that an episode ends at."""

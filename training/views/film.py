@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Camera", "Film", "TeamCamera", "check_video", "film", "film_episode", "filmed"]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Write = Callable[[Image], None]
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import agents
 from mecanum_env.env import ExploreEnv
@@ -16,7 +15,6 @@ from training.studies.recovery.faults import make_fault
 
 __all__ = ["BINS", "REGION", "Job", "Row", "run_job", "within"]
 
-Array = NDArray[np.float64]
 Job = tuple[str, str, str, str, str, int, int]
 """Fault, backend, agent, rooms or file of a plan, noise, seed, steps at most."""
 Row = dict[str, Any]

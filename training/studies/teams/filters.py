@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 import agents
 import slam
@@ -32,6 +31,7 @@ from slam.geometry import compose, inverse, wrap
 from slam.metrics.measures import ate, heading_errors
 from slam.settings import from_mapping
 from slam.teams.centralised import JointEkf
+from slam.types import Array
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
 from training.runs.errors import bad_input
@@ -41,7 +41,6 @@ from training.studies.exploring import AGENT
 
 __all__ = ["SINGLE", "TEAM", "explore", "study", "table"]
 
-Array = NDArray[np.float64]
 Job = tuple[int, int, int, float, float, str]  # room seed, robots, steps, start's σ [m, rad], noise
 
 TEAM, SINGLE = "centralised", ("ekf-lines", "invariant-ekf")

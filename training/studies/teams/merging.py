@@ -18,7 +18,6 @@ from typing import Annotated, Any, NamedTuple
 import cv2
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 import agents
 from mecanum_env.env import ExploreEnv
@@ -31,6 +30,7 @@ from slam.settings import to_mapping
 from slam.teams.account import Account
 from slam.teams.alignment import Alignment, AlignmentConfig, align
 from slam.teams.fusion import MergedMap, fuse
+from slam.types import Array
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import installed_version, keep_settings
@@ -51,7 +51,6 @@ SLAM = "invariant-ekf"
 _CLEARANCE_M = 0.6  # of the second robot's start
 _SAME_CORNER_M = 0.3  # a mapped corner is the nearest true one, if no farther
 
-Array = NDArray[np.float64]
 Job = tuple[str, int, float, float]  # rooms, seed of the room, coverage and time [s] at which a robot stops
 Row = dict[str, Any]
 
