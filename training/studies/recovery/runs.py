@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-import agents
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 from training.studies.recovery.faults import make_fault
 
 __all__ = ["BINS", "REGION", "Job", "Row", "run_job", "within"]
@@ -80,9 +80,8 @@ class _Episode:
     """An agent that explores, with what was seen of its belief."""
 
     def __init__(self, env: ExploreEnv, agent: str, seed: int) -> None:
-        told = env.config
         self.env = env
-        self._agent = agents.make(agent, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+        self._agent = make_agent(agent, env)
         self._observation, _ = env.reset(seed=seed)
         self._agent.reset(env.belief, seed=seed)
         self.errors: list[tuple[float, float, float]] = []  # of a step: [m], [rad], NEES

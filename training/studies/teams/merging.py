@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import typer
 
-import agents
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.formats import atomic_write
@@ -31,6 +30,7 @@ from slam.teams.account import Account
 from slam.teams.alignment import Alignment, AlignmentConfig, align
 from slam.teams.fusion import MergedMap, fuse
 from slam.types import Array
+from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import installed_version, keep_settings
@@ -101,8 +101,7 @@ def _explore(
     env: ExploreEnv, room_seed: int, robot: int, start: Iterable[float], coverage: float, time_s: float
 ) -> _Told:
     """Explore until so much is covered, or so much time has passed."""
-    told, seed = env.config, 2 * room_seed + robot + 1
-    agent = agents.make(AGENT, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+    seed, agent = 2 * room_seed + robot + 1, make_agent(AGENT, env)
     observation, info = env.reset(seed=seed, options={"room_seed": room_seed, "start_pose": tuple(start)})
     agent.reset(env.belief, seed=seed)
     ended = False
