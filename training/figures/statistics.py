@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.types import Array
+from training.runs.running import plain
 
 __all__ = [
     "CONFIDENCE", "NONE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval",
@@ -36,6 +37,10 @@ class Interval:
     value: float
     low: float
     high: float
+
+    def as_json(self) -> dict[str, float | None]:
+        """Return value and limits by their names, null for what is not finite."""
+        return {name: plain(float(getattr(self, name))) for name in ("value", "low", "high")}
 
 
 NONE = Interval(np.nan, np.nan, np.nan)
