@@ -288,8 +288,7 @@ class SurfaceBackend(Backend):
     """A backend without landmarks: ``landmarks`` of its belief are empty, and ``observe`` refuses."""
 
     observes_landmarks = False
-    relocalises = True
-    maps: ClassVar[str]
+    maps: ClassVar[str] = "this backend maps surfaces"
     """Its name and what it maps instead, in words."""
 
     def observe(self, observations: Observations) -> None:

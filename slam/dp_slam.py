@@ -86,6 +86,7 @@ class DpSlam(SurfaceBackend):
     (:mod:`slam.particles.map_error`).
     """
 
+    relocalises = True
     maps = "dp-slam maps occupied cells"
     config: DpSlamConfig
 

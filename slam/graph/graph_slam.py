@@ -35,6 +35,7 @@ _ALIGNED = np.diag([1e-5, 1e-5, 1e-6])  # covariance of where the scan before wa
 class GraphSlam(SurfaceBackend):
     """Key scans, and the patches each was the first to see, in a sparse graph."""
 
+    relocalises = True
     maps = "graph-slam maps surfaces"
     config: GraphSlamConfig
 
