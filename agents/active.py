@@ -28,10 +28,9 @@ from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anch
 from agents.view_points.sightings import expected_sightings
 from slam.belief import Belief
 from slam.settings import not_negative, positive, require
+from slam.types import Array
 
 __all__ = ["ActiveConfig", "ActiveSlam", "LookConfig", "RevisitConfig"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, resolve
 from slam.belief import Belief
 from slam.settings import from_mapping, require
+from slam.types import Array
 
 __all__ = ["ENDINGS", "Agent", "Goal"]
-
-Array = NDArray[np.float64]
 
 ENDINGS = {
     "covered": "nothing is left that it holds worth a visit",

@@ -12,16 +12,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
 from slam.belief import Belief
 from slam.settings import not_negative, positive
+from slam.types import Array
 
 __all__ = ["CostUtility", "CostUtilityConfig"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

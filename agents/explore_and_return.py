@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.driving.control import PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
-from agents.ways.planning import travel_costs
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
-
-Array = NDArray[np.float64]
 
 _HOME = np.zeros(3)  # the belief's frame is that of the start pose
 
@@ -120,18 +118,12 @@ class ExploreAndReturn(NearestFrontier):
 
     def _way_home(self, belief: Belief) -> tuple[Array, float]:
         """Return the path ``(n, 2)`` [m] to the start, or to the reachable place nearest to it, and its cost."""
-        cost_map = self._cost_maps.of(belief)
-        travel = travel_costs(cost_map)
-        reached = np.argwhere(np.isfinite(travel.cost))
-        away = np.hypot(*(cost_map.to_points(reached) - _HOME[:2]).T)
-        nearest = int(np.argmin(away))
-        row, column = reached[nearest].tolist()
-        path = self._path(cost_map, travel, (row, column), belief)
-        if away[nearest] <= max(self.config.homing.last_leg_m, cost_map.resolution):
+        path, cost, away = self._way_near(_HOME[:2], belief)
+        if away <= max(self.config.homing.last_leg_m, self._cost_maps.of(belief).resolution):
             # The start itself for the centre of the cell. Where that cell is not the start's own, the robot has
             # stood there all the same, and the follower's safety check keeps it off the walls.
             path = np.vstack([path[: max(len(path) - 1, 1)], _HOME[:2]])
-        return path, float(travel.cost[row, column])
+        return path, cost
 
     def _is_home(self, belief: Belief) -> bool:
         pose = np.asarray(belief.pose, dtype=np.float64)

@@ -26,10 +26,9 @@ from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
-
-Array = NDArray[np.float64]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
 _REMOTE_RAYS = 60
@@ -156,6 +155,17 @@ class Explorer(Agent):
     def _path(self, cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], belief: Belief) -> Array:
         spacing = self.config.planner.path_spacing_m
         return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
+
+    def _way_near(self, point: Array, belief: Belief) -> tuple[Array, float, float]:
+        """Return the path ``(n, 2)`` [m] to the reachable place nearest to a point, its cost and that distance."""
+        cost_map = self._cost_maps.of(belief)
+        travel = travel_costs(cost_map)
+        reached = np.argwhere(np.isfinite(travel.cost))
+        away = np.hypot(*(cost_map.to_points(reached) - point).T)
+        nearest = int(np.argmin(away))
+        row, column = reached[nearest].tolist()
+        path = self._path(cost_map, travel, (row, column), belief)
+        return path, float(travel.cost[row, column]), float(away[nearest])
 
     def _candidates(self, belief: Belief) -> Candidates:
         found = self._candidates_on(self._cost_maps.of(belief))

@@ -105,11 +105,8 @@ class _Beneath(ExploreEnv):
     @property
     def outline(self) -> Belief:
         """The belief without its landmarks: all that choosing and driving ask for, every step."""
-        backend, nothing = self.backend, np.zeros((0, 2))
-        return Belief(
-            pose=backend.pose, pose_cov=backend.pose_cov, landmarks=nothing, landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64), grid=backend.grid, health=backend.health,
-        )  # fmt: skip
+        backend = self.backend
+        return Belief.without_landmarks(backend.pose, backend.pose_cov, backend.grid, backend.health)
 
 
 class ExploreFrontierEnv(ChoiceEnv):

@@ -25,10 +25,10 @@ from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief
 from slam.settings import not_negative, positive
+from slam.types import Array
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 _SAMPLE_RAYS = 60  # enough to rank places by; six degrees apart

@@ -22,10 +22,9 @@ from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
-
-Array = NDArray[np.float64]
 
 FORMAT = "mecanum-slam drive policy 1"
 SHIPPED = Path(__file__).parent / "policies" / "ppo.safetensors"

@@ -18,7 +18,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
@@ -26,10 +25,9 @@ from agents.view_points.rrt_tree import Tree, mean_shift
 from agents.ways.cost_map import CostMap
 from slam.belief import Belief
 from slam.settings import not_negative, positive, require
+from slam.types import Array
 
 __all__ = ["Rrt", "RrtConfig"]
-
-Array = NDArray[np.float64]
 
 _REMEMBERED = 400  # frontier points; the latest stay
 

@@ -23,10 +23,10 @@ from agents.ways.travel import between
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import not_negative, require
+from slam.types import Array
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 _FAR = 1e6  # [m] farther than anything is

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mecanum_env import rooms as room_registry
 from mecanum_env.config import (
     LIDAR_PRESETS,
     NOISE_PRESETS,
@@ -19,6 +20,7 @@ from mecanum_env.config import (
     from_toml,
     resolve,
 )
+from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensing.calibration import backend_settings
 from slam.backend import Backend
@@ -27,7 +29,7 @@ from slam.registry import config_type
 from slam.registry import make as make_slam
 from slam.settings import from_mapping
 
-__all__ = ["Settings", "make_backend", "make_config"]
+__all__ = ["Settings", "make_backend", "make_config", "make_plan"]
 
 Settings = str | Mapping[str, Any]
 """A name, or a mapping that configures what it names."""
@@ -81,6 +83,21 @@ def make_config(
     from_mapping(config_type(made.slam), backend_settings(made))
     make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
     return made
+
+
+def make_plan(
+    config: EnvConfig, seed: int, *, given: FloorPlan | str | Path | None = None,
+    start: Sequence[float] | None = None,
+) -> FloorPlan:  # fmt: skip
+    """Return where to explore: a plan or its file where one is given, else the configuration's, else rooms drawn.
+
+    ``start`` is a pose x, y, θ in the plan's frame, for the plan's own.
+    """
+    given = config.floor_plan if given is None else given
+    if given is not None and not isinstance(given, FloorPlan):
+        return room_registry.load(given, start=start, seed=seed)
+    plan = room_registry.make(config.rooms, seed=seed, config=config.rooms_config) if given is None else given
+    return plan if start is None else plan.with_start(start, clearance_m=config.robot.inscribed_radius_m)
 
 
 def make_backend(config: EnvConfig) -> Backend:

@@ -14,8 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from numba import njit
 from numpy.typing import NDArray
 
-from mecanum_env import rooms as room_registry
-from mecanum_env.arguments import make_backend, make_config
+from mecanum_env.arguments import make_backend, make_config, make_plan
 from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
@@ -33,11 +32,9 @@ from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.odometry.filters import make_odometry_filter
 from slam.settings import unknown_name
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["ExploreEnv"]
-
-Array = NDArray[np.float64]
 
 ACTIONS = {"twist": 3, "wheels": 4}
 
@@ -115,7 +112,10 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 raise unknown_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         room_seed = options.get("room_seed")
-        plan = self._make_plan(options, episode_seed if room_seed is None else int(room_seed))
+        plan = make_plan(
+            self.config, episode_seed if room_seed is None else int(room_seed),
+            given=options.get("floor_plan", self._plan), start=options.get("start_pose"),
+        )  # fmt: skip
         self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
         self._set_up(plan, episode_seed)
         info = self._first_look()
@@ -253,21 +253,6 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self.truth.record.metrics(self.truth.ground, self.backend.belief)
 
     # ---- parts of a step -----------------------------------------------------------------------------------
-
-    def _make_plan(self, options: dict[str, Any], room_seed: int) -> FloorPlan:
-        start = options.get("start_pose")
-        given = options.get("floor_plan", self._plan)
-        if given is None:
-            given = self.config.floor_plan
-        if isinstance(given, FloorPlan):
-            plan = given
-        elif given is not None:
-            return room_registry.load(given, start=start, seed=room_seed)
-        else:
-            plan = room_registry.make(self.config.rooms, seed=room_seed, config=self.config.rooms_config)
-        if start is not None:
-            plan = plan.with_start(start, clearance_m=self.config.robot.inscribed_radius_m)
-        return plan
 
     def _remember(self) -> None:
         """Keep what the next step's reward compares with."""

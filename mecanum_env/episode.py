@@ -7,7 +7,6 @@ from array import array
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from mecanum_env.physics.world import World
@@ -15,11 +14,9 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.belief import Belief
 from slam.grids.occupancy import OCCUPIED
 from slam.metrics import measures as metrics
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["EpisodeRecord", "Truth"]
-
-Array = NDArray[np.float64]
 
 WALL_TOLERANCE_M = 0.1
 """A mapped wall stands rightly where a true one is no farther than this."""

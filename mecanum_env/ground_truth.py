@@ -14,11 +14,9 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.sensors import Lidar
 from slam.geometry import compose, inverse, transform_points, wrap_scalar
 from slam.grids.occupancy import FREE, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["Coverage", "GroundTruth"]
-
-Array = NDArray[np.float64]
 
 _VIEW_SPACING_M = 0.8  # between the places that visibility is computed from: a quarter of it finds 0.5 % more
 _VIEW_BEAMS = 360

@@ -14,11 +14,10 @@ from mecanum_env.config import EnvConfig
 from slam.backend import Backend
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["LOCAL_CELL_M", "MAP_SIZE", "draw_maps", "map_frame", "observation_space", "observe"]
 
-Array = NDArray[np.float64]
 Observation = dict[str, NDArray[np.uint8] | NDArray[np.float32]]
 
 MAP_SIZE = 64

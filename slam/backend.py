@@ -21,11 +21,9 @@ from slam.health.relocalisation import RelocalisationConfig
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
-__all__ = ["Backend", "BackendConfig", "found_cov"]
-
-Array = NDArray[np.float64]
+__all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,6 +282,26 @@ class Backend(abc.ABC):
         """Go on from a pose ``(3,)`` that a scan was found to be taken from."""
         self._place(pose, cov + found_cov())
         self._update(scan)
+
+
+class SurfaceBackend(Backend):
+    """A backend without landmarks: ``landmarks`` of its belief are empty, and ``observe`` refuses."""
+
+    observes_landmarks = False
+    maps: ClassVar[str] = "this backend maps surfaces"
+    """Its name and what it maps instead, in words."""
+
+    def observe(self, observations: Observations) -> None:
+        """Refuse: its maps have no use for landmark observations."""
+        raise ValueError(
+            f"{self.maps}, not landmarks: it takes scans (`update`), not landmark observations; "
+            "use ekf or fastslam2 for those"
+        )
+
+    @property
+    def belief(self) -> Belief:
+        """Pose and grid; landmarks are empty, and there is no joint covariance."""
+        return Belief.without_landmarks(self.pose, self.pose_cov, self.grid, self.health)
 
 
 def found_cov() -> Array:

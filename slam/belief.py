@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
+from slam.types import Array
 
 __all__ = ["Belief", "Teammate"]
-
-Array = NDArray[np.float64]
 
 
 _POSTPONED = (
@@ -57,6 +56,14 @@ class Belief:
     _read: tuple[Callable[[], dict[str, Any]], Callable[[], Array], Callable[[], Array]] | None = field(
         default=None, repr=False, compare=False
     )  # see postponed
+
+    @classmethod
+    def without_landmarks(cls, pose: Array, pose_cov: Array, grid: OccupancyGrid, health: float = 1.0) -> Belief:
+        """Return a belief of a pose and a map alone."""
+        return cls(
+            pose=pose, pose_cov=pose_cov, landmarks=np.zeros((0, 2)), landmark_cov=np.zeros((0, 2, 2)),
+            landmark_ids=np.zeros(0, np.int64), grid=grid, health=health,
+        )  # fmt: skip
 
     @classmethod
     def postponed(

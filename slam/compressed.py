@@ -30,11 +30,9 @@ from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
 from slam.settings import require
-from slam.types import LINE, Observations, Scan
+from slam.types import LINE, Array, Observations, Scan
 
 __all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

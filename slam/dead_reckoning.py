@@ -15,11 +15,9 @@ from slam.backend import Backend
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.stacked_update import NO_LIMITS
-from slam.types import Odometry
+from slam.types import Array, Odometry
 
 __all__ = ["OdometrySlam", "TruthSlam"]
-
-Array = NDArray[np.float64]
 
 
 class OdometrySlam(EkfSlam):

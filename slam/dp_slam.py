@@ -15,8 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend, BackendConfig, found_cov
-from slam.belief import Belief
+from slam.backend import BackendConfig, SurfaceBackend, found_cov
 from slam.geometry import about_z, compose, inverse, wrap
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import MatchConfig, body_points
@@ -37,11 +36,9 @@ from slam.particles.resampling import (
 )
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]
-
-Array = NDArray[np.float64]
 
 _LEAD_SHARE = 0.5  # the map's particle is followed until another weighs more than twice as much
 
@@ -81,16 +78,16 @@ class DpSlamConfig(BackendConfig):
         require(0 < self.free <= 1 and 0 < self.unknown <= 1, "DpSlamConfig.free and unknown must be in (0, 1]")
 
 
-class DpSlam(Backend):
+class DpSlam(SurfaceBackend):
     """Particles with maps of their own in one grid.
 
-    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. There are no
-    landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses. The pose's covariance is no less
-    than that of the error which all particles inherit with their ancestors' map (:mod:`slam.particles.map_error`).
+    ``n_eff`` is that of the last update, before resampling; ``resampled`` tells whether it resampled. The pose's
+    covariance is no less than that of the error which all particles inherit with their ancestors' map
+    (:mod:`slam.particles.map_error`).
     """
 
-    observes_landmarks = False
     relocalises = True
+    maps = "dp-slam maps occupied cells"
     config: DpSlamConfig
 
     def __init__(self, config: DpSlamConfig | None = None) -> None:
@@ -153,13 +150,6 @@ class DpSlam(Backend):
             self.grid.integrate(
                 self.sensor_pose(body), scan, self.extractor.surface, body=(x, y, self.config.body_radius_m)
             )
-
-    def observe(self, observations: Observations) -> None:
-        """Refuse: maps of occupied cells have no use for landmark observations."""
-        raise ValueError(
-            "dp-slam maps occupied cells, not landmarks: it takes scans (`update`), not landmark observations; "
-            "use ekf or fastslam2 for those"
-        )
 
     def _motion(self) -> Array:
         """Return how the robot has moved since the last update, in the body frame of then ``(3,)``."""
@@ -319,16 +309,3 @@ class DpSlam(Backend):
     def path(self) -> Array:
         """The leading particle's poses at every update ``(updates, 3)``: the path that its map belongs to."""
         return self._paths.of(self._lead)
-
-    @property
-    def belief(self) -> Belief:
-        """Pose and grid; landmarks are empty, and there is no joint covariance."""
-        return Belief(
-            pose=self.pose,
-            pose_cov=self.pose_cov,
-            landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64),
-            grid=self.grid,
-            health=self.health,
-        )

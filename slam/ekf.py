@@ -31,11 +31,9 @@ from slam.landmarks.loop_closing import agreeing, put_off
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import Twist
-from slam.types import LINE, Observations, Odometry, Scan
+from slam.types import LINE, Array, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
-
-Array = NDArray[np.float64]
 
 _WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 

@@ -23,7 +23,7 @@ from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, obse
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
-from slam.landmarks.known_ids import rigid_fit
+from slam.metrics.measures import align_se2
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.gate import refuse_unlikely
 from slam.particles.inherited import InheritedError, beyond, common_descent
@@ -37,11 +37,10 @@ from slam.particles.resampling import (
     systematic,
 )
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -172,7 +171,7 @@ class FastSlam(LandmarkBackend):
             offset + found.rows[:, 0] * np.cos(found.rows[:, 1]), found.rows[:, 0] * np.sin(found.rows[:, 1])
         ])  # fmt: skip
         for i in range(len(self._poses)):
-            self._poses[i] = rigid_fit(ahead, self._maps.of(i)[rows, :2])
+            self._poses[i] = align_se2(self._maps.of(i)[rows, :2], ahead)
         self._covs[:] = ANYWHERE_COV
         self._inherited.widen(ANYWHERE_COV)
         match = self._match_buffer(len(rows))

@@ -11,7 +11,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from slam.types import Array
 
 __all__ = [
     "about_z",
@@ -25,8 +26,6 @@ __all__ = [
     "wrap",
     "wrap_scalar",
 ]
-
-Array = NDArray[np.float64]
 
 _TWO_PI = 2.0 * math.pi
 

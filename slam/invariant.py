@@ -24,11 +24,9 @@ from slam.gaussian.tiles import add_combination, downdate, product
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
-from slam.types import LINE, Odometry, Scan
+from slam.types import LINE, Array, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
-
-Array = NDArray[np.float64]
 
 _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since walls alone need the others
 

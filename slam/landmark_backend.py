@@ -13,11 +13,9 @@ from slam.backend import Backend
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
 from slam.motion import OdometryNoise, Twist
-from slam.types import LINE, Observations, Odometry
+from slam.types import LINE, Array, Observations, Odometry
 
 __all__ = ["FEWEST_BACK", "LandmarkBackend", "far_better", "observation_rows"]
-
-Array = NDArray[np.float64]
 
 FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""

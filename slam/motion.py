@@ -7,15 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.settings import require
-from slam.types import Odometry
+from slam.types import Array, Odometry
 
 __all__ = ["LastingErrors", "OdometryNoise", "Twist", "jacobians", "move", "predict_robot", "twist_between"]
 
-Array = NDArray[np.float64]
 Twist = tuple[float, float, float]
 
 NO_SLIP = (0.0, 0.0)

@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONCAVE", "CONVEX", "LINE", "Observations", "Odometry", "Scan", "Sighting"]
+__all__ = ["CONCAVE", "CONVEX", "LINE", "Array", "Observations", "Odometry", "Scan", "Sighting"]
 
 Array = NDArray[np.float64]
+"""Numbers; their shape and units stand where they are named."""
 
 CONVEX = 1
 """A corner that stands out into free space: the end of a wall, the edge of a cupboard."""

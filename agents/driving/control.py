@@ -8,7 +8,6 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
 from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points
@@ -17,10 +16,9 @@ from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.settings import positive, require
+from slam.types import Array
 
 __all__ = ["ControlConfig", "PathFollower"]
-
-Array = NDArray[np.float64]
 
 _CREEP_M_S, _CREEP_ROOM_M = 0.2, 1.0
 _CREPT_M = 0.2  # between two places that it has crept over

@@ -12,14 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from agents.driving.safety import Guard, LocalMap, clearance_at, safe_twist
 from slam.geometry import wrap_scalar
+from slam.types import Array
 
 __all__ = ["WINDOW_M", "Motors", "Pace", "aim", "send"]
-
-Array = NDArray[np.float64]
 
 WINDOW_M = 2.0  # half side of the map that the follower looks at
 _SPACING_M = 0.1  # between the points of a path, about

@@ -13,16 +13,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig, PathFollower
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.motion import OdometryNoise, twist_between
+from slam.types import Array
 
 __all__ = ["GentleFollower", "WheelWatch", "eased"]
-
-Array = NDArray[np.float64]
 
 _MEMORY = 200.0  # steps at full weight of what was expected before any was driven
 _FORGET = 0.998  # share of the past that a step leaves: what was learnt fades over some fifty seconds

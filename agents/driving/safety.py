@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
+from slam.types import Array
 
 __all__ = ["Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points"]
-
-Array = NDArray[np.float64]
 
 _SCAN_WITHIN_M = 2.0
 _POSES = 8  # of a predicted motion, the present one included

@@ -15,14 +15,12 @@ import math
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from agents.driving.safety import LocalMap
 from slam.belief import Belief
+from slam.types import Array
 
 __all__ = ["parting_lines"]
-
-Array = NDArray[np.float64]
 
 _NONE = np.zeros((0, 3))
 _OLD_S = 1.5  # what is older says no longer where a robot is

@@ -18,15 +18,16 @@ from agents.view_points.foresight import marks_of
 from agents.view_points.gain import expected_area
 from agents.view_points.sightings import SensorModel, expected_sightings
 from agents.ways.cost_map import CostMap
+from agents.ways.planning import cell_before
 from agents.ways.travel import between
 from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _FIRST_LEG_M = 0.5  # of a way: where it turns to first
@@ -228,21 +229,17 @@ def _landmarks_left(
 def _first_turns(step: NDArray[np.int8], cells: NDArray[np.int64], heading: float, leg: float) -> Array:
     """Return by how much the way to each cell turns off the heading at its beginning, 0 … π."""
     turns = np.zeros(len(cells))
-    rows = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-    cols = np.array([1, 1, 0, -1, -1, -1, 0, 1])
     for i in range(len(cells)):
         row, col = cells[i]
         # To the start and count, then again as far as the first leg's end.
         length = 0
         while step[row, col] >= 0:
-            k = step[row, col]
-            row, col = row - rows[k], col - cols[k]
+            row, col = cell_before(step, row, col)
             length += 1
         start_r, start_c = row, col
         row, col = cells[i]
         for _ in range(length - int(leg)):
-            k = step[row, col]
-            row, col = row - rows[k], col - cols[k]
+            row, col = cell_before(step, row, col)
         if row == start_r and col == start_c:
             continue
         off = math.atan2(row - start_r, col - start_c) - heading

@@ -16,6 +16,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.ways.planning import D_COL, D_ROW
+
 __all__ = ["EDGES", "descend", "distances", "gradient", "node_prices"]
 
 Floats = NDArray[np.float32]
@@ -23,8 +25,6 @@ Floats = NDArray[np.float32]
 EDGES = ((0, 1), (1, 1), (1, 0), (1, -1))
 """Row and column offsets of the four steps that each pixel owns; the other four are its neighbours'."""
 
-_DR = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_DC = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 _ROOT2 = math.sqrt(2.0)
 _NOWHERE = 1e30
 
@@ -89,7 +89,7 @@ def _directions(best: Floats, price: Floats, goal: Floats) -> NDArray[np.int8]:
             if value == goal[r - 1, c - 1]:
                 continue
             for k in range(8):
-                i, j = r + _DR[k], c + _DC[k]
+                i, j = r + D_ROW[k], c + D_COL[k]
                 # The very sum that the distance was.
                 if best[i, j] + (price[k, r, c] if k < 4 else price[k - 4, i, j]) == value:
                     parent[r - 1, c - 1] = k
@@ -111,7 +111,7 @@ def gradient(best: Floats, parent: NDArray[np.int8], upstream: Floats) -> tuple[
         if k < 0:
             by_goal[r, c] += amount
             continue
-        i, j = r + _DR[k], c + _DC[k]
+        i, j = r + D_ROW[k], c + D_COL[k]
         if k < 4:
             by_price[k, r, c] += amount
         else:
@@ -129,7 +129,7 @@ def node_prices(price: Floats, length: float) -> Floats:
         size = np.float32(0.5 * length * (_ROOT2 if k % 2 else 1.0))
         for r in range(rows):
             for c in range(cols):
-                i, j = r + _DR[k], c + _DC[k]
+                i, j = r + D_ROW[k], c + D_COL[k]
                 if 0 <= i < rows and 0 <= j < cols:
                     out[k, r, c] = size * (price[r, c] + price[i, j])
     return out
@@ -144,7 +144,7 @@ def descend(parent: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
     n = 1
     while parent[row, col] >= 0 and n < rows * cols:
         k = parent[row, col]
-        row, col = row + _DR[k], col + _DC[k]
+        row, col = row + D_ROW[k], col + D_COL[k]
         way[n] = row, col
         n += 1
     return way[:n].copy()

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from agents.learned.layers import Layers
 from agents.stations.survey import STRIDE, Openings, Survey
 from slam.grids.occupancy import FREE, UNKNOWN
+from slam.types import Array
 
 __all__ = [
     "PLANES",
@@ -29,7 +30,6 @@ __all__ = [
     "with_walls",
 ]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 Floats = NDArray[np.float32]
 

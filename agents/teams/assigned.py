@@ -36,9 +36,6 @@ class Assigned(Shared, NearestFrontier):
     config: AssignedConfig
     config_type = AssignedConfig
 
-    def _sharing(self) -> SharingConfig:
-        return self.config.sharing
-
     def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
         """Return the column that is assigned to this robot: of each cluster the piece that it is nearest to."""
         costs = crew.held(self.config.sharing.hold_m)

@@ -22,10 +22,9 @@ from agents.stations.lattice import in_sight
 from agents.teams.crew import Crew
 from agents.teams.shared import Shared, SharingConfig
 from agents.view_points.gain import expected_area
+from slam.types import Array
 
 __all__ = ["Coordinated", "CoordinatedConfig", "pair_off"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,9 +40,6 @@ class Coordinated(Shared, CostUtility):
 
     config: CoordinatedConfig
     config_type = CoordinatedConfig
-
-    def _sharing(self) -> SharingConfig:
-        return self.config.sharing
 
     def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
         """Return the column that is paired with this robot."""

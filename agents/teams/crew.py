@@ -16,10 +16,10 @@ from agents.view_points.sight import view_points
 from agents.ways.giving_way import costs_from
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief, Teammate
+from slam.types import Array
 
 __all__ = ["Crew", "muster"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 

@@ -18,13 +18,11 @@ from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.teams.team_tour import TeamTour, TeamTourConfig
-from agents.ways.planning import travel_costs
 from slam.belief import Belief
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,14 +85,8 @@ class Rendezvous(TeamTour):
     def _way_there(self, belief: Belief) -> tuple[Goal, float]:
         """Return the meeting place, or the place nearest to it that can be reached, as a goal, and its cost."""
         assert self._place is not None
-        cost_map = self._cost_maps.of(belief)
-        travel = travel_costs(cost_map)
-        reached = np.argwhere(np.isfinite(travel.cost))
-        away = np.hypot(*(cost_map.to_points(reached) - self._place).T)
-        row, column = reached[int(np.argmin(away))].tolist()
-        path = self._path(cost_map, travel, (row, column), belief)
-        goal = Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path)
-        return goal, float(travel.cost[row, column])
+        path, cost, _ = self._way_near(self._place, belief)
+        return Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path), cost
 
     def _set_off(self, goal: Goal, cost: float) -> Goal:
         if not self._meeting:

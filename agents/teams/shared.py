@@ -17,8 +17,6 @@ from slam.settings import not_negative, positive
 
 __all__ = ["Shared", "SharingConfig"]
 
-Array = NDArray[np.float64]
-
 _FAR = 1e6  # [m] farther than anything is
 
 
@@ -37,12 +35,16 @@ class SharingConfig:
         not_negative(self, "service_m_m2", "hold_m")
 
 
+_USUAL = SharingConfig()
+
+
 class Shared(Explorer):
     """To be put before a strategy: leaves it the candidates that fall to this robot."""
 
     def _sharing(self) -> SharingConfig:
-        """Return how what is left is shared out."""
-        return SharingConfig()
+        """Return how what is left is shared out; a policy's configuration does not say."""
+        sharing: SharingConfig = getattr(self.config, "sharing", _USUAL)
+        return sharing
 
     def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
         """Return the crew's columns that fall to this robot: the tour that does when all are shared out."""

@@ -7,9 +7,10 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from slam.types import Array
+
 __all__ = ["assign", "share_tours", "tour_length"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _MOST_ROUNDS = 50

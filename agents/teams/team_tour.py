@@ -27,6 +27,3 @@ class TeamTour(Shared, BriskTour):
 
     config: TeamTourConfig
     config_type = TeamTourConfig
-
-    def _sharing(self) -> SharingConfig:
-        return self.config.sharing

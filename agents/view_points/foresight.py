@@ -32,7 +32,7 @@ from slam.gaussian.tiles import downdate
 from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, predict_robot, twist_between
 from slam.settings import positive
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = [
     "Foreseen",
@@ -44,8 +44,6 @@ __all__ = [
     "marks_of",
     "spread_m",
 ]
-
-Array = NDArray[np.float64]
 
 _MOST = 32  # landmarks in one update: those that the sensor sees best
 

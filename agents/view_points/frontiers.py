@@ -13,10 +13,9 @@ from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
 from slam.settings import not_negative, positive
+from slam.types import Array
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

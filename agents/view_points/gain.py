@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import OCCUPIED, UNKNOWN
+from slam.types import Array
 
 __all__ = ["expected_area"]
-
-Array = NDArray[np.float64]
 
 _RAYS = 120
 _STEP = 0.7  # cells: less than one, so that no wall is stepped over, diagonal ones included

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.types import Array
 
 __all__ = ["Tree", "mean_shift"]
-
-Array = NDArray[np.float64]
 
 
 class Tree:

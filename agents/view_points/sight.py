@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import CostMap, kind_at
 from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.types import Array
 
 __all__ = ["Track", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
-
-Array = NDArray[np.float64]
 
 _NEARER = 0.85  # share of the view range that places to look from keep to: the robot stops a little short
 

@@ -18,11 +18,9 @@ from agents.ways.cost_map import CostMap, kind_at
 from mecanum_env.config import LidarConfig
 from slam.grids.occupancy import FREE
 from slam.settings import positive
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = ["BEAM", "SensorModel", "expected_sightings"]
-
-Array = NDArray[np.float64]
 
 BEAM = 10
 """Columns of an observation row, as :meth:`slam.features.extraction.FeatureExtractor.extract` has them."""

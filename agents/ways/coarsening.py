@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 
-__all__ = ["FAR_M", "OCCUPIED_LEAST", "Blocks", "coarsen", "fill_blocks", "known_extent", "to_walls"]
+__all__ = ["FAR_M", "OCCUPIED_LEAST", "Blocks", "fill_blocks", "known_extent", "to_walls"]
 
 Corners = tuple[int, int, int, int]
 
@@ -47,25 +47,6 @@ class Blocks:
             np.full((rows, cols), FAR_M, dtype=np.float32),
             np.zeros((rows, cols), dtype=np.bool_),
         )
-
-
-def coarsen(
-    log_odds: NDArray[np.int8],
-    visited: NDArray[np.uint8],
-    *,
-    resolution: float,
-    factor: int,
-    pads: tuple[int, int],
-) -> Blocks:
-    """Return blocks of ``factor`` × ``factor`` cells; the corner lies ``pads`` (row, column) into the first."""
-    rows = -(-(log_odds.shape[0] + pads[0]) // factor) + 2
-    cols = -(-(log_odds.shape[1] + pads[1]) // factor) + 2
-    blocks = Blocks.blank(rows, cols)
-    fill_blocks(
-        log_odds, visited, to_walls(log_odds), (0, 0, *log_odds.shape), (1, 1, rows - 1, cols - 1), resolution,
-        factor, *pads, blocks.classes, blocks.clearance, blocks.suspect,
-    )  # fmt: skip
-    return blocks
 
 
 def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:

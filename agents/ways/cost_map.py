@@ -22,12 +22,11 @@ from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import not_negative, positive
+from slam.types import Array
 
 __all__ = [
     "CostMap", "CostMaps", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 _ALL = slice(None)
 _OLD_S = 5.0  # what is older says no longer where a robot is in the way

@@ -19,10 +19,9 @@ from agents.ways.planning import TravelCosts, travel_costs, way_cells
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief, Teammate
 from slam.settings import positive
+from slam.types import Array
 
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
-
-Array = NDArray[np.float64]
 
 _SLOW_M_S = 0.06  # that is held up
 

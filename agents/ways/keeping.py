@@ -1,6 +1,6 @@
 """The blocks of a belief's grid, kept from one decision to the next: what was not drawn since is not done anew.
 
-Bit for bit the same as :func:`agents.ways.coarsening.coarsen` of the whole. A wall matters for distances no
+Bit for bit the same as :func:`agents.ways.coarsening.fill_blocks` of the whole. A wall matters for distances no
 farther than these say anything, so that a box of new walls is measured within a box grown by that much.
 """
 

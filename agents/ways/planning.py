@@ -16,14 +16,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
+from slam.types import Array
 
-__all__ = ["TravelCosts", "cell_before", "resample", "shortest_path", "travel_costs", "way_cells"]
+__all__ = [
+    "D_COL", "D_ROW", "TravelCosts", "cell_before", "resample", "shortest_path", "travel_costs", "way_cells",
+]  # fmt: skip
 
-Array = NDArray[np.float64]
+D_ROW, D_COL = np.array([0, 1, 1, 1, 0, -1, -1, -1]), np.array([1, 1, 0, -1, -1, -1, 0, 1])
+"""A cell's eight neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8."""
 
-# Neighbours, even ones straight and odd ones diagonal; the opposite of k is (k + 4) % 8.
-_D_ROW = np.array([0, 1, 1, 1, 0, -1, -1, -1])
-_D_COL = np.array([1, 1, 0, -1, -1, -1, 0, 1])
 _ALL_BUCKETS = 2**30  # more than there are
 
 
@@ -220,7 +221,7 @@ def _edges(ahead: NDArray[np.int64], cols: int) -> tuple[NDArray[np.int64], NDAr
 
     And half the length of each step ``(9, 8)``.
     """
-    around = _D_ROW * cols + _D_COL
+    around = D_ROW * cols + D_COL
     offsets, half_lengths = np.zeros((9, 8), dtype=np.int64), np.zeros((9, 8))
     beside = np.zeros((9, 8, 2), dtype=np.int64)
     for way in range(9):
@@ -236,7 +237,7 @@ def _edges(ahead: NDArray[np.int64], cols: int) -> tuple[NDArray[np.int64], NDAr
 def cell_before(step: NDArray[np.int8], row: int, col: int) -> tuple[int, int]:
     """Return the row and column that the last step of the way to a cell, which is not the start, came from."""
     k = step[row, col]
-    return row - _D_ROW[k], col - _D_COL[k]
+    return row - D_ROW[k], col - D_COL[k]
 
 
 @njit(cache=True, nogil=True)

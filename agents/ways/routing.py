@@ -11,9 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 __all__ = ["best_tour", "cover", "draw_luck", "improve", "nearest_order", "order_cost", "tours_begun_with"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Sight = NDArray[np.bool_]
 

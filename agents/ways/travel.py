@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts, cell_before, travel_costs
+from slam.types import Array
 
 __all__ = ["between"]
-
-Array = NDArray[np.float64]
 
 _CELLS = 100_000  # that may be searched for exact costs in one call: some 5 ms
 

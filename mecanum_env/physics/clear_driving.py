@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from mecanum_env.physics.robot import INCREMENTS, STATE_SIZE, motor_constants, turn_wheels
 from slam.geometry import wrap_scalar
+from slam.types import Array
 
 __all__ = [
     "CONSTANTS", "FIXED_SIZE", "GRIP", "HALF_X", "HALF_Y", "LOST", "MOTION", "RADII", "RASTER", "SLIP",
     "STATE", "TARGETS", "WHEELS_X", "WHEELS_Y", "WORK_SIZE", "WRAPPED", "drive_clear", "wheel_step",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 _MARGIN_M = 1e-3  # nothing within it: no contact, whatever the rounding
 

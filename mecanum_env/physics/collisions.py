@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymunk
-from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
+from slam.types import Array
 
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
 
 __all__ = ["CONTACT_GAP_S", "Contacts", "Touch", "add_robots", "build_space"]
-
-Array = NDArray[np.float64]
 
 CONTACT_GAP_S = 0.5
 """A contact is a new one when the robot has touched nothing for this long [s]."""

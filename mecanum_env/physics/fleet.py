@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from mecanum_env.physics.collisions import add_robots, build_space
 from mecanum_env.physics.world import World, divide
 from mecanum_env.rooms.floor_plan import FloorPlanError
+from slam.types import Array
 
 __all__ = ["Fleet", "outlines"]
-
-Array = NDArray[np.float64]
 
 
 class Fleet:

@@ -12,13 +12,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig
+from slam.types import Array
 
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
 
 __all__ = ["Floor", "build_floor"]
-
-Array = NDArray[np.float64]
 
 _PATCH_RADIUS_M = (0.25, 0.8)
 

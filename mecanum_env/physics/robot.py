@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import RobotConfig
+from slam.types import Array
 
 __all__ = [
     "GRAVITY_M_S2",
@@ -35,8 +36,6 @@ __all__ = [
     "turn_wheels",
     "wheel_positions",
 ]
-
-Array = NDArray[np.float64]
 
 _FLOAT32 = np.dtype(np.float32)  # of what agents send
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pymunk
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mecanum_env.config import NoiseConfig, RobotConfig
 from mecanum_env.physics.clear_driving import (
@@ -51,13 +51,12 @@ from mecanum_env.physics.robot import (
 )
 from mecanum_env.rooms.floor_plan import FloorPlanError
 from slam.geometry import wrap_scalar
+from slam.types import Array
 
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
 
 __all__ = ["CONTACT_GAP_S", "MAX_TRAVEL_M", "World", "divide"]
-
-Array = NDArray[np.float64]
 
 MAX_TRAVEL_M = 0.005
 """pymunk's steps are cut so that the robot, at its limits, goes no further in one: hence no deeper into a wall."""

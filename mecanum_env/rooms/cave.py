@@ -17,10 +17,10 @@ from mecanum_env.rooms.layout.limits import interval
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise
 from slam.settings import require, shares
+from slam.types import Array
 
 __all__ = ["CaveConfig", "cave"]
 
-Array = NDArray[np.float64]
 Field = NDArray[np.float32]  # single precision: a quarter of a million cells, and half a hundred passes over them
 Mask = NDArray[np.bool_]
 

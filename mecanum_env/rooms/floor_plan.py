@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from mecanum_env.rooms.outlines.corners import find_corners
 from mecanum_env.rooms.outlines.distance import distance_to_zero
+from slam.types import Array
 
 __all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
-
-Array = NDArray[np.float64]
 
 
 class FloorPlanError(ValueError):

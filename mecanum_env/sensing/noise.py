@@ -16,6 +16,8 @@ from numba import njit, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 try:  # NumPy's tables for the ziggurat, which Numba has copied and NumPy does not hand out
     from numba.np.random._constants import fi_double as _FI
     from numba.np.random._constants import ki_double as _KI
@@ -26,7 +28,6 @@ except ImportError:  # private to Numba: then NumPy's own generator does
 
 __all__ = ["NoiseStream", "RandomNumbers", "fill_normal", "fill_uniform", "noise_stream"]
 
-Array = NDArray[np.float64]
 Words = NDArray[np.uint64]
 
 _MASK = 2**64 - 1

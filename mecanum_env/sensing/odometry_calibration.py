@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import WheelTargets
@@ -19,10 +18,9 @@ from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.sensing.sensors import WheelEncoders
 from slam.motion import OdometryNoise, twist_between
+from slam.types import Array
 
 __all__ = ["Calibration", "Drives", "drift_ratios", "drive", "fit", "open_floor"]
-
-Array = NDArray[np.float64]
 
 WINDOW_S = 0.8
 """Over which drift is measured: about as long as it takes the landmarks to correct the pose."""

@@ -11,13 +11,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.types import Array
 
 __all__ = ["beam_directions", "cast_rays"]
-
-Array = NDArray[np.float64]
 
 _TWO_PI = 2.0 * math.pi
 _BEARING_ERROR = 4e-5  # [rad], above what a difference of two results of _bearing can be wrong by

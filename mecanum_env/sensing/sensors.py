@@ -18,11 +18,9 @@ from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, f
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
 from mecanum_env.sensing.slip import expected_share, follow, traction_constants
 from slam.odometry.filters import OdometryFilter
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
-
-Array = NDArray[np.float64]
 
 # What encoders remember of the step before, and what stays the same: one array each, since arguments take time.
 _LAST_TWIST, _BODY, _SPEEDS = slice(0, 3), slice(3, 6), slice(6, 10)

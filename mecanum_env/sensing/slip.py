@@ -11,14 +11,12 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, pull
+from slam.types import Array
 
 __all__ = ["expected_share", "follow", "grip_m_s2", "traction_constants"]
-
-Array = NDArray[np.float64]
 
 _PARTS = 2  # of the time between two readings
 

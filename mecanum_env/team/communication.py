@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from mecanum_env.team.config import CommunicationConfig
+from slam.types import Array
 
 __all__ = ["groups", "walls_between"]
-
-Array = NDArray[np.float64]
 
 
 def groups(config: CommunicationConfig, places: Array, segments: Array) -> NDArray[np.int64]:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.team.reports import Report
 from slam.backend import Backend
@@ -14,11 +13,9 @@ from slam.geometry import compose, inverse
 from slam.teams.account import Account
 from slam.teams.alignment import align
 from slam.teams.sighting import combine, relative_pose
-from slam.types import Sighting
+from slam.types import Array, Sighting
 
 __all__ = ["Frames"]
-
-Array = NDArray[np.float64]
 
 _TRY_AGAIN_S = 10.0  # maps have to grow before another look finds what one did not
 _LOOK_AGAIN_S = 60.0  # at a frame that is known, for a better one

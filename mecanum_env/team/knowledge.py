@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.frames import Frames
@@ -20,11 +19,9 @@ from slam.geometry import compose, transform_points
 from slam.grids.occupancy import OccupancyGrid
 from slam.teams.account import Account
 from slam.teams.merged_grid import Chart, MergedGrid
-from slam.types import Sighting
+from slam.types import Array, Sighting
 
 __all__ = ["Knowledge"]
-
-Array = NDArray[np.float64]
 
 _IN_SIGHT_S = 0.5  # a robot seen so lately is where it was seen, whatever it told before
 

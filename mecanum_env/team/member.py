@@ -21,11 +21,9 @@ from slam.backend import Backend
 from slam.belief import Belief, Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
-from slam.types import Scan, Sighting
+from slam.types import Array, Scan, Sighting
 
 __all__ = ["Member", "member_observation_space"]
-
-Array = NDArray[np.float64]
 
 _NO_CIRCLES = np.zeros((0, 3))
 _LEAST_SIGMA = 1e-4  # [m, rad]: never exactly zero

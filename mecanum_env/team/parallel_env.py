@@ -14,6 +14,7 @@ from mecanum_env.team.picture import render_team
 from mecanum_env.team.team import Team
 from slam.belief import Belief
 from slam.settings import unknown_name
+from slam.types import Array
 
 try:
     from pettingzoo import ParallelEnv
@@ -24,7 +25,6 @@ except ImportError as error:
 
 __all__ = ["ExploreParallelEnv"]
 
-Array = NDArray[np.float64]
 Action = NDArray[np.float32]
 
 

@@ -8,17 +8,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.views.canvas import FLOOR, INK, PAGE, WALL, Canvas, View, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, WALL, Canvas, View
 from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned, with_margin
+from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_readouts
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.types import Array
 
 if TYPE_CHECKING:
     from mecanum_env.team.team import Team
 
 __all__ = ["COLOURS", "draw_maps", "render_team"]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLOURS = (
@@ -27,9 +28,6 @@ COLOURS = (
 )  # fmt: skip
 """Of the robots in turn, blue, green, red: Matplotlib's."""
 
-_SHAPE = (720, 1280)
-_PANEL = (620, 624)  # width, height
-_LEFT, _RIGHT, _TOP = 14, 646, 44
 _TINT = 0.45  # share of the robot's colour in what it has mapped
 
 
@@ -40,12 +38,8 @@ def render_team(team: Team) -> Image:
     where several have it, in all of theirs.
     """
     ground = team.ground
-    frame = np.empty((*_SHAPE, 3), np.uint8)
-    frame[:] = PAGE
-    width, height = _PANEL
-    view = View.fit(with_margin(extent_of_truth(ground)), width, height)
-    left = Canvas(frame[_TOP : _TOP + height, _LEFT : _LEFT + width], view)
-    right = Canvas(frame[_TOP : _TOP + height, _RIGHT : _RIGHT + width], view)
+    view, frame = view_of_truth(ground), blank_frame("Maps")
+    left, right = (Canvas(panel, view) for panel in panels(frame))
     paint_plan(left, ground.plan, inverse(ground.start))
     for member, placed in zip(team.members, team.frames, strict=True):
         colour = COLOURS[member.number % len(COLOURS)]
@@ -100,9 +94,6 @@ def _paint_maps(canvas: Canvas, grids: list[OccupancyGrid], frames: list[Array])
 
 
 def _write(frame: Image, team: Team) -> None:
-    put_text(frame, "World", (_LEFT, 30), INK, size=19, bold=True)
-    put_text(frame, "Maps", (_RIGHT, 30), INK, size=19, bold=True)
-    height, width = _SHAPE
     coverage = team.coverage_share
     collisions = sum(member.truth.world.collisions for member in team.members)
     entries = (
@@ -112,9 +103,4 @@ def _write(frame: Image, team: Team) -> None:
         ("collisions", f"{collisions}", 470),
         ("communication", team.team.communication.model, 632),
     )
-    for name, value, x in entries:
-        put_text(frame, name, (_LEFT + x, height - 24), INK, size=17)
-        at = _LEFT + x + text_width(name, size=17) + 9
-        put_text(frame, value, (at, height - 24), WALL, size=17, bold=True)
-    frame[height - 8 :] = UNSEEN
-    frame[height - 8 :, : round(width * min(max(coverage, 0.0), 1.0))] = COLOURS[0]
+    write_readouts(frame, entries, coverage=coverage, colour=COLOURS[0])

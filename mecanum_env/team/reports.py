@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from slam.teams.account import Account
 from slam.teams.merged_grid import Chart
+from slam.types import Array
 
 __all__ = ["Report"]
-
-Array = NDArray[np.float64]
 
 
 class Report(NamedTuple):

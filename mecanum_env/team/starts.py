@@ -6,14 +6,12 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
+from slam.types import Array
 
 __all__ = ["start_poses"]
-
-Array = NDArray[np.float64]
 
 _APART_M = 0.4  # between two bodies at least, however they are turned
 _CLEAR_M = 0.1  # between a body and whatever is in the plan

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env import rooms as room_registry
-from mecanum_env.arguments import make_config
+from mecanum_env.arguments import make_config, make_plan
 from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
@@ -29,10 +28,9 @@ from slam.metrics.chi_square import chi2_quantile
 from slam.settings import from_mapping, require, unknown_name
 from slam.teams.account import Account
 from slam.teams.centralised import JointEkf
+from slam.types import Array
 
 __all__ = ["Outcome", "Team"]
-
-Array = NDArray[np.float64]
 
 _JOINT = "ekf-lines"
 _GATE = chi2_quantile(0.999, 3)  # of a sighting
@@ -153,14 +151,7 @@ class Team:
 
     def _plans(self, options: Mapping[str, Any], seed: int, room_seed: int) -> list[FloorPlan]:
         """Return the plan with each robot's start."""
-        given = options.get("floor_plan", self._plan)
-        given = self.config.floor_plan if given is None else given
-        if isinstance(given, FloorPlan):
-            plan = given
-        elif given is not None:
-            plan = room_registry.load(given, seed=room_seed)
-        else:
-            plan = room_registry.make(self.config.rooms, seed=room_seed, config=self.config.rooms_config)
+        plan = make_plan(self.config, room_seed, given=options.get("floor_plan", self._plan))
         robots, robot = self.team.robots, self.config.robot
         starts = options.get("start_poses")
         if starts is None:

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from mecanum_env.config import RobotConfig
 from mecanum_env.physics.robot import wheel_positions
 from slam.geometry import transform_points
+from slam.types import Array
 
 __all__ = [
     "FLOOR", "FURNITURE", "FURNITURE_EDGE", "INK", "PAGE", "ROBOT", "WALL", "Canvas", "View", "put_text",
     "text_width",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 

@@ -13,13 +13,13 @@ from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.views.canvas import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, Canvas, Colour, View
 from slam.belief import Belief
 from slam.geometry import transform_points
+from slam.types import Array
 
 __all__ = [
     "BEAM", "BELIEVED_PATH", "FRONTIER", "LANDMARK", "PLANNED_PATH", "SIGMAS", "TRUE_PATH", "UNSEEN", "Box",
     "extent", "extent_of_truth", "paint_landmarks", "paint_plan", "thinned", "with_margin",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 """x_min, y_min, x_max, y_max [m]."""
 

@@ -30,10 +30,10 @@ from mecanum_env.views.paint import (
 from slam.belief import Belief
 from slam.geometry import inverse
 from slam.grids.occupancy import OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.types import Array
 
 __all__ = ["draw_map", "draw_truth", "episode_view"]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _FOOTER_PX = 64

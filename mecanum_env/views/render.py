@@ -7,6 +7,7 @@ Inside, colours are blue, green, red, as everywhere in OpenCV; the frame that is
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any, Protocol
 from weakref import WeakKeyDictionary
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
-from mecanum_env.views.canvas import FLOOR, INK, PAGE, ROBOT, WALL, Canvas, View, put_text, text_width
+from mecanum_env.views.canvas import FLOOR, INK, PAGE, ROBOT, WALL, Canvas, Colour, View, put_text, text_width
 from mecanum_env.views.paint import (
     BEAM,
     BELIEVED_PATH,
@@ -35,11 +36,13 @@ from mecanum_env.views.paint import (
 from slam.belief import Belief
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
-__all__ = ["FRAME_SHAPE", "Shown", "frontier_cells", "render_frame"]
+__all__ = [
+    "FRAME_SHAPE", "Shown", "blank_frame", "frontier_cells", "panels", "render_frame", "view_of_truth",
+    "write_readouts",
+]  # fmt: skip
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 FRAME_SHAPE = (720, 1280)
@@ -98,7 +101,7 @@ def render_frame(env: Shown, *, planned_path: Array | None = None) -> Image:
     if planned_path is None:
         planned_path = getattr(env, "planned_path", None)
     frame = template.copy()
-    left, right = _panels(frame)
+    left, right = panels(frame)
     robot, pose = env.config.robot, env.truth.pose
     true_poses, estimates, belief = record.true_poses, record.estimates, env.belief
 
@@ -143,12 +146,8 @@ def frontier_cells(grid: OccupancyGrid) -> NDArray[np.bool_]:
 def _fixed_parts(ground: GroundTruth) -> tuple[View, Image]:
     """Return the view of an episode's frames and a frame of what never changes in it."""
     if ground not in _FIXED:
-        view = View.fit(with_margin(extent_of_truth(ground)), *_PANEL)
-        frame = np.empty((*FRAME_SHAPE, 3), np.uint8)
-        frame[:] = PAGE
-        paint_plan(Canvas(_panels(frame)[0], view), ground.plan, inverse(ground.start))
-        put_text(frame, "World", (_LEFT, 30), INK, size=19, bold=True)
-        put_text(frame, "Belief", (_RIGHT, 30), INK, size=19, bold=True)
+        view, frame = view_of_truth(ground), blank_frame("Belief")
+        paint_plan(Canvas(panels(frame)[0], view), ground.plan, inverse(ground.start))
         x = _RIGHT + _PANEL[0]
         for name, colour in (("landmark, 3σ", LANDMARK), ("frontier", FRONTIER), ("way ahead", PLANNED_PATH)):
             x -= text_width(name, size=15)
@@ -160,7 +159,22 @@ def _fixed_parts(ground: GroundTruth) -> tuple[View, Image]:
     return _FIXED[ground]
 
 
-def _panels(frame: Image) -> tuple[Image, Image]:
+def view_of_truth(ground: GroundTruth) -> View:
+    """Return the view that shows all that can be mapped in a panel."""
+    return View.fit(with_margin(extent_of_truth(ground)), *_PANEL)
+
+
+def blank_frame(right: str) -> Image:
+    """Return a frame with nothing but its titles, of which the right one is given."""
+    frame = np.empty((*FRAME_SHAPE, 3), np.uint8)
+    frame[:] = PAGE
+    put_text(frame, "World", (_LEFT, 30), INK, size=19, bold=True)
+    put_text(frame, right, (_RIGHT, 30), INK, size=19, bold=True)
+    return frame
+
+
+def panels(frame: Image) -> tuple[Image, Image]:
+    """Return a frame's left and right panel, to be drawn on."""
     width, height = _PANEL
     rows = frame[_TOP : _TOP + height]
     return rows[:, _LEFT : _LEFT + width], rows[:, _RIGHT : _RIGHT + width]
@@ -201,8 +215,6 @@ def _paint_grid(canvas: Canvas, grid: OccupancyGrid) -> None:
 def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, error: str) -> None:
     at = _RIGHT + text_width("Belief", size=19, bold=True) + 12
     put_text(frame, env.config.slam, (at, 30), INK, size=17)
-    height, width = FRAME_SHAPE
-    y = height - 24
     entries = (
         ("time", f"{time_s:.1f} s", 0),
         ("coverage", f"{100.0 * coverage:.1f} %", 163),
@@ -211,9 +223,17 @@ def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, 
         ("position error", error, 632),
         ("landmarks", f"{len(env.belief.landmarks) + len(env.belief.lines)}", 1100),
     )
+    write_readouts(frame, entries, coverage=coverage, colour=TRUE_PATH)
+
+
+def write_readouts(
+    frame: Image, entries: Iterable[tuple[str, str, int]], *, coverage: float, colour: Colour
+) -> None:
+    """Write names and values below a frame's panels, each from its x [pixels] on, and a bar of the coverage."""
+    height, width = FRAME_SHAPE
     for name, value, x in entries:
-        put_text(frame, name, (_LEFT + x, y), INK, size=17)
+        put_text(frame, name, (_LEFT + x, height - 24), INK, size=17)
         at = _LEFT + x + text_width(name, size=17) + 9
-        put_text(frame, value, (at, y), WALL, size=17, bold=True)
+        put_text(frame, value, (at, height - 24), WALL, size=17, bold=True)
     frame[height - 8 :] = UNSEEN
-    frame[height - 8 :, : round(width * min(max(coverage, 0.0), 1.0))] = TRUE_PATH
+    frame[height - 8 :, : round(width * min(max(coverage, 0.0), 1.0))] = colour

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.features.surfaces import (
     CURVATURE,
@@ -37,9 +35,7 @@ from slam.features.surfaces import (
     R,
     add_hidden,
 )
-from slam.types import CONCAVE, CONVEX, LINE
-
-Array = NDArray[np.float64]
+from slam.types import CONCAVE, CONVEX, LINE, Array
 
 _LOOSE_M = 0.02
 

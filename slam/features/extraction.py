@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from slam.features.corners import all_on, edge, meet, walls_first
 from slam.features.surfaces import ENDS, FIRST, LAST, MAX_LINES, MAX_STEP, fit, points_in_order, split
 from slam.settings import require
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["FeatureConfig", "FeatureExtractor"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

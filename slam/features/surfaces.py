@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from slam.types import Array
 
 MAX_LINES = 128
 _GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that

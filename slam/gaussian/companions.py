@@ -19,10 +19,9 @@ from slam.gaussian.lanes import LANES, aligned_zeros
 from slam.gaussian.stacked_update import SPARE_ROWS, solve
 from slam.gaussian.tiles import add_combination, downdate, subtract
 from slam.motion import Twist, predict_robot
+from slam.types import Array
 
 __all__ = ["Companions"]
-
-Array = NDArray[np.float64]
 
 
 class Companions:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.joint_compatibility import insert_nearest
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = [
     "ANYWHERE_COV",
@@ -30,8 +30,6 @@ __all__ = [
     "state_rows",
     "symmetric_block",
 ]
-
-Array = NDArray[np.float64]
 
 OBSERVED_LIMIT = 1e4
 """Bound of what :func:`near_landmarks` writes, m and m²: Gymnasium asks for finite spaces."""

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.tiles import product
+from slam.types import Array
 
 __all__ = ["FEWEST_SAMPLES", "factor", "root_of_loss"]
-
-Array = NDArray[np.float64]
 
 FEWEST_SAMPLES = 48
 """Random sums of columns that are tried at first."""

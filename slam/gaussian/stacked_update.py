@@ -19,10 +19,9 @@ from slam.gaussian.lanes import LANES, add_product, aligned_zeros, first, load, 
 from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
+from slam.types import Array
 
 __all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "work_space"]
-
-Array = NDArray[np.float64]
 
 SPARE_ROWS = 6
 """Rows of w beyond the observations', for what a filter may want to subtract beside Wᵀ W."""

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.lanes import (
     LANES,
@@ -22,10 +21,9 @@ from slam.gaussian.lanes import (
     subtract_number,
     subtract_product,
 )
+from slam.types import Array
 
 __all__ = ["add_combination", "downdate", "product", "subtract"]
-
-Array = NDArray[np.float64]
 
 # Of a tile: what sixteen registers hold, AVX2's. With the thirty-two of AVX-512 a larger one is 5 % faster.
 _HEIGHT, _WIDTH = 4, 3 * LANES

@@ -20,14 +20,12 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.companions import Companions
 from slam.motion import LastingErrors, Twist, predict_robot
+from slam.types import Array
 
 __all__ = ["WheelErrors"]
-
-Array = NDArray[np.float64]
 
 _STATES = 5
 # The rollers' directions: every combination of signs occurs on one wheel; which one, e does not mind.

@@ -16,10 +16,10 @@ from slam.graph.pose_graph import PoseGraph, relative_jacobians
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds
 from slam.graph.window import Window
+from slam.types import Array
 
 __all__ = ["Atlas"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.backend import Backend
-from slam.belief import Belief
+from slam.backend import SurfaceBackend
 from slam.geometry import about_z, compose, relative, wrap
 from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, links
@@ -22,11 +21,9 @@ from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
 from slam.motion import predict_robot
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["GraphSlam"]
-
-Array = NDArray[np.float64]
 
 _SPUN = 25.0  # chi-square, 3 degrees of freedom, from which the wheels are not believed
 _KNOWN, _SOONER = 0.7, 0.4  # share of a scan that is known, below which the next key scan comes so much sooner
@@ -35,14 +32,11 @@ _EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an 
 _ALIGNED = np.diag([1e-5, 1e-5, 1e-6])  # covariance of where the scan before was aligned, as far as a guess goes
 
 
-class GraphSlam(Backend):
-    """Key scans, and the patches each was the first to see, in a sparse graph.
+class GraphSlam(SurfaceBackend):
+    """Key scans, and the patches each was the first to see, in a sparse graph."""
 
-    There are no landmarks: ``landmarks`` of the belief are empty, and ``observe`` refuses.
-    """
-
-    observes_landmarks = False
     relocalises = True
+    maps = "graph-slam maps surfaces"
     config: GraphSlamConfig
 
     def __init__(self, config: GraphSlamConfig | None = None) -> None:
@@ -190,13 +184,6 @@ class GraphSlam(Backend):
         part = 1.0 if share >= _KNOWN else _SOONER
         return math.hypot(x, y) >= part * self.config.key_m or abs(theta) >= part * self.config.key_rad
 
-    def observe(self, observations: Observations) -> None:
-        """Refuse: surfaces have no use for landmark observations."""
-        raise ValueError(
-            "graph-slam maps surfaces, not landmarks: it takes scans (`update`), not landmark observations; "
-            "use ekf or fastslam2 for those"
-        )
-
     # ---- the map that is shown -----------------------------------------------------------------------------
 
     def _draw_it(self, scan: Scan) -> None:
@@ -262,19 +249,6 @@ class GraphSlam(Backend):
         x = keys[:, 0] + c * seen[:, 0] - s * seen[:, 1]
         y = keys[:, 1] + s * seen[:, 0] + c * seen[:, 1]
         return np.column_stack([x, y, wrap(keys[:, 2] + seen[:, 2])])
-
-    @property
-    def belief(self) -> Belief:
-        """Pose and grid; landmarks are empty, and there is no joint covariance."""
-        return Belief(
-            pose=self.pose,
-            pose_cov=self.pose_cov,
-            landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64),
-            grid=self.grid,
-            health=self.health,
-        )
 
 
 def _full(upper: Array) -> Array:

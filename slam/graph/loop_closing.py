@@ -22,10 +22,9 @@ from slam.graph.surfaces import BeamEnds
 from slam.grids.match_kernels import field_sum
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, search
 from slam.settings import require
+from slam.types import Array
 
 __all__ = ["Candidate", "ClosingConfig", "agreeing", "find_candidate"]
-
-Array = NDArray[np.float64]
 
 _RIVAL_APART_M, _RIVAL_STEP_M = 0.25, 0.1
 

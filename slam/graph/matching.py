@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.graph.surfaces import BeamEnds
+from slam.types import Array
 
 __all__ = ["Alignment", "Links", "SurfaceMap", "align", "links"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _CELL_M = 0.25

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from slam.features.surfaces import MAX_LINES
 from slam.graph.surfaces import BeamEnds
+from slam.types import Array
 
 __all__ = ["ModelError", "Patch", "extended", "new_patches"]
-
-Array = NDArray[np.float64]
 
 _SAMPLES_M = 0.1  # between the points that stand for a straight surface
 _FEWEST = 3  # beams that make a patch

@@ -15,10 +15,10 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from slam.geometry import relative, wrap
+from slam.types import Array
 
 __all__ = ["PoseGraph", "relative_jacobians"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureExtractor
 from slam.features.surfaces import FIRST, LAST, MAX_LINES, NX, NY, R
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["BeamEnds", "beam_ends"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that

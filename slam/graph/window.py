@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from slam.geometry import compose, wrap
 from slam.graph.matching import Links
 from slam.graph.pose_graph import relative_jacobians
+from slam.types import Array
 
 __all__ = ["Window", "moved"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -13,10 +13,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.scan_drawing import IN_FREE, WORD
+from slam.types import Array
 
 __all__ = ["SUBCELL_BITS", "crossings_of", "fill_inside", "mark_free"]
-
-Array = NDArray[np.float64]
 
 SUBCELL_BITS = 4
 """Fractional bits of a polygon's vertices: they are whole sixteenths of a cell."""

@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
-
-Array = NDArray[np.float64]
 
 _ANCHORS = 12  # landmarks that a key scan hangs on, at most
 

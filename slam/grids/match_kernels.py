@@ -9,10 +9,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
+from slam.types import Array
 
 __all__ = ["BLOCK", "climb", "correlate", "field_sum", "prior_loss", "slope", "splat"]
 
-Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 BLOCK = 4

@@ -35,11 +35,9 @@ from slam.grids.scan_drawing import (
     mark_disc,
     sum_blocks,
 )
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["CLASS_OF", "FREE", "OCCUPIED", "PROBABILITY_BYTE", "UNKNOWN", "OccupancyGrid"]
-
-Array = NDArray[np.float64]
 
 _CHUNK = 32  # the grid's edges lie on multiples of this, so that every overview block is whole
 _SPARE = 2  # chunks more than is needed when it grows

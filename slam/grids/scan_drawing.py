@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from slam.types import Array
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Cell classes, with the values of a ROS ``nav_msgs/OccupancyGrid``."""

@@ -21,11 +21,10 @@ from numpy.typing import NDArray
 
 from slam.grids.match_kernels import BLOCK, climb, correlate, splat
 from slam.settings import require
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search", "stamps_of"]
 
-Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 _MARGIN_M = 1.0  # of a field around its points

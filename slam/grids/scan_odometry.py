@@ -11,17 +11,14 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import transform_points
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
 from slam.settings import require
-from slam.types import Odometry
+from slam.types import Array, Odometry
 
 __all__ = ["ScanOdometry", "ScanOdometryConfig"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)

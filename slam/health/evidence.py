@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
 from slam.grids.scan_drawing import FREE_UP_TO, OCCUPIED_FROM
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["Agreement", "agreement", "agrees", "through_walls"]
-
-Array = NDArray[np.float64]
 
 
 class Agreement(NamedTuple):

@@ -16,18 +16,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import compose, inverse, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.health.evidence import Agreement, agreement, agrees
 from slam.health.monitor import HealthConfig, HealthMonitor
 from slam.health.relocalisation import Place, RelocalisationConfig, Relocaliser
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["Recovery"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass

@@ -23,11 +23,10 @@ from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, body_points, match, refine
 from slam.health.evidence import agreement, through_walls
 from slam.settings import require
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["Place", "RelocalisationConfig", "Relocaliser"]
 
-Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 

@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = [
     "IGNORED",
@@ -27,8 +27,6 @@ __all__ = [
     "refuse_unlikely",
     "too_near",
 ]
-
-Array = NDArray[np.float64]
 
 UNMATCHED, IGNORED = -1, -2
 """An observation of something new; one too near to a landmark to be new, yet not surely that landmark."""

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.settings import require
-from slam.types import LINE, Scan
+from slam.types import LINE, Array, Scan
 
 __all__ = ["KIND", "MARKS", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
-
-Array = NDArray[np.float64]
 
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 

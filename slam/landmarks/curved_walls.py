@@ -20,11 +20,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureConfig
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "forget", "straighten"]
-
-Array = NDArray[np.float64]
 
 _INFO, _PULL, _AT = 8, 9, 10  # Σ 1/σκ² [m²]; Σ κ/σκ² [m]; where along the wall it is tangent to its line [m]
 _KAPPA, _VAR_KAPPA = 10, 11  # columns of an observation row

@@ -28,11 +28,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.formats import replacing
-from slam.types import CONCAVE, CONVEX
+from slam.types import CONCAVE, CONVEX, Array
 
 __all__ = ["SCHEMA_VERSION", "LandmarkMap", "read_landmark_map", "relate", "write_landmark_map"]
-
-Array = NDArray[np.float64]
 
 SCHEMA_VERSION = 2
 """That of what is written. Version 1 had no ``sightings``, and is read as if there were none."""
@@ -143,7 +141,6 @@ def write_landmark_map(
     seen_by: Sequence[Iterable[int]] | None = None,
     backend: str = "",
     frame: str = "start",
-    neighbours: int = 8,
 ) -> None:
     """Write the cartographic database; the same arguments give the same content.
 
@@ -167,8 +164,6 @@ def write_landmark_map(
         Which robots have each landmark in their maps, where several made the map together.
     backend, frame : str
         Who estimated this, and in which frame: by default that of the robot's start.
-    neighbours : int
-        Relations are kept to so many nearest neighbours of each landmark.
 
     Raises
     ------
@@ -192,7 +187,7 @@ def write_landmark_map(
     seen = _column("times_seen", times_seen, np.zeros(n, np.int64))
     if joint is not None:
         joint = joint.reshape(n, 2, n, 2)[order][:, :, order].reshape(2 * n, 2 * n)
-    pairs, *measures = relate(xy[order], covs[order], joint_cov=joint, neighbours=neighbours)
+    pairs, *measures = relate(xy[order], covs[order], joint_cov=joint)
     moments = np.column_stack([xy, covs[:, 0, 0], covs[:, 1, 1], covs[:, 0, 1]]).tolist()
     rows = [
         (int(names[i]), _KIND_NAMES[int(kind[i])], *moments[i], _or_null(angle[i]), int(seen[i])) for i in order

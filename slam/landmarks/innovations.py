@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.landmarks.association import gated_distance, predicted
-from slam.types import CONCAVE, CONVEX, LINE
+from slam.types import CONCAVE, CONVEX, LINE, Array
 
 __all__ = ["Innovation", "innovations"]
-
-Array = NDArray[np.float64]
 
 _KINDS = {LINE: "wall", CONVEX: "convex corner", CONCAVE: "concave corner"}
 

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import IGNORED, UNMATCHED, alike, beside, gated_distance, predicted, too_near
 from slam.metrics.chi_square import chi2_quantile
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = ["JOINT_GATES", "JOINT_LIMITS", "MAX_OBSERVATIONS", "extend", "insert_nearest", "joint_compatibility"]
-
-Array = NDArray[np.float64]
 
 MAX_OBSERVATIONS = 64
 """Observations that are taken at once."""

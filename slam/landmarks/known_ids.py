@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import compose, inverse, transform_points, wrap_scalar
+from slam.geometry import compose, inverse, transform_points
 from slam.landmarks.association import IGNORED, UNMATCHED
+from slam.metrics.measures import align_se2
+from slam.types import Array
 
-__all__ = ["Elsewhere", "KnownIds", "rigid_fit"]
-
-Array = NDArray[np.float64]
+__all__ = ["Elsewhere", "KnownIds"]
 
 _LATELY = 24  # sightings that are looked back upon
 _LONGEST_WAY_M = 1.0  # of the robot since a sighting that still counts: odometry alone relates the two
@@ -178,25 +178,16 @@ def _slack(row: Array) -> float:
     return float(min(_SLACK_M + 2.0 * math.sqrt(row[2] + row[0] ** 2 * row[4]), _WIDEST_M))
 
 
-def rigid_fit(points: Array, places: Array) -> Array:
-    """Return the pose ``(3,)`` that takes points ``(n, 2)`` nearest to places ``(n, 2)``, by least squares."""
-    centre, middle = points.mean(axis=0), places.mean(axis=0)
-    a, b = points - centre, places - middle
-    theta = math.atan2(float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), float(np.sum(a * b)))
-    turned = transform_points(np.array([0.0, 0.0, theta]), centre[None])[0]
-    return np.array([*(middle - turned), wrap_scalar(theta)])
-
-
 def _best_pose(points: Array, places: Array, slack: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the pose on which most agree, fitted to those, and who they are ``(n,)``; tried pair by pair."""
     best, most = np.zeros(len(points), bool), 0
     for i in range(len(points)):
         for j in range(i):
-            pair = rigid_fit(points[[i, j]], places[[i, j]])
+            pair = align_se2(places[[i, j]], points[[i, j]])
             agree = np.hypot(*(transform_points(pair, points) - places).T) < slack
             if np.count_nonzero(agree) > most:
                 best, most = agree, int(np.count_nonzero(agree))
     if not most:
         return np.zeros(3), best
-    pose = rigid_fit(points[best], places[best])
+    pose = align_se2(places[best], points[best])
     return pose, best & (np.hypot(*(transform_points(pose, points) - places).T) < slack)

@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 
 from slam.landmarks.association import IGNORED, add_expected, gated_distance, predicted
 from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
-from slam.types import LINE
+from slam.types import LINE, Array
 
 __all__ = ["agreeing", "put_off"]
-
-Array = NDArray[np.float64]
 
 _LAST_SEEN = 5  # column of marks
 _OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company

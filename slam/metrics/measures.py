@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.metrics.chi_square import chi2_quantile
+from slam.types import Array
 
 __all__ = [
     "CornerDeviation",
@@ -34,7 +35,6 @@ __all__ = [
     "time_to",
 ]
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 # ---------------------------------------------------------------------------------------------------------

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from slam.geometry import relative, wrap
+from slam.types import Array
 
 __all__ = ["RelationScore", "closing_relations", "local_relations", "relation_errors", "relation_score"]
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 LOCAL_STEPS = (1, 5, 20)

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.settings import require, unknown_name
+from slam.types import Array
 
 __all__ = ["MODELS", "PowerModel", "fill_model", "fit_pade", "make_model"]
-
-Array = NDArray[np.float64]
 
 SINGULAR = 1e-10
 """A pivot this small, as a share of the largest number in its system, is taken for zero."""

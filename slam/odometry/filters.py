@@ -14,16 +14,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import make_model
 from slam.odometry.riccati import Rules, Tolerances, Workspace, advance
 from slam.settings import from_mapping, require, unknown_name
-from slam.types import Odometry
+from slam.types import Array, Odometry
 
 __all__ = ["ODOMETRY_FILTERS", "OdometryFilter", "OdometryFilterConfig", "make_odometry_filter"]
-
-Array = NDArray[np.float64]
 
 _START_S = 0.1  # since which a robot that starts has moved: models that know of 1/t cannot start at 0
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import fill_model, fit_pade
 from slam.settings import require, unknown_name
+from slam.types import Array
 
 __all__ = ["RECOVERIES", "Rules", "Tolerances", "Workspace", "advance"]
 
-Array = NDArray[np.float64]
 Rules = tuple[float, float, bool]  # relative and absolute error of an expansion, whether fractions are tried
 
 RECOVERIES = ("pade", "series")

@@ -14,15 +14,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.odometry.differential_transform import PowerModel, make_model
 from slam.odometry.riccati import Tolerances, Workspace, advance
 from slam.settings import require
+from slam.types import Array
 
 __all__ = ["KalmanBucyFilter"]
-
-Array = NDArray[np.float64]
 
 
 class KalmanBucyFilter:

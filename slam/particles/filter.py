@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.motion import predict_robot
 from slam.particles.maps import correct_landmark, innovation, own
+from slam.types import Array
 
 __all__ = ["correct_particles", "draw", "narrow", "predict_particles"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _LOG_2PI = math.log(2.0 * math.pi)

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from slam.geometry import wrap
 from slam.landmarks.association import IGNORED
 from slam.particles.maps import ParticleMaps
+from slam.types import Array
 
 __all__ = ["refuse_unlikely"]
-
-Array = NDArray[np.float64]
 
 
 def refuse_unlikely(

@@ -15,9 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 __all__ = ["PASSES", "STOPS", "SUM_X", "SUM_Y", "Lattice", "ParticleGrids", "ScanCells", "scan_cells"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 

@@ -18,10 +18,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.particles.maps import innovation
+from slam.types import Array
 
 __all__ = ["InheritedError", "beyond", "common_descent"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 

@@ -13,9 +13,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 __all__ = ["MapError", "transport"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import IGNORED, UNMATCHED
+from slam.types import Array
 
 __all__ = ["ParticleMaps", "associate", "correct_landmark", "innovation", "own", "refresh_extents"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _RECORD = 5  # x, y [m], σxx, σxy, σyy [m²] given the particle's path

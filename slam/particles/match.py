@@ -12,10 +12,10 @@ from slam.geometry import wrap_scalar
 from slam.grids.match_kernels import climb, prior_loss, slope
 from slam.grids.scan_matching import MatchConfig, Values, stamps_of
 from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
+from slam.types import Array
 
 __all__ = ["ParticleMatcher"]
 
-Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 _BLOCK = 4  # cells a side of what is read of a map at once, around each beam's end and one to every side

@@ -6,9 +6,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 __all__ = ["Paths"]
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
 from slam.settings import require, unknown_name
+from slam.types import Array
 
 __all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
-
-Array = NDArray[np.float64]
 
 _WHEN = ("every_step", "every_k", "n_eff")
 

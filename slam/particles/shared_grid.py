@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from slam.particles.ancestry import Ancestry
 from slam.particles.grids import Floats, Ints, ParticleGrids, ScanCells
+from slam.types import Array
 
 __all__ = ["TILE", "CopiedGrids", "SharedGrid"]
-
-Array = NDArray[np.float64]
 
 TILE = 8
 """Cells a side of what is shared or copied as one."""

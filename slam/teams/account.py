@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.settings import require
+from slam.types import Array
 
 __all__ = ["Account"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

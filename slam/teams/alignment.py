@@ -22,10 +22,10 @@ from slam.teams.account import Account
 from slam.teams.constellation import ConstellationConfig, candidates, rigid_fit, same_landmarks
 from slam.teams.contradiction import contradiction
 from slam.teams.joint import Joint, Link, SameConfig, joint_of
+from slam.types import Array
 
 __all__ = ["Alignment", "AlignmentConfig", "align"]
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 _IDENTITY = (np.zeros(3), np.zeros((3, 3)))

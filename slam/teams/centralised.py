@@ -27,11 +27,9 @@ from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.settings import require
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["JointEkf", "JointMember", "expected_sighting", "swap_robots"]
-
-Array = NDArray[np.float64]
 
 _SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
 _LAST_SEEN = 5  # column of marks

@@ -18,10 +18,10 @@ from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.settings import positive, require
 from slam.teams.account import Account
 from slam.teams.frames import ends_into, points_into, walls_into
+from slam.types import Array
 
 __all__ = ["ConstellationConfig", "candidates", "rigid_fit", "same_landmarks"]
 
-Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 

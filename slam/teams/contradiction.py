@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
+from slam.types import Array
 
 __all__ = ["contradiction"]
-
-Array = NDArray[np.float64]
 
 _DEEP_M = 0.2  # from anything that is not free: a wall there is not merely drawn askew
 

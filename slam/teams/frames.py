@@ -6,15 +6,13 @@ A frame is a pose ``(3,)`` of b in a: x, y [m], θ [rad]; what is given in b com
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import compose, inverse, rotation, transform_points, wrap
+from slam.types import Array
 
 __all__ = [
-    "compose_jacobians", "ends_into", "inverse_jacobian", "points_into", "pose_into", "relative_cov", "walls_into",
+    "compose_jacobians", "ends_into", "inverse_jacobian", "points_into", "pose_into", "walls_into",
 ]  # fmt: skip
-
-Array = NDArray[np.float64]
 
 
 def compose_jacobians(pose_a_b: Array, pose_b_c: Array) -> tuple[Array, Array]:
@@ -34,14 +32,6 @@ def inverse_jacobian(pose_a_b: Array) -> Array:
     out[:2, :2] = -rotation(-float(pose_a_b[2]))
     out[:2, 2] = y, -x
     return out
-
-
-def relative_cov(pose_a: Array, cov_a: Array, pose_b: Array, cov_b: Array) -> tuple[Array, Array]:
-    """Return the pose of b in a and its covariance, of two poses in one frame with independent errors."""
-    back = inverse(pose_a)
-    by_back, by_b = compose_jacobians(back, pose_b)
-    by_a = by_back @ inverse_jacobian(pose_a)
-    return compose(back, pose_b), by_a @ cov_a @ by_a.T + by_b @ cov_b @ by_b.T
 
 
 def pose_into(frame: Array, pose: Array) -> tuple[Array, Array, Array]:

@@ -18,10 +18,10 @@ from slam.teams.account import Account
 from slam.teams.alignment import Alignment
 from slam.teams.frames import ends_into, points_into, pose_into, walls_into
 from slam.teams.joint import Frame, Joint, Link, SameConfig, joint_of
+from slam.types import Array
 
 __all__ = ["MergedMap", "fuse"]
 
-Array = NDArray[np.float64]
 Member = tuple[int, int]  # account, row of the landmark: points, then walls
 
 

@@ -24,10 +24,9 @@ from slam.geometry import wrap
 from slam.settings import not_negative
 from slam.teams.account import Account
 from slam.teams.frames import points_into, walls_into
+from slam.types import Array
 
 __all__ = ["Frame", "Joint", "Link", "SameConfig", "joint_of", "own_cov"]
-
-Array = NDArray[np.float64]
 
 Frame = tuple[Array, Array | None]
 """Pose ``(3,)`` of a robot's frame in the common one, and its covariance ``(3, 3)``; None: nothing is known of it

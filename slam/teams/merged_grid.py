@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from slam.geometry import rotation, transform_points
 from slam.grids.occupancy import CLASS_OF, OccupancyGrid
 from slam.grids.scan_drawing import ENTROPY_BIT, MAX_LOG_ODDS, MIN_LOG_ODDS, PROBABILITY_BYTE, WORD
+from slam.types import Array
 
 __all__ = ["Chart", "MergedGrid"]
 
-Array = NDArray[np.float64]
 _BLOCK = 64  # cells that are looked at together
 _Box = tuple[int, int, int, int]  # lattice rows and columns: first, first, beyond the last, beyond the last
 

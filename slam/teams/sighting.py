@@ -6,15 +6,13 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from slam.geometry import compose, inverse, wrap
 from slam.teams.frames import compose_jacobians, inverse_jacobian
+from slam.types import Array
 
 __all__ = ["combine", "relative_pose"]
-
-Array = NDArray[np.float64]
 
 
 def relative_pose(

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from training.episodes.recording import Recording
+from training.episodes.recording import Recording, TeamRecorder
 from training.episodes.team import TeamEpisode, prepare, read_team, run
-from training.episodes.team_recording import TeamRecorder
 
 STEPS = 50
 
@@ -27,4 +26,4 @@ def explore_together(
     episode = prepare(setting, out=out, rooms="apartment", seed=3, max_steps=steps, slam=slam)
     recorder = TeamRecorder()
     run(episode, lambda **_: None, [recorder])
-    return Explored(episode, recorder.recordings())
+    return Explored(episode, recorder.recording())

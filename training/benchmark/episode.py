@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,16 @@ from numpy.typing import NDArray
 
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.metrics.measures import ate_aligned
-from training.episodes.explore import Episode, prepare, run
+from slam.types import Array
+from training.episodes.explore import Course, Episode, prepare, run
 from training.runs.errors import one_line
 from training.runs.running import plain
 
-__all__ = ["CURVE_POINTS", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "run_job"]
+__all__ = [
+    "CURVE_POINTS", "THUMBNAIL_PX", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "resampled",
+    "row_metrics", "run_job", "run_single", "small_png", "way",
+]  # fmt: skip
 
-Array = NDArray[np.float64]
 Curve = NDArray[np.float32]
 Key = tuple[str, str, int, str, str] | tuple[str, str, int, str, str, int, str]
 """Suite, place, seed, agent, backend; of a team also the number of its robots and its communication."""
@@ -30,7 +34,10 @@ CURVE_POINTS = 128
 WALL_CLOCK = ("decision_ms_median", "decision_ms_p95", "wall_time_s")
 """The metrics that the machine decides, too; all the others are the same in every run of a job."""
 
-_THUMBNAIL_PX = 220
+THUMBNAIL_PX = 220
+"""Longer side of a thumbnail."""
+
+_IN_KEY = {"agent", "slam", "rooms", "floor_plan", "seed", "interrupted", "robots", "communication"}
 _OVERSAMPLED = 2  # drawn this much larger, then reduced: thin lines stay lines
 _LEVELS = 16  # of each colour: a thumbnail needs no more, and takes half the room
 
@@ -54,6 +61,14 @@ class EpisodeJob:
         """What tells the job's row from every other."""
         return self.suite, self.place, self.seed, self.agent, self.slam
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """What :func:`training.episodes.explore.prepare` is asked for; nothing is written to ``out``."""
+        return {
+            "out": Path(tempfile.gettempdir()), "agent": self.agent, "rooms": self.rooms, "slam": self.slam,
+            "noise": self.noise, "seed": self.seed, "floor_plan": self.floor_plan, "max_steps": self.max_steps,
+        }  # fmt: skip
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRow:
@@ -73,7 +88,16 @@ class EpisodeFailure:
     message: str
 
 
-def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
+def run_single(job: EpisodeJob) -> EpisodeRow | None:
+    """Run an episode of one robot; return its row, or None where it was interrupted."""
+    episode = prepare(**job.options)
+    run(episode, lambda **_: None)
+    return None if episode.interrupted else _row(episode)
+
+
+def run_job(
+    job: EpisodeJob, run_one: Callable[[Any], EpisodeRow | None] = run_single
+) -> EpisodeRow | EpisodeFailure:
     """Run one episode; an error in it is returned, so that the other episodes go on.
 
     Raises
@@ -82,13 +106,7 @@ def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
         On Ctrl-C: half an episode is no row.
     """
     try:
-        # Nothing is written there.
-        episode = prepare(
-            out=Path(tempfile.gettempdir()), agent=job.agent, rooms=job.rooms, slam=job.slam, noise=job.noise,
-            seed=job.seed, floor_plan=job.floor_plan, max_steps=job.max_steps,
-        )  # fmt: skip
-        run(episode, lambda **_: None)
-        row = None if episode.interrupted else _row(episode)
+        row = run_one(job)
     except Exception as error:
         return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
     if row is None:
@@ -110,25 +128,27 @@ def resampled(values: Array, along: Array) -> Curve:
 def _row(episode: Episode) -> EpisodeRow:
     record = episode.env.truth.record
     true_poses, coverage = record.true_poses, record.coverage
-    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true_poses[:, :2], axis=0).T))])
     every = round(1.0 / episode.config.step_s)
     return EpisodeRow(
-        metrics=_metrics(episode),
+        metrics=row_metrics(episode, episode.metrics(), ate_aligned(true_poses, record.estimates)),
         coverage_by_time=resampled(coverage, record.times),
-        coverage_by_path=resampled(coverage, path),
+        coverage_by_path=resampled(coverage, way(true_poses)),
         nees=record.nees[every::every].astype(np.float32),
         thumbnail=_thumbnail(episode),
     )
 
 
-def _metrics(episode: Episode) -> dict[str, Any]:
-    record, decisions = episode.env.truth.record, episode.decisions_ms
-    metrics = episode.metrics()
-    # The row's key says where and who; the limit is what an episode that never got there is counted with.
-    for name in ("agent", "slam", "rooms", "floor_plan", "seed", "interrupted"):
-        metrics.pop(name, None)
-    return metrics | {
-        "ate_aligned_rmse_m": plain(ate_aligned(record.true_poses, record.estimates)),
+def way(poses: Array) -> Array:
+    """Return how far [m] it is along poses ``(n, 3)`` to each of them ``(n,)``."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+
+
+def row_metrics(episode: Course, metrics: dict[str, Any], aligned_m: float) -> dict[str, Any]:
+    """Return an episode's metrics as a row has them: with the ATE after alignment, without what its key says."""
+    decisions = episode.decisions_ms
+    # The limit is what an episode that never got there is counted with.
+    return {name: value for name, value in metrics.items() if name not in _IN_KEY} | {
+        "ate_aligned_rmse_m": plain(aligned_m),
         "decisions": len(decisions),
         "decision_ms_p95": float(np.percentile(decisions, 95.0)) if decisions else None,
         "limit_s": round(episode.run["max_steps"] * episode.config.step_s, 6),
@@ -137,10 +157,15 @@ def _metrics(episode: Episode) -> dict[str, Any]:
 
 def _thumbnail(episode: Episode) -> bytes:
     env = episode.env
-    view = episode_view(env.truth.ground, env.belief, longest_px=_OVERSAMPLED * _THUMBNAIL_PX)
+    view = episode_view(env.truth.ground, env.belief, longest_px=_OVERSAMPLED * THUMBNAIL_PX)
     picture = draw_map(env.belief, env.truth.record.estimates, view=view, robot=episode.config.robot)
     size = (max(view.width // _OVERSAMPLED, 1), max(view.height // _OVERSAMPLED, 1))
     small = cv2.resize(picture[: view.height], size, interpolation=cv2.INTER_AREA)
     step = 255.0 / (_LEVELS - 1)
     small = np.round(np.round(small / step) * step).astype(np.uint8)
-    return bytes(cv2.imencode(".png", small, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
+    return small_png(small)
+
+
+def small_png(picture: NDArray[Any]) -> bytes:
+    """Return a picture as a PNG of as few bytes as may be."""
+    return bytes(cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from slam.types import Array
 from training.benchmark.episode import EpisodeRow, Key
 from training.figures.consistency import consistency_figures
 from training.figures.statistics import (
@@ -25,7 +25,6 @@ from training.figures.statistics import (
 
 __all__ = ["COMPARED", "METRICS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows", "merged"]
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]  # an episode's metrics
 
 

@@ -196,7 +196,7 @@ def _figures(entry: Entry) -> dict[str, dict[str, Any]]:
     out = {}
     for key, figure in entry.figures.items():
         a = figure.averages
-        values = _interval(figure.centre) | _plain({
+        values = figure.centre.as_json() | _plain({
             "iqm": a.iqm.value, "median": a.median.value, "median_low": a.median.low,
             "median_high": a.median.high, "mean": a.mean.value,
         })  # fmt: skip
@@ -207,8 +207,8 @@ def _figures(entry: Entry) -> dict[str, dict[str, Any]]:
 def _compared(against: Mapping[str, Comparison]) -> dict[str, dict[str, Any]]:
     return {
         key: {
-            "difference": _interval(c.difference), "ratio": _interval(c.ratio),
-            "probability_of_improvement": _interval(c.probability), "n": c.n,
+            "difference": c.difference.as_json(), "ratio": c.ratio.as_json(),
+            "probability_of_improvement": c.probability.as_json(), "n": c.n,
         }
         for key, c in against.items()
     }  # fmt: skip
@@ -216,10 +216,6 @@ def _compared(against: Mapping[str, Comparison]) -> dict[str, dict[str, Any]]:
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return {key: plain(value) for key, value in values.items()}
-
-
-def _interval(found: Interval) -> dict[str, Any]:
-    return _plain({"value": found.value, "low": found.low, "high": found.high})
 
 
 def _comparison(report: Report, found: dict[str, Any], teams: Sequence[str]) -> list[dict[str, Any]]:

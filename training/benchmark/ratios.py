@@ -13,15 +13,13 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
+from slam.types import Array
 from training.figures.statistics import Interval, interval
 from training.figures.tables import markdown_table
 from training.runs.errors import BadInput
 
 __all__ = ["ratio", "study", "table"]
-
-Array = NDArray[np.float64]
 
 COLUMNS = {
     "time_to_95_s": ("time to 95 % [s]", 1.0, 1),

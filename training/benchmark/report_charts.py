@@ -10,15 +10,14 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
 
+from slam.types import Array
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
 from training.figures.statistics import Interval
 
 __all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts"]
 
-Array = NDArray[np.float64]
 Along = Literal["time_s", "path_length_m"]
 Line = tuple[str, list[tuple[int, Interval]]]  # name, and its figure for each number of robots
 
@@ -82,10 +81,7 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
     last = float(bands[0].x[-1])
     right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
     names = ", ".join(b.name for b in bands)
-    parts = [
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
-        f'aria-label="Coverage against {escape(_LABELS[along])}: {escape(names)}">'
-    ]
+    parts = []
     ticks = np.asarray(MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(0.0, last))
     for tick in ticks[ticks <= last].tolist():
         at = _to_x(tick, last)
@@ -105,12 +101,17 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         parts.append(
             f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{escape(b.name)}</title></path>'
         )
-    parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">coverage [%]</text>')
-    middle = 0.5 * (_LEFT + right)
-    parts.append(
-        f'<text class="label" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{_LABELS[along]}</text>'
+    return _chart(f"Coverage against {_LABELS[along]}: {names}", parts, up="coverage [%]", along=_LABELS[along])
+
+
+def _chart(told: str, parts: Sequence[str], *, up: str, along: str) -> str:
+    """Return the chart of these parts, what it tells in words, and the labels of its axes."""
+    middle = 0.5 * (_LEFT + _WIDTH - _RIGHT)
+    return (
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(told)}">{"".join(parts)}'
+        f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{escape(up)}</text>'
+        f'<text class="label" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{along}</text></svg>'
     )
-    return "".join([*parts, "</svg>"])
 
 
 def _to_x(value: float, last: float) -> float:
@@ -171,10 +172,7 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
         return "M" + "L".join(f"{x} {y}" for x, y in points)
 
     names = ", ".join(name for name, _ in lines)
-    parts = [
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
-        f'aria-label="{escape(label)} against the number of robots: {escape(names)}">'
-    ]
+    parts = []
     for tick in ticks.tolist():
         _, y = at(1, tick, 0)
         parts.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y}" y2="{y}"/>')
@@ -197,7 +195,4 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
                 parts.append(f'<path class="{kind}" style="stroke-width: 1.2" d="{limits}"/>')
             x, y = at(n, f.value, k)
             parts.append(f'<circle class="{kind}" style="fill: var(--c)" cx="{x}" cy="{y}" r="2.5"/>')
-    parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{escape(label)}</text>')
-    centre = 0.5 * (_LEFT + right)
-    parts.append(f'<text class="label" x="{centre}" y="{_HEIGHT - 6}" text-anchor="middle">robots</text>')
-    return "".join([*parts, "</svg>"])
+    return _chart(f"{label} against the number of robots: {names}", parts, up=label, along="robots")

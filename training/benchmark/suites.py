@@ -14,7 +14,7 @@ from mecanum_env.team.config import TeamConfig
 from slam.settings import unknown_name
 from training.episodes.team import read_team
 from training.runs.errors import BadInput, bad_input
-from training.runs.options import refuse_team_options, whole_numbers
+from training.runs.options import whole_numbers
 from training.runs.provenance import short_digest
 
 __all__ = [
@@ -151,10 +151,8 @@ def teams_of(
 ) -> tuple[TeamConfig | None, ...]:
     """Return the teams of ``--robots 1,2,3`` and ``--communication range,none``; None is one robot alone."""
     counts = whole_numbers("--robots", robots, low=1, high=64)
-    if counts == [1]:
-        refuse_team_options(
-            communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
-        )
+    if counts == [1]:  # refuses what is for several
+        read_team(communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts)
     words = [None] if communication is None else list(dict.fromkeys(map(str.strip, communication.split(","))))
     found: list[TeamConfig | None] = [None] if 1 in counts else []
     for count in counts:

@@ -102,14 +102,10 @@ def scalings_as_json(scalings: Sequence[Scaling]) -> list[dict[str, Any]]:
     """Return a mapping a team, with the limits of each figure."""
     return [
         {
-            "name": s.name, "robots": robots, "episodes": s.episodes[k], "time_to_95_s": _interval(s.time[k]),
-            "ratio_to_one": _interval(s.ratio[k]), "robot_collisions_per_100_m": _interval(s.touching[k]),
-            "nees_over_3": plain(s.nees[k]), **{key: _interval(found) for key, found in s.others[k].items()},
+            "name": s.name, "robots": robots, "episodes": s.episodes[k], "time_to_95_s": s.time[k].as_json(),
+            "ratio_to_one": s.ratio[k].as_json(), "robot_collisions_per_100_m": s.touching[k].as_json(),
+            "nees_over_3": plain(s.nees[k]), **{key: found.as_json() for key, found in s.others[k].items()},
         }
         for s in scalings
         for k, robots in enumerate(s.robots)
     ]  # fmt: skip
-
-
-def _interval(found: Interval) -> dict[str, Any]:
-    return {key: plain(float(getattr(found, key))) for key in ("value", "low", "high")}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
@@ -82,61 +81,57 @@ def explore(
         "floor_plan": floor_plan, "start": pose, "config": config, "max_steps": max_steps,
         "coverage_target": coverage_target,
     }  # fmt: skip
-    from training.episodes.team import read_team
-
-    team = read_team(
-        config, robots=robots, communication=communication, range_m=range_m, starts=starts,
-        unknown_starts=unknown_starts, joint_belief=joint_belief,
-    )  # fmt: skip
-    if team.robots > 1:
-        single = {"--video-substeps": video_substeps, "--mcap": mcap, "--rerun": rerun}
-        _refuse([name for name, wanted in single.items() if wanted], "is for one robot; leave it out")
-        from training.cli.explore_team import explore_team
-
-        explore_team(team, given, video=video, as_json=as_json)
-        return
-    opt.refuse_team_options(
-        communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts,
-        joint_belief=joint_belief,
-    )  # fmt: skip
-    from training.episodes import explore as task
-    from training.episodes.recording import Recorder
+    from training.episodes import explore as single
+    from training.episodes import team as several
+    from training.episodes.recording import Recorder, TeamRecorder
     from training.runs.signals import interrupt_flag
     from training.views.episode_files import Saver, check_extras, write_episode
     from training.views.film import filmed
+    from training.views.team_files import write_team_episode
 
+    team = several.read_team(
+        config, robots=robots, communication=communication, range_m=range_m, starts=starts,
+        unknown_starts=unknown_starts, joint_belief=joint_belief,
+    )  # fmt: skip
+    alone = team.robots == 1
+    only_alone = {"--video-substeps": video_substeps, "--mcap": mcap, "--rerun": rerun}
+    for name, wanted in only_alone.items():
+        if wanted and not alone:
+            raise BadInput(f"{name} is for one robot; leave it out")
     check_extras(extras)
-    episode, recorder = task.prepare(**given), Recorder()
+    episode: Any = single.prepare(**given) if alone else several.prepare(team, **given)
+    recorder = Recorder() if alone else TeamRecorder()
+    run: Any = single.run if alone else several.run
+    write: Any = write_episode if alone else write_team_episode
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
-        witnesses: list[task.Witness] = [recorder, Saver(episode, recorder)]
-        film = stack.enter_context(filmed(out, episode.config, video_substeps)) if "video" in extras else None
-        witnesses += [film] if film is not None else []
+        witnesses: list[Any] = [recorder, Saver(episode, lambda: write(episode, recorder.recording()))]
+        film = None
+        if "video" in extras:
+            film = stack.enter_context(filmed(out, episode.config, substeps=video_substeps, team=not alone))
+            witnesses.append(film)
         with Progress("exploring", 1.0, eta=False) as shown:
 
             def progress(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
                 where = f"step {steps} of at most {max_steps}, {100 * coverage:.1f} % mapped at {time_s:.0f} s"
                 shown.show(coverage, where)
 
-            task.run(episode, progress, witnesses)
+            run(episode, progress, witnesses)
         path = film.finish() if film is not None else None
         if path is None and film is not None:
             extras.remove("video")
-        metrics = write_episode(episode, recorder.recording(), extras=extras, film=path)
+        metrics = write(episode, recorder.recording(), extras=extras, film=path)
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:
-        files = (*task.FILES, *(task.EXTRAS[name] for name in extras))
-        print(_summary(metrics, out, files, task.ENDINGS[metrics["end"]]))
+        made = [single.EXTRAS[name] for name in extras]
+        files = [*single.FILES, *made] if alone else [*several.FILES, *made, *several.files_of(0)]
+        written = f"{out}/: {', '.join(files)}" + ("" if alone else ", … of each robot")
+        print(_summary(metrics, written, single.ENDINGS[metrics["end"]]))
     if film is not None and film.failure is not None:
         raise OSError(f"{one_line(film.failure)}; all but the film is in {out}")
     if episode.interrupted or late.is_set():
         raise Interrupted(f"interrupted after {metrics['time_s']:.1f} s; the episode so far is in {out}")
-
-
-def _refuse(options: Sequence[str], why: str) -> None:
-    if options:
-        raise BadInput(f"{options[0]} {why}")
 
 
 def _parse_start(text: str | None) -> tuple[float, float, float] | None:
@@ -151,22 +146,41 @@ def _parse_start(text: str | None) -> tuple[float, float, float] | None:
     return x, y, theta
 
 
-def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: str) -> str:
+def _summary(metrics: dict[str, Any], files: str, ending: str) -> str:
     def shown(key: str, unit: str, digits: int, factor: float = 1.0) -> str:
         value = metrics[key]
         return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
 
+    robots = metrics.get("per_robot")
     where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
+    who = metrics["agent"] if robots is None else f"{len(robots)} × {metrics['agent']}"
     verdict = "success" if metrics["success"] else "target not reached"
-    corners = shown("corner_mean_m", "cm", 1, 100.0)
-    heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
-    rows = (
-        ("explored", f"{where} with {metrics['slam']} and {metrics['agent']}"),
-        ("ended", f"{metrics['end']} ({ending}) after {metrics['time_s']:.1f} s, {metrics['steps']} steps"),
+    steps = f", {metrics['steps']} steps" if robots is None else ""
+    path, iou = shown("path_length_m", "m", 1), shown("map_iou", "", 3)
+    rows = [
+        ("explored", f"{where} with {metrics['slam']} and {who}"),
+        ("ended", f"{metrics['end']} ({ending}) after {metrics['time_s']:.1f} s{steps}"),
         ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
-        ("path", f"{shown('path_length_m', 'm', 1)}, {metrics['collisions']} collisions"),
-        ("map", f"wall IoU {shown('map_iou', '', 3)}, corners {corners} off on average"),
-        ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
-        ("files", f"{out}/: {', '.join(files)}"),
-    )
-    return "\n".join(f"{name:<12} {text}" for name, text in rows)
+    ]
+    if robots is None:
+        heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
+        rows += [
+            ("path", f"{path}, {metrics['collisions']} collisions"),
+            ("map", f"wall IoU {iou}, corners {shown('corner_mean_m', 'cm', 1, 100.0)} off on average"),
+            ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
+        ]
+    else:
+        touching = f"{metrics['robot_collisions']} of robots with each other"
+        rows += [
+            ("path", f"{path} in all, {metrics['collisions']} collisions, {touching}"),
+            ("map", f"wall IoU {iou}; ATE {shown('ate_rmse_m', 'cm', 1, 100.0)}"),
+            *((f"robot {robot['robot']}", _of_robot(robot)) for robot in robots),
+        ]
+    return "\n".join(f"{name:<12} {text}" for name, text in [*rows, ("files", files)])
+
+
+def _of_robot(robot: dict[str, Any]) -> str:
+    share = robot["first_share"]
+    first = "" if share is None else f", saw {100.0 * share:.1f} % first"
+    own = f"own map {100.0 * robot['coverage']:.1f} %"
+    return f"{robot['path_length_m']:.1f} m, {robot['collisions']} collisions, {own}{first}"

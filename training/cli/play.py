@@ -62,22 +62,15 @@ def play(
     from training.play.session import Session
     from training.play.team_session import TeamSession
 
-    team = None
-    if robots == 1:
-        opt.refuse_team_options(
-            communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
-        )
-    else:
-        team = read_team(
-            robots=robots, communication=communication, range_m=range_m, starts=starts,
-            unknown_starts=unknown_starts,
-        )  # fmt: skip
+    team = read_team(
+        robots=robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+    )
     window = open_window()
     try:
         with _said_where_it_takes_long():
             where: dict[str, Any] = {"rooms": rooms, "slam": slam, "robot": robot, "noise": noise}
             where |= {"agent": agent, "seed": seed, "floor_plan": floor_plan}
-            session = Session(**where) if team is None else TeamSession(team=team, **where)
+            session = Session(**where) if robots == 1 else TeamSession(team=team, **where)
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()

@@ -16,8 +16,7 @@ import numpy as np
 import agents
 from agents.base import ENDINGS as AGENT_ENDINGS
 from agents.base import Agent, Goal
-from mecanum_env import rooms as room_registry
-from mecanum_env.arguments import make_config
+from mecanum_env.arguments import make_config, make_plan
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
@@ -29,18 +28,9 @@ from training.runs.running import plain
 from training.runs.signals import interrupt_flag
 
 __all__ = [
-    "AGENT_DONE_AFTER_S",
-    "ENDINGS",
-    "EXTRAS",
-    "FILES",
-    "Episode",
-    "Progress",
-    "Witness",
-    "asked_for",
-    "make_agent",
-    "prepare",
-    "run",
-]
+    "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
+    "make_agent", "prepare", "run",
+]  # fmt: skip
 
 FILES = (
     "map.png", "map.pgm", "map.yaml", "truth.png", "trajectory_true.tum", "trajectory_estimate.tum",
@@ -84,14 +74,10 @@ class Witness(Protocol):
         """Take down the environment as it is now, and where the agent means to go."""
 
 
-@dataclass(eq=False)
-class Episode:
-    """An episode: prepared, then run, then written."""
+@dataclass(eq=False, kw_only=True)
+class Course:
+    """What was asked of an episode, of one robot or of a team, and how it went: prepared, run, then written."""
 
-    env: ExploreEnv
-    wrapped: Any  # the same environment, as gym.make wrapped it
-    agent: Agent
-    observation: Mapping[str, Any]
     config: EnvConfig  # with the coverage that counts as success
     run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
     out: Path
@@ -100,14 +86,14 @@ class Episode:
     wall_time_s: float = 0.0
     decisions_ms: list[float] = field(default_factory=list)
 
-    def metrics(self) -> dict[str, Any]:
-        """Return the contents of ``metrics.json``."""
-        metrics: dict[str, Any] = dict(self.env.episode_metrics())
-        coverage = metrics["coverage"]
-        metrics["decision_ms_median"] = statistics.median(self.decisions_ms) if self.decisions_ms else None
-        metrics["return_error_m"] = float(np.hypot(*self.env.truth.pose[:2])) if self.end == "returned" else None
-        metrics |= {
-            "success": bool(coverage is not None and coverage >= self.config.coverage_target),
+    @property
+    def decision_ms(self) -> float | None:
+        """Median time of a decision [ms]."""
+        return statistics.median(self.decisions_ms) if self.decisions_ms else None
+
+    def about(self) -> dict[str, Any]:
+        """Return what the metrics say of who explored where, and of the end."""
+        return {
             "agent": self.run["agent"],
             "slam": self.config.slam,
             "rooms": self.config.rooms if self.config.floor_plan is None else None,
@@ -117,6 +103,24 @@ class Episode:
             "interrupted": self.interrupted,
             "wall_time_s": round(self.wall_time_s, 3),
         }
+
+
+@dataclass(eq=False, kw_only=True)
+class Episode(Course):
+    """An episode of one robot."""
+
+    env: ExploreEnv
+    wrapped: Any  # the same environment, as gym.make wrapped it
+    agent: Agent
+    observation: Mapping[str, Any]
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the contents of ``metrics.json``."""
+        metrics: dict[str, Any] = dict(self.env.episode_metrics())
+        metrics["decision_ms_median"] = self.decision_ms
+        metrics["return_error_m"] = float(np.hypot(*self.env.truth.pose[:2])) if self.end == "returned" else None
+        metrics["success"] = bool(metrics["coverage"] >= self.config.coverage_target)
+        metrics |= self.about()
         return {key: plain(value) for key, value in metrics.items()}
 
 
@@ -155,7 +159,9 @@ def prepare(
         assert isinstance(env, ExploreEnv)
         explorer = make_agent(run["agent"], env)
         explorer.reset(env.belief, run["seed"])
-    return Episode(env, wrapped, explorer, observation, world, run, out)
+    return Episode(
+        env=env, wrapped=wrapped, agent=explorer, observation=observation, config=world, run=run, out=out
+    )
 
 
 def asked_for(
@@ -184,7 +190,7 @@ def asked_for(
     if coverage_target is not None:
         world = replace(world, coverage_target=coverage_target)
     check_writable(out, files)
-    plan = _make_plan(world, run["seed"])
+    plan = make_plan(world, run["seed"])
     limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
     return world, run | {"max_steps": limit}, plan
 
@@ -194,12 +200,6 @@ def make_agent(name: str, env: ExploreEnv) -> Agent:
     config = env.config
     body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
     return KnownMap(env.truth.ground, **body) if name == KNOWN_MAP else agents.make(name, **body)
-
-
-def _make_plan(config: EnvConfig, seed: int) -> FloorPlan:
-    if config.floor_plan is not None:
-        return room_registry.load(config.floor_plan, seed=seed)
-    return room_registry.make(config.rooms, seed=seed, config=config.rooms_config)
 
 
 def _read_run_table(path: Path) -> dict[str, Any]:

@@ -22,11 +22,11 @@ from agents.ways.planning import shortest_path, travel_costs
 from agents.ways.routing import best_tour, draw_luck
 from mecanum_env.ground_truth import GroundTruth
 from slam.belief import Belief
+from slam.types import Array
 from training.episodes.true_places import TruePlaces, greedy_tour
 
 __all__ = ["NAME", "KnownMap"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 NAME = "known-map"

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from slam.grids.occupancy import UNKNOWN
 from slam.motion import move
+from slam.types import Array
 from training.episodes.recording import Recording
 
 __all__ = ["dead_reckoned", "ellipses", "map_origin", "maps"]
 
-Array = NDArray[np.float64]
 Classes = NDArray[np.int8]
 
 _MAP_EVERY_S = 1.0

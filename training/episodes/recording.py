@@ -5,7 +5,7 @@ While the episode runs little more is done than to keep references; see :class:`
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import UNKNOWN, OccupancyGrid
-from slam.types import Scan
+from slam.types import Array, Scan
 
 if TYPE_CHECKING:
     from agents.base import Goal
     from mecanum_env.env import ExploreEnv
+    from mecanum_env.team.team import Team
 
-__all__ = ["Recorded", "Recorder", "Recording"]
+__all__ = ["Recorded", "Recorder", "Recording", "TeamRecorder"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 _Notes = dict[int, NDArray[Any]]  # by the step that they were noted in
@@ -138,6 +138,26 @@ class Recorder:
         cov = belief.landmark_cov
         rows = np.column_stack([belief.landmarks, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]])
         self._landmarks[step] = rows.astype(np.float32)
+
+
+class TeamRecorder:
+    """Notes every robot of a team that is still exploring: a witness of :func:`training.episodes.team.run`."""
+
+    def __init__(self) -> None:
+        self._recorders: list[Recorder] = []
+
+    def take(self, team: Team, goals: Sequence[Goal | None]) -> None:
+        """Note the team as it is now, and where each robot means to go."""
+        if not self._recorders:
+            self._recorders = [Recorder() for _ in team.members]
+        for member, recorder, goal in zip(team.members, self._recorders, goals, strict=True):
+            # One that has ended stands still, and its own record has ended, too.
+            if len(member.truth.record) > recorder.rows:
+                recorder.take(member, goal)
+
+    def recording(self) -> list[Recording]:
+        """Return what was recorded so far of each robot; those that ended before have fewer rows."""
+        return [recorder.recording() for recorder in self._recorders]
 
 
 def _recorded(notes: _Notes) -> Recorded:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import statistics
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,14 +13,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from agents.base import Agent, Goal
-from mecanum_env.config import EnvConfig
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.team import Team
 from slam.settings import from_mapping
-from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Progress, asked_for, make_agent
+from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Course, Progress, asked_for, make_agent
 from training.episodes.team_log import TeamLog, team_metrics
 from training.runs.config_files import read_config
-from training.runs.errors import bad_input
+from training.runs.errors import BadInput, bad_input
 from training.runs.running import plain
 from training.runs.signals import interrupt_flag
 
@@ -57,21 +55,14 @@ class TeamWitness(Protocol):
         """Take down the team as it is now, and where each of its robots means to go."""
 
 
-@dataclass(eq=False)
-class TeamEpisode:
-    """An episode of a team: prepared, then run, then written."""
+@dataclass(eq=False, kw_only=True)
+class TeamEpisode(Course):
+    """An episode of a team."""
 
     team: Team
     agents: tuple[Agent, ...]
     observations: list[Mapping[str, Any]]
-    config: EnvConfig  # with the coverage that counts as success
-    run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
-    out: Path
     log: TeamLog = field(default_factory=TeamLog)
-    end: str = "time"  # a word of ENDINGS
-    interrupted: bool = False
-    wall_time_s: float = 0.0
-    decisions_ms: list[float] = field(default_factory=list)
 
     def metrics(self) -> dict[str, Any]:
         """Return the contents of ``metrics.json``."""
@@ -82,15 +73,8 @@ class TeamEpisode:
             "starts": setting.starts,
             "known_starts": setting.known_starts,
             **team_metrics(self.team, self.log),
-            "decision_ms_median": statistics.median(self.decisions_ms) if self.decisions_ms else None,
-            "agent": self.run["agent"],
-            "slam": self.config.slam,
-            "rooms": self.config.rooms if self.config.floor_plan is None else None,
-            "floor_plan": self.config.floor_plan,
-            "seed": self.run["seed"],
-            "end": self.end,
-            "interrupted": self.interrupted,
-            "wall_time_s": round(self.wall_time_s, 3),
+            "decision_ms_median": self.decision_ms,
+            **self.about(),
         }
         metrics["success"] = bool(metrics["coverage"] >= self.config.coverage_target)
         robots = [{key: plain(value) for key, value in robot.items()} for robot in metrics.pop("per_robot")]
@@ -104,6 +88,8 @@ def read_team(
 ) -> TeamConfig:  # fmt: skip
     """Return the team that a config file's [run] table names, the options before it; of neither, one robot.
 
+    Options that mean something to several robots only are refused where there is one.
+
     Raises
     ------
     BadInput
@@ -111,14 +97,18 @@ def read_team(
     """
     with bad_input():
         past = read_config(config, {"team": (dict,)})[1].get("team", {}) if config is not None else {}
-        heard = {"model": communication, "range_m": range_m}
-        given = {
+        heard = _known({"model": communication, "range_m": range_m})
+        given = _known({
             "robots": robots, "starts": starts, "known_starts": False if unknown_starts else None,
             "belief": "joint" if joint_belief else None,
-        }  # fmt: skip
-        settings = {"robots": 1} | past | _known(given)
-        if _known(heard):
-            settings["communication"] = dict(past.get("communication", {})) | _known(heard)
+        })  # fmt: skip
+        settings = {"robots": 1} | past | given
+        if settings["robots"] == 1:
+            for name, option in _OPTIONS.items():
+                if name in heard | given:
+                    raise BadInput(f"{option} is for several robots; give --robots 2 or more")
+        if heard:
+            settings["communication"] = dict(past.get("communication", {})) | heard
         team = from_mapping(TeamConfig, settings)
         if range_m is not None and team.robots > 1 and team.communication.model in ("unlimited", "none"):
             raise ValueError(
@@ -126,6 +116,12 @@ def read_team(
                 "give range, line-of-sight or walls"
             )
         return team
+
+
+_OPTIONS = {
+    "model": "--communication", "range_m": "--range", "starts": "--starts", "known_starts": "--unknown-starts",
+    "belief": "--joint-belief",
+}  # fmt: skip
 
 
 def _known(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -162,7 +158,10 @@ def prepare(
         explorers = tuple(make_agent(run["agent"], member) for member in robots.members)
         for k, (explorer, member) in enumerate(zip(explorers, robots.members, strict=True)):
             explorer.reset(member.belief, run["seed"] + k)
-    return TeamEpisode(robots, explorers, [observation for observation, _ in found], world, run, out)
+    return TeamEpisode(
+        team=robots, agents=explorers, observations=[observation for observation, _ in found], config=world,
+        run=run, out=out,
+    )  # fmt: skip
 
 
 def tell_goal(team: Team, robot: int, goal: Goal | None) -> None:

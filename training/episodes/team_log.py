@@ -20,10 +20,9 @@ from slam.teams.account import Account
 from slam.teams.alignment import align
 from slam.teams.fusion import MergedMap, fuse
 from slam.teams.merged_grid import Chart, MergedGrid
+from slam.types import Array
 
 __all__ = ["TeamLog", "team_landmarks", "team_map", "team_metrics"]
-
-Array = NDArray[np.float64]
 
 _FIRST_EVERY_S = 1.0  # what several see for the first time within so long is shared between them
 _LOOK_NEAR = np.diag([0.1, 0.1, 0.02]) ** 2  # of a frame that is known, when landmarks are compared [m, m, rad]

@@ -19,10 +19,10 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from slam.types import Array
 
 __all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 TILE = 6
@@ -98,12 +98,7 @@ def _true_cost_map(ground: GroundTruth, planner: PlannerConfig, robot: RobotConf
     row, col = ground.lattice_origin
     size = ground.resolution
     grid = OccupancyGrid.from_classes(classes, size, (col * size, row * size))
-    nothing = np.zeros((0, 2))
-    belief = Belief(
-        pose=np.zeros(3), pose_cov=np.zeros((3, 3)), landmarks=nothing, landmark_cov=np.zeros((0, 2, 2)),
-        landmark_ids=np.zeros(0, np.int64), grid=grid,
-    )  # fmt: skip
-    return cost_maps.build(belief, planner, robot)
+    return cost_maps.build(Belief.without_landmarks(np.zeros(3), np.zeros((3, 3)), grid), planner, robot)
 
 
 def cells_per_tile(cells: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.metrics.measures import anees, nees_band
+from slam.types import Array
 
 __all__ = ["consistency_figures", "step_averages"]
-
-Array = NDArray[np.float64]
 
 
 def step_averages(profiles: Sequence[ArrayLike]) -> tuple[Array, Array, Array]:

@@ -15,12 +15,14 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam.types import Array
+from training.runs.running import plain
+
 __all__ = [
     "CONFIDENCE", "NONE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval",
     "iqm", "mean_interval", "median", "ratio_of_sums", "resampled_indices",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 CONFIDENCE = 0.95
@@ -35,6 +37,10 @@ class Interval:
     value: float
     low: float
     high: float
+
+    def as_json(self) -> dict[str, float | None]:
+        """Return value and limits by their names, null for what is not finite."""
+        return {name: plain(float(getattr(self, name))) for name in ("value", "low", "high")}
 
 
 NONE = Interval(np.nan, np.nan, np.nan)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from agents.ways.routing import improve
 from slam.belief import Belief
+from slam.types import Array
 from training.episodes.true_places import TruePlaces, greedy_tour, see_from
 
 __all__ = ["Hindsight"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 _OFFSETS_M = np.array([0.5, 2.0, 6.0])  # greedy tours tried: what a new cell is worth against its way

@@ -14,7 +14,6 @@ from typing import Any, SupportsInt
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.frontier_env import ChoiceEnv, Observation
 from agents.learned.chooser import Chooser, ChooserConfig
@@ -27,11 +26,9 @@ from slam.features.extraction import FeatureExtractor
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import OccupancyGrid
 from slam.settings import from_mapping
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["COVERED", "JumpWorld"]
-
-Array = NDArray[np.float64]
 
 COVERED = 0.95
 """Coverage that an episode ends at."""
@@ -83,10 +80,7 @@ class JumpWorld(ChoiceEnv):
     @property
     def belief(self) -> Belief:
         """The true pose, and the map as the scans drew it."""
-        return Belief(
-            pose=self._pose, pose_cov=_POSE_COV, landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)), landmark_ids=np.zeros(0, np.int64), grid=self._grid,
-        )  # fmt: skip
+        return Belief.without_landmarks(self._pose, _POSE_COV, self._grid)
 
     @property
     def ground(self) -> GroundTruth:

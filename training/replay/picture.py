@@ -11,11 +11,10 @@ from mecanum_env.views.paint import extent, with_margin
 from mecanum_env.views.pictures import draw_map
 from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
+from slam.types import Array
 from training.figures.charts import COLOURS, INK, chart, label
 
 __all__ = ["draw_belief", "draw_replay"]
-
-Array = NDArray[np.float64]
 
 
 def draw_replay(

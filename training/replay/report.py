@@ -21,6 +21,7 @@ from slam.landmarks.database import write_landmark_map
 from slam.logs import ScanLog
 from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
+from slam.types import Array
 from training.figures.charts import png
 from training.replay.picture import draw_belief, draw_replay
 from training.replay.run import FILES, Replay
@@ -28,8 +29,6 @@ from training.replay.scans import scan_metrics
 from training.runs.running import plain, versions, written_together
 
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
-
-Array = NDArray[np.float64]
 
 
 def metrics(replay: Replay) -> dict[str, Any]:

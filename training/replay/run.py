@@ -18,6 +18,7 @@ from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.registry import config_type, make
 from slam.settings import from_mapping, require, to_mapping, unknown_name
+from slam.types import Array
 from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
 from training.runs.signals import interrupt_flag
@@ -31,8 +32,6 @@ __all__ = [
     "run",
     "sample_times",
 ]
-
-Array = NDArray[np.float64]
 
 FILES = (
     "trajectory_estimate.tum", "trajectory_true.tum", "landmarks.db", "landmarks.csv", "trajectory.png",

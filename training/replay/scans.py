@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.logs import ScanLog
 from slam.metrics.relations import RelationScore, closing_relations, local_relations, relation_score
 from training.replay.run import Replay
 
 __all__ = ["scan_metrics"]
-
-Array = NDArray[np.float64]
 
 _KINDS = ("", "local_", "closing_")  # all relations; those along the way; those between visits of one place
 

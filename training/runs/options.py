@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out",
     "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts",
-    "UnknownStarts", "Workers", "refuse_team_options", "whole_numbers", "workers_of",
+    "UnknownStarts", "Workers", "whole_numbers", "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
@@ -99,17 +99,3 @@ def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
         if low <= numbers[0] and numbers[-1] <= high:
             return numbers
     raise BadInput(f"{option} {text!r} must be whole numbers in {low} … {high}, for instance 25,50,100")
-
-
-def refuse_team_options(
-    *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool,
-    joint_belief: bool = False,
-) -> None:  # fmt: skip
-    """Raise :class:`BadInput` for an option of several robots where there is one."""
-    given = {
-        "--communication": communication, "--range": range_m, "--starts": starts,
-        "--unknown-starts": unknown_starts or None, "--joint-belief": joint_belief or None,
-    }  # fmt: skip
-    for name, value in given.items():
-        if value is not None:
-            raise BadInput(f"{name} is for several robots; give --robots 2 or more")

@@ -17,7 +17,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from agents.base import Goal
@@ -27,7 +26,7 @@ from slam.formats import atomic_write
 from slam.geometry import transform_points, wrap_scalar
 from slam.landmarks.innovations import Innovation
 from slam.metrics.chi_square import chi2_quantile
-from slam.types import Scan
+from slam.types import Array, Scan
 from training.episodes import explore
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.figures.tables import number, text_table
@@ -36,8 +35,6 @@ from training.runs.options import ConfigFile, FloorPlanFile, MaxSteps, Noise, Ro
 from training.runs.progress import Progress
 
 __all__ = ["BeliefWitness", "figures", "rises", "study"]
-
-Array = NDArray[np.float64]
 
 FILES = ("belief.json", "belief.png", "innovations.png")
 DIRECTIONS = ("ahead", "left", "heading")

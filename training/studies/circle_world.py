@@ -14,17 +14,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 import slam
 from slam.backend import Backend
 from slam.geometry import wrap
 from slam.motion import move, twist_between
-from slam.types import Observations, Odometry
+from slam.types import Array, Observations, Odometry
 
 __all__ = ["WORLDS", "LandmarkWorld", "Step", "drive", "not_observing", "simulate"]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -22,7 +22,7 @@ from slam.backend import Backend
 from slam.formats import atomic_write
 from slam.geometry import wrap
 from slam.motion import move
-from slam.types import Observations, Odometry
+from slam.types import Array, Observations, Odometry
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, installed_version, keep_settings
@@ -33,7 +33,6 @@ from training.studies.circle_world import not_observing
 
 __all__ = ["REFERENCE", "SEEN", "complexity", "exponent", "run_job", "table"]
 
-Array = NDArray[np.float64]
 Job = tuple[str, int, int]  # backend or REFERENCE, landmarks, steps
 Point = dict[str, float | None]
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 import slam
 from mecanum_env import MAX_EPISODE_STEPS
@@ -26,6 +25,7 @@ from slam.backend import Backend
 from slam.formats import atomic_write
 from slam.metrics.measures import nees_band
 from slam.settings import unknown_name
+from slam.types import Array
 from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
 from training.figures.tables import number, text_table
@@ -37,7 +37,6 @@ from training.studies.exploring import AGENT, exploring
 
 __all__ = ["Record", "consistency", "run_job", "scaled_noise", "summarise", "table"]
 
-Array = NDArray[np.float64]
 Job = tuple[str, str, int, int, float]  # backend, rooms, seed, steps, noise
 Row = list[tuple[float, float, float]]  # a run: NEES, NIS and its degrees of freedom at each step
 Record = dict[str, Array]  # the same as columns (steps,): "nees", "nis", "dof"

@@ -17,19 +17,17 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 import slam
 from slam.backend import Backend
 from slam.formats import atomic_write
+from slam.types import Array
 from training.figures.charts import COLOURS, chart, label, png
 from training.runs.errors import BadInput, check_writable
 from training.runs.options import Seed
 from training.studies.circle_world import WORLDS, LandmarkWorld, drive
 
 __all__ = ["floor_of", "follow_filter", "follow_particles", "paper_b", "study"]
-
-Array = NDArray[np.float64]
 
 _START_SIGMA_M = 0.1  # a start known exactly would leave landmarks no floor but zero
 _UNCERTAIN_HEADING = math.radians(2.0)

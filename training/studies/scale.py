@@ -16,13 +16,13 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
 import agents
 from agents.base import Goal
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.formats import atomic_write
+from slam.types import Array
 from training.episodes.explore import Episode, prepare, run
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
@@ -33,7 +33,6 @@ from training.runs.rows import resume
 
 __all__ = ["explore", "study", "table"]
 
-Array = NDArray[np.float64]
 Job = tuple[str, str, int, float, str]  # plan, agent, seed, most minutes, folder
 
 FILES = ("scale.json", "scale.png")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +17,8 @@ from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
-from training.episodes.explore import ENDINGS, EXTRAS, FILES, Episode
-from training.episodes.recording import Recorder, Recording
+from training.episodes.explore import ENDINGS, EXTRAS, FILES, Course, Episode
+from training.episodes.recording import Recording
 from training.episodes.team import FILES as TEAM_FILES
 from training.episodes.team import ROBOT_FILE, TeamEpisode
 from training.runs.running import versions, written_together
@@ -27,7 +28,7 @@ from training.views.report_page import episode_page
 from training.views.rerun_file import check_rerun, write_rerun
 
 __all__ = [
-    "PeriodicSaver", "Saver", "check_extras", "config_text", "leftovers", "place_of", "write_episode",
+    "Saver", "check_extras", "config_text", "episode_folder", "place_of", "write_episode",
     "write_landmarks",
 ]  # fmt: skip
 
@@ -47,35 +48,38 @@ def write_episode(
     Of the extras those are written that need no more than the recording; the film, made while it ran, is moved to
     its place. Extras not asked for are taken away: they would be another episode's.
     """
-    asked = {file for extra, file in EXTRAS.items() if extra in extras}
-    with written_together(episode.out, without=leftovers(episode.out, {*FILES, *asked})) as folder:
-        metrics = _write_into(folder, episode, recording, extras)
+    with episode_folder(episode.out, FILES, extras, film) as folder:
+        return _write_into(folder, episode, recording, extras)
+
+
+@contextmanager
+def episode_folder(
+    out: Path, files: Collection[str], extras: Collection[str], film: Path | None
+) -> Iterator[Path]:
+    """Give a folder whose files, with the film, come into ``out`` together; those of another episode go."""
+    known, kept = {*FILES, *EXTRAS.values(), *TEAM_FILES}, {*files, *(EXTRAS[extra] for extra in extras)}
+    names = {path.name for path in out.glob("*")} - kept
+    others = sorted(name for name in names if name in known or ROBOT_FILE.fullmatch(name))
+    with written_together(out, without=others) as folder:
+        yield folder
         if film is not None:
             film.replace(folder / EXTRAS["video"])
-    return metrics
 
 
-def leftovers(out: Path, kept: Collection[str]) -> list[str]:
-    """Return the files in a folder that episodes write, of one robot or of a team, but for those ``kept``."""
-    known = {*FILES, *EXTRAS.values(), *TEAM_FILES}
-    names = {path.name for path in out.glob("*")} - set(kept)
-    return sorted(name for name in names if name in known or ROBOT_FILE.fullmatch(name))
-
-
-class PeriodicSaver:
+class Saver:
     """A witness that writes what there is of an episode now and then: what kills the run takes little.
 
     Parameters
     ----------
-    episode : Episode or TeamEpisode
+    episode : Course
         What is written.
     write : callable
-        Writes it.
+        Writes it; what it is written from has to have seen a step before this witness does.
     every_s
         Time between two writings [s]; more where one takes long, for it to take no more than a twentieth.
     """
 
-    def __init__(self, episode: Episode | TeamEpisode, write: Callable[[], Any], every_s: float) -> None:
+    def __init__(self, episode: Course, write: Callable[[], Any], *, every_s: float = 60.0) -> None:
         self._episode, self._write, self._every_s = episode, write, every_s
         self._due = time.monotonic() + every_s
 
@@ -92,13 +96,6 @@ class PeriodicSaver:
             episode.end = end
         took = time.monotonic() - began
         self._due = time.monotonic() + max(self._every_s, 20.0 * took)
-
-
-class Saver(PeriodicSaver):
-    """Of one robot; ``recorder`` has to have seen a step before this witness does, so it comes first."""
-
-    def __init__(self, episode: Episode, recorder: Recorder, *, every_s: float = 60.0) -> None:
-        super().__init__(episode, lambda: write_episode(episode, recorder.recording()), every_s)
 
 
 def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Collection[str]) -> dict[str, Any]:
@@ -151,7 +148,7 @@ def write_landmarks(path: Path, env: ExploreEnv) -> None:
     )  # fmt: skip
 
 
-def config_text(episode: Episode | TeamEpisode) -> str:
+def config_text(episode: Course) -> str:
     """Return the effective configuration as TOML, with a [run] table that ``--config`` takes up again."""
     run = {key: list(v) if isinstance(v, tuple) else v for key, v in episode.run.items() if v is not None}
     if isinstance(episode, TeamEpisode):
@@ -160,7 +157,7 @@ def config_text(episode: Episode | TeamEpisode) -> str:
     return tomli_w.dumps(to_mapping(episode.config) | {"run": run})
 
 
-def place_of(episode: Episode | TeamEpisode) -> str:
+def place_of(episode: Course) -> str:
     """Return where an episode was, in words."""
     plan = episode.config.floor_plan
     return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"

@@ -27,9 +27,8 @@ if TYPE_CHECKING:
     from mecanum_env.env import ExploreEnv
     from mecanum_env.team.team import Team
 
-__all__ = ["Camera", "Film", "TeamCamera", "check_video", "film", "film_episode", "filmed", "filmed_team"]
+__all__ = ["Camera", "Film", "TeamCamera", "check_video", "film", "film_episode", "filmed"]
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Write = Callable[[Image], None]
 
@@ -147,24 +146,16 @@ class Film:
 
 
 @contextmanager
-def filmed(out: Path, config: EnvConfig, substeps: bool) -> Iterator[Film]:
+def filmed(out: Path, config: EnvConfig, *, substeps: bool = False, team: bool = False) -> Iterator[Film]:
     """Give a :class:`Film` that is made in a folder within ``out``, which goes when the block ends."""
-    with _filming(out) as (path, stack):
-        yield Film(path, stack.enter_context(film_episode(path, config, substeps=substeps)), stack)
-
-
-@contextmanager
-def filmed_team(out: Path, config: EnvConfig) -> Iterator[Film]:
-    """Give the :class:`Film` of a team, a frame a step; as :func:`filmed`."""
-    with _filming(out) as (path, stack):
-        yield Film(path, TeamCamera(stack.enter_context(film(path, fps=1.0 / config.step_s))), stack)
-
-
-@contextmanager
-def _filming(out: Path) -> Iterator[tuple[Path, ExitStack]]:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder, ExitStack() as stack:
-        yield Path(folder) / "episode.mp4", stack
+        path = Path(folder) / "episode.mp4"
+        if team:
+            camera: _Takes = TeamCamera(stack.enter_context(film(path, fps=1.0 / config.step_s)))
+        else:
+            camera = stack.enter_context(film_episode(path, config, substeps=substeps))
+        yield Film(path, camera, stack)
 
 
 @contextmanager

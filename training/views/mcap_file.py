@@ -21,13 +21,13 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam.formats import replacing
 from slam.geometry import compose, inverse, wrap
 from slam.motion import twist_between
+from slam.types import Array
 from training.episodes.playback import dead_reckoned, ellipses, map_origin, maps
 from training.episodes.recording import Recording
 from training.runs.errors import needs_extra
 
 __all__ = ["TOPICS", "check_mcap", "write_mcap"]
 
-Array = NDArray[np.float64]
 Message = Mapping[str, Any]
 """A message as nested mappings; a field that is left out is zero or empty."""
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -100,13 +101,16 @@ def about_plan(config: EnvConfig, ground: GroundTruth, view: View) -> dict[str, 
 
 
 def filled(template: str, header: Mapping[str, Any], arrays: Arrays, parts: Mapping[str, str]) -> str:
-    """Return a page of ``assets/`` with its parts in their places, the style and the data among them."""
+    """Return ``assets/page.html`` with what the template has of its own, and all parts, in their places."""
     parts = dict(parts) | {
         "STYLE": STYLE + assets(["episode.css"]),
         "HEADER": json.dumps(header).replace("</", "<\\/"),
         "DATA": _deflated(header["arrays"], arrays),
     }
-    before, *pieces = assets([template]).split("{{")
+    frame = assets(["page.html"])
+    for name, own in zip(("VIEWS", "LAYERS", "MORE"), re.split("<!-- .* -->\n", assets([template])), strict=True):
+        frame = frame.replace("{{" + name + "}}", own)
+    before, *pieces = frame.split("{{")
     return before + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces))
 
 

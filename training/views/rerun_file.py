@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.formats import replacing
 from slam.geometry import wrap
+from slam.types import Array
 from training.episodes.playback import ellipses, map_origin, maps
 from training.episodes.recording import Recording
 from training.runs.errors import needs_extra
 
 __all__ = ["check_rerun", "write_rerun"]
-
-Array = NDArray[np.float64]
 
 APPLICATION = "mecanum-slam"
 TIMELINE = "time"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,37 +13,27 @@ import numpy as np
 from mecanum_env.team.picture import render_team
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
-from training.episodes.explore import ENDINGS, EXTRAS
+from training.episodes.explore import ENDINGS
 from training.episodes.recording import Recording
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
-from training.episodes.team_recording import TeamRecorder
-from training.runs.running import written_together
-from training.views.episode_files import PeriodicSaver, config_text, leftovers, place_of, write_landmarks
+from training.views.episode_files import config_text, episode_folder, place_of, write_landmarks
 from training.views.team_page import team_page
 
-__all__ = ["TeamSaver", "write_team_episode"]
+__all__ = ["write_team_episode"]
 
 
 def write_team_episode(
-    episode: TeamEpisode, recordings: Sequence[Recording], *, film: Path | None = None
+    episode: TeamEpisode,
+    recordings: Sequence[Recording],
+    *,
+    extras: Collection[str] = (),
+    film: Path | None = None,
 ) -> dict[str, Any]:
-    """Write every file of a team's episode and return its metrics; those of another episode are taken away."""
-    kept = {*FILES, *(name for member in episode.team.members for name in files_of(member.number))}
-    if film is not None:
-        kept.add(EXTRAS["video"])
-    with written_together(episode.out, without=leftovers(episode.out, kept)) as folder:
-        metrics = _write_into(folder, episode, recordings)
-        if film is not None:
-            film.replace(folder / EXTRAS["video"])
-    return metrics
-
-
-class TeamSaver(PeriodicSaver):
-    """Of a team; ``recorder`` comes before this witness."""
-
-    def __init__(self, episode: TeamEpisode, recorder: TeamRecorder, *, every_s: float = 60.0) -> None:
-        super().__init__(episode, lambda: write_team_episode(episode, recorder.recordings()), every_s)
+    """Write every file of a team's episode and return its metrics, as :func:`.episode_files.write_episode`."""
+    files = [*FILES, *(name for member in episode.team.members for name in files_of(member.number))]
+    with episode_folder(episode.out, files, extras, film) as folder:
+        return _write_into(folder, episode, recordings)
 
 
 def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recording]) -> dict[str, Any]:

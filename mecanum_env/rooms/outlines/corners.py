@@ -14,11 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import CONCAVE, CONVEX
+from slam.types import CONCAVE, CONVEX, Array
 
 __all__ = ["find_corners"]
-
-Array = NDArray[np.float64]
 
 _TOUCH_M = 1e-3  # two surfaces meet when they are this near
 _STRAIGHT_DEG = 5.0  # a smaller bend is no corner

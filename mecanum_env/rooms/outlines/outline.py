@@ -15,9 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.types import Array
+
 __all__ = ["outline_segments", "trace"]
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _TOLERANCE = 0.5 + 1e-9  # [cells]: the flat top of an arc is cut by exactly half a cell

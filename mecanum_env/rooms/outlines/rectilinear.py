@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["raster", "surfaces"]
+from slam.types import Array
 
-Array = NDArray[np.float64]
+__all__ = ["raster", "surfaces"]
 
 
 def raster(rectangles: ArrayLike, size: tuple[int, int]) -> NDArray[np.bool_]:

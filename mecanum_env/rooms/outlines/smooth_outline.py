@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.outlines.outline import trace
+from slam.types import Array
 
 __all__ = ["MOST_TURN_DEG", "bends_deg", "facets", "level_loops", "rasterise"]
-
-Array = NDArray[np.float64]
 
 MOST_TURN_DEG = 4.8
 """Largest bend [°] from one piece to the next: a plan's list of corners begins at 5°."""

@@ -12,7 +12,8 @@ from slam import Observations, Odometry
 from slam.gaussian.joint_gaussian import ANYWHERE_COV
 from slam.geometry import compose, transform_points, wrap
 from slam.landmarks.association import IGNORED
-from slam.landmarks.known_ids import KnownIds, rigid_fit
+from slam.landmarks.known_ids import KnownIds
+from slam.metrics.measures import align_se2
 from slam.particles.gate import refuse_unlikely
 from slam.particles.maps import ParticleMaps
 from tests.slam.simulated import circle_twist, drive, observe_landmarks
@@ -114,7 +115,7 @@ def test_a_forgotten_pose_is_found_by_the_landmarks_alone():
 def test_the_rigid_fit_is_the_motion_that_was_made(seed):
     rng = np.random.default_rng(seed)
     pose, points = rng.uniform(-3.0, 3.0, 3), rng.normal(size=(4, 2))
-    np.testing.assert_allclose(rigid_fit(points, transform_points(pose, points)), pose, atol=1e-9)
+    np.testing.assert_allclose(align_se2(transform_points(pose, points), points), pose, atol=1e-9)
 
 
 def test_two_landmarks_alone_do_not_say_that_the_robot_is_elsewhere():

@@ -14,7 +14,6 @@ from slam.teams.frames import (
     inverse_jacobian,
     points_into,
     pose_into,
-    relative_cov,
     walls_into,
 )
 from slam.teams.sighting import combine, relative_pose
@@ -98,19 +97,6 @@ def test_jacobians_of_a_sighting() -> None:
         covs = [own if j == k else zero for j in range(3)]
         found = relative_pose(seen, covs[0], a, covs[1], b, covs[2])[1]
         np.testing.assert_allclose(found, jacobian @ own @ jacobian.T, atol=1e-8)
-
-
-def test_relative_cov_against_samples() -> None:
-    rng = np.random.default_rng(0)
-    a, b = np.array([1.0, 2.0, 0.5]), np.array([-2.0, 1.0, 3.0])
-    cov_a, cov_b = np.diag([1e-4, 4e-4, 1e-5]), np.diag([2e-4, 1e-4, 3e-5])
-    pose, cov = relative_cov(a, cov_a, b, cov_b)
-    errors = []
-    for _ in range(4000):
-        noisy = compose(inverse(rng.multivariate_normal(a, cov_a)), rng.multivariate_normal(b, cov_b)) - pose
-        noisy[2] = wrap(noisy[2])
-        errors.append(noisy)
-    assert abs(np.einsum("ni,ij,nj->n", errors, np.linalg.inv(cov), errors).mean() / 3 - 1) < 0.1
 
 
 def test_sightings_that_share_their_errors_are_not_counted_twice() -> None:

@@ -29,7 +29,7 @@ from training.episodes import explore as task
 from training.episodes.explore import EXTRAS, FILES
 from training.episodes.recording import Recorder
 from training.runs.running import plain
-from training.views.episode_files import Saver
+from training.views.episode_files import Saver, write_episode
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -214,7 +214,7 @@ def test_sigterm_is_ctrl_c_but_for_the_exit_code(tmp_path: Path) -> None:
 def test_what_kills_a_run_takes_no_more_than_a_minute_of_it(tmp_path: Path) -> None:
     """The files are there while it runs, whole, and each writing's are of one moment."""
     episode, recorder = task.prepare(out=tmp_path, agent="random", rooms="rectangular", max_steps=60), Recorder()
-    saver = Saver(episode, recorder, every_s=0.0)
+    saver = Saver(episode, lambda: write_episode(episode, recorder.recording()), every_s=0.0)
     seen: list[int] = []
 
     class Look:

@@ -21,9 +21,10 @@ from tests.training.cli.test_explore import run
 from training.cli import main
 from training.episodes import team as task
 from training.episodes.explore import FILES as SINGLE_FILES
+from training.episodes.recording import TeamRecorder
 from training.episodes.team import FILES, LANDMARKS, files_of
-from training.episodes.team_recording import TeamRecorder
-from training.views.team_files import TeamSaver
+from training.views.episode_files import Saver
+from training.views.team_files import write_team_episode
 
 SHORT = ["explore", "--rooms", "rectangular", "--seed", "3", "--max-steps", "15"]
 
@@ -139,5 +140,6 @@ def test_what_kills_a_run_takes_no_more_than_a_minute_of_it(tmp_path: Path) -> N
                 assert sorted(p.name for p in tmp_path.iterdir()) == files(2)
                 seen.append(metrics["steps"])
 
-    task.run(episode, lambda **_: None, [recorder, TeamSaver(episode, recorder, every_s=0.0), Look()])
+    saver = Saver(episode, lambda: write_team_episode(episode, recorder.recording()), every_s=0.0)
+    task.run(episode, lambda **_: None, [recorder, saver, Look()])
     assert episode.end == "time" and seen and seen[0] <= 1

@@ -13,7 +13,7 @@ from mecanum_env.team.picture import COLOURS, draw_maps
 from slam.grids.occupancy import FREE
 from tests.training.team_episode import STEPS, Explored, explore_together
 from tests.training.views.test_report_page import opened, page_data, settled
-from training.views.film import filmed_team
+from training.views.film import filmed
 from training.views.team_files import write_team_episode
 from training.views.team_page import colour
 
@@ -116,7 +116,7 @@ def test_the_page_fits_a_phone(browser: Any, written: Written, width: int) -> No
 def test_a_team_is_filmed(tmp_path: Path, written: Written) -> None:
     pytest.importorskip("imageio_ffmpeg")
     team = written.explored.episode.team
-    with filmed_team(tmp_path, team.config) as film:
+    with filmed(tmp_path, team.config, team=True) as film:
         for _ in range(3):
             film.take(team, [None] * 3)
         path = film.finish()

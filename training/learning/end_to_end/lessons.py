@@ -24,10 +24,10 @@ from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, map_frame
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
+from slam.types import Array
 
 __all__ = ["LOG_PRICE", "NO_WAY", "FollowingTeacher", "map_lesson"]
 
-Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 LOG_PRICE = 70.0

@@ -17,13 +17,13 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from slam.formats import atomic_write
 from slam.odometry.differential_transform import MODELS, make_model
 from slam.odometry.filters import OdometryFilterConfig
 from slam.odometry.riccati import RECOVERIES, Tolerances
 from slam.odometry.transform_filter import KalmanBucyFilter
+from slam.types import Array
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.runs.campaign import Workers
 from training.runs.errors import check_writable
@@ -33,8 +33,6 @@ from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
 
 __all__ = ["covariances", "estimates", "run_of", "study"]
-
-Array = NDArray[np.float64]
 
 _FILES = ("figure_2.png", "figure_3.png", "work.png", "odometry.png", "paper_c.json")
 _T0, _T1 = 1.0, 11.0  # [s]

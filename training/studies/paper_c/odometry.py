@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
 from mecanum_env.env import ExploreEnv
@@ -20,7 +19,7 @@ from mecanum_env.sensing.odometry_calibration import Drives, drive
 from slam.motion import move
 from slam.odometry.differential_transform import MODELS
 from slam.odometry.filters import OdometryFilter, OdometryFilterConfig
-from slam.types import Odometry
+from slam.types import Array, Odometry
 from training.runs.campaign import Workers, run_all
 from training.studies.exploring import exploring
 
@@ -29,7 +28,6 @@ __all__ = [
     "explore", "filtered", "scan_process", "step_time_us",
 ]  # fmt: skip
 
-Array = NDArray[np.float64]
 Row = dict[str, Any]
 Job = tuple[str, str, int, int]  # noise, odometry filter, seed, steps
 

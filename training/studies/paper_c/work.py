@@ -13,17 +13,15 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import RK45, solve_ivp
 from scipy.linalg import expm
 
 from slam.odometry.differential_transform import PowerModel
 from slam.odometry.riccati import Tolerances
 from slam.odometry.transform_filter import KalmanBucyFilter
+from slam.types import Array
 
 __all__ = ["METHODS", "Run", "cheapest", "measure", "multiplications", "reference", "relative_deviation", "solve"]
-
-Array = NDArray[np.float64]
 
 METHODS: dict[str, Sequence[float]] = {
     "Padé [3/3]": tuple(10.0**-k for k in range(3, 12)),

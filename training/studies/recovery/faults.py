@@ -9,14 +9,11 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.env import ExploreEnv
-from slam.types import Scan
+from slam.types import Array, Scan
 
 __all__ = ["FAULTS", "Fault", "make_fault"]
-
-Array = NDArray[np.float64]
 
 FAULTS = {
     "none": "nothing goes wrong",

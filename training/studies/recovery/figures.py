@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from training.figures.charts import COLOURS, INK, chart, label
 from training.studies.recovery.runs import BINS, Row
 
 __all__ = ["draw_recovery", "draw_reliability", "false_alarms", "recovered", "reliability", "sum_up"]
-
-Array = NDArray[np.float64]
 
 _COUNTED = ("count", "true", "sum")
 _IN_TIME_S = 20.0

@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-import agents
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 from training.studies.recovery.faults import make_fault
 
 __all__ = ["BINS", "REGION", "Job", "Row", "run_job", "within"]
 
-Array = NDArray[np.float64]
 Job = tuple[str, str, str, str, str, int, int]
 """Fault, backend, agent, rooms or file of a plan, noise, seed, steps at most."""
 Row = dict[str, Any]
@@ -82,9 +80,8 @@ class _Episode:
     """An agent that explores, with what was seen of its belief."""
 
     def __init__(self, env: ExploreEnv, agent: str, seed: int) -> None:
-        told = env.config
         self.env = env
-        self._agent = agents.make(agent, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+        self._agent = make_agent(agent, env)
         self._observation, _ = env.reset(seed=seed)
         self._agent.reset(env.belief, seed=seed)
         self.errors: list[tuple[float, float, float]] = []  # of a step: [m], [rad], NEES

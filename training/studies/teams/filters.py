@@ -17,9 +17,7 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
-import agents
 import slam
 from mecanum_env.arguments import make_config
 from mecanum_env.env import ExploreEnv
@@ -32,6 +30,8 @@ from slam.geometry import compose, inverse, wrap
 from slam.metrics.measures import ate, heading_errors
 from slam.settings import from_mapping
 from slam.teams.centralised import JointEkf
+from slam.types import Array
+from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
 from training.runs.errors import bad_input
@@ -41,7 +41,6 @@ from training.studies.exploring import AGENT
 
 __all__ = ["SINGLE", "TEAM", "explore", "study", "table"]
 
-Array = NDArray[np.float64]
 Job = tuple[int, int, int, float, float, str]  # room seed, robots, steps, start's σ [m, rad], noise
 
 TEAM, SINGLE = "centralised", ("ekf-lines", "invariant-ekf")
@@ -60,8 +59,7 @@ class _Robot:
         if start is not None:
             options["start_pose"] = start.tolist()
         self._observation, _ = env.reset(seed=seed, options=options)
-        told = env.config
-        self._agent = agents.make(AGENT, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+        self._agent = make_agent(AGENT, env)
         self._agent.reset(env.belief, seed=seed)
         self._idle, self.done = 0, False
 

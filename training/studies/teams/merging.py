@@ -18,9 +18,7 @@ from typing import Annotated, Any, NamedTuple
 import cv2
 import numpy as np
 import typer
-from numpy.typing import NDArray
 
-import agents
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.formats import atomic_write
@@ -31,6 +29,8 @@ from slam.settings import to_mapping
 from slam.teams.account import Account
 from slam.teams.alignment import Alignment, AlignmentConfig, align
 from slam.teams.fusion import MergedMap, fuse
+from slam.types import Array
+from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import installed_version, keep_settings
@@ -51,7 +51,6 @@ SLAM = "invariant-ekf"
 _CLEARANCE_M = 0.6  # of the second robot's start
 _SAME_CORNER_M = 0.3  # a mapped corner is the nearest true one, if no farther
 
-Array = NDArray[np.float64]
 Job = tuple[str, int, float, float]  # rooms, seed of the room, coverage and time [s] at which a robot stops
 Row = dict[str, Any]
 
@@ -102,8 +101,7 @@ def _explore(
     env: ExploreEnv, room_seed: int, robot: int, start: Iterable[float], coverage: float, time_s: float
 ) -> _Told:
     """Explore until so much is covered, or so much time has passed."""
-    told, seed = env.config, 2 * room_seed + robot + 1
-    agent = agents.make(AGENT, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+    seed, agent = 2 * room_seed + robot + 1, make_agent(AGENT, env)
     observation, info = env.reset(seed=seed, options={"room_seed": room_seed, "start_pose": tuple(start)})
     agent.reset(env.belief, seed=seed)
     ended = False

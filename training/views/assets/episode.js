@@ -27,21 +27,13 @@ async function openViews(header, recording, redraw) {
       c.fill(map.frontiers());
       c.restore();
     }
-    if (layers.landmarks) drawLandmarks(c, k, px);
+    if (layers.landmarks) draw.landmarks(c, landmarksAt(k), px, colours.landmark);
     if (layers.paths) draw.path(c, data.estimate, k, colours.believed, px);
     if (layers.goal) draw.goal(c, wayAt(k), px, colours.goal);
     draw.robot(c, data.estimate, k, colours.believed);
     const [a, b, angle] = poseEllipse(k);
     Object.assign(c, { strokeStyle: colours.landmark, lineWidth: 2 * px });
     draw.ellipse(c, data.estimate[3 * k], data.estimate[3 * k + 1], 3 * a, 3 * b, angle, 1.5 * px);
-  }
-
-  function drawLandmarks(c, k, px) {
-    Object.assign(c, { strokeStyle: colours.landmark, fillStyle: colours.landmark, lineWidth: 1.2 * px });
-    for (const [x, y, a, b, angle] of landmarksAt(k)) {
-      c.fillRect(x - 1.5 * px, y - 1.5 * px, 3 * px, 3 * px);
-      draw.ellipse(c, x, y, 3 * a, 3 * b, angle, 2 * px);
-    }
   }
 
   return {

@@ -116,6 +116,15 @@ async function openCanvases(header, redraw) {
     c.stroke();
   }
 
+  // Each a dot in its 3σ ellipse.
+  function landmarks(c, found, px, colour) {
+    Object.assign(c, { strokeStyle: colour, fillStyle: colour, lineWidth: 1.2 * px });
+    for (const [x, y, a, b, angle] of found) {
+      c.fillRect(x - 1.5 * px, y - 1.5 * px, 3 * px, 3 * px);
+      ellipse(c, x, y, 3 * a, 3 * b, angle, 2 * px);
+    }
+  }
+
   // One of the map's pictures, on a canvas of the page.
   function map(c, { map }, header, k, canvas, picture = 0) {
     const m = header.map, left = m.col0 * m.resolution, top = (m.row0 + m.rows) * m.resolution;
@@ -201,5 +210,5 @@ async function openCanvases(header, redraw) {
     });
   }
 
-  return { layers, canvases, begin, plan, path, robot, scan, ellipse, map, goal };
+  return { layers, canvases, begin, plan, path, robot, scan, ellipse, landmarks, map, goal };
 }

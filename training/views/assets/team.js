@@ -91,19 +91,10 @@ async function openViews(header, { data, robots }, redraw) {
     const { data: { estimate: poses } } = followed();
     const { c, px } = draw.begin(canvases[1], placed(followed(), poses, rowOf(followed(), k)), 0);
     maps(c, shown, k);
-    if (layers.landmarks) each(c, shown, (robot) => landmarks(c, robot, k, px));
+    if (layers.landmarks) each(c, shown, (robot) => draw.landmarks(c, robot.landmarksAt(k), px, robot.header.colour));
     if (layers.paths) each(c, shown, (robot) => draw.path(c, robot.data.estimate, rowOf(robot, k), robot.header.colour, px));
     if (layers.goal) each(c, shown, (robot) => draw.goal(c, robot.wayAt(k), px, robot.header.colour));
     each(c, shown, (robot) => draw.robot(c, robot.data.estimate, rowOf(robot, k), robot.header.colour));
-  }
-
-  function landmarks(c, robot, k, px) {
-    const colour = robot.header.colour;
-    Object.assign(c, { strokeStyle: colour, fillStyle: colour, lineWidth: 1.2 * px });
-    for (const [x, y, a, b, angle] of robot.landmarksAt(k)) {
-      c.fillRect(x - 1.5 * px, y - 1.5 * px, 3 * px, 3 * px);
-      draw.ellipse(c, x, y, 3 * a, 3 * b, angle, 2 * px);
-    }
   }
 
   return {
