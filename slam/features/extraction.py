@@ -50,7 +50,8 @@ class FeatureConfig:
     wall_length_m: float = 0.6
     wall_points: int = 5  # through a door the walls beyond are seen by a few beams, and nothing else tells as much
     # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
-    # jamb. As noise of each it counts for so much more, and adds up to no less.
+    # jamb; so does what is not seen of where a surface ends. As noise of each it counts for so much more, and adds
+    # up to no less.
     wall_lasting_scans: float = 16.0
     # Of a wall's curvature (slam.landmarks.curved_walls): the probability that it has one, 1σ of it where it has,
     # and the share by which it changes along the wall. Chosen in caves of the training seeds 100-115.

@@ -80,11 +80,11 @@ def test_old_landmarks_that_are_not_expected_narrowly_wait_while_others_hold_the
     z = np.vstack([z, wall_row(2.0, math.pi / 2, -1.0, 1.0)])
     match = np.array([1, 1, 1, 0])
     assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == 0  # old, and known where it should be seen
-    p[1, 1] += 0.2**2  # now the robot alone is uncertain
+    p[1, 1] += 0.15**2  # now the robot alone is uncertain
     assert put_off(x, p, OFFSET, z, marks, 40, SIGMA, match) == 0  # seen 40 updates ago
     assert put_off(x, p, OFFSET, z[1:], marks, 1000, SIGMA, match[1:]) == 0  # there is too little else
     lone, wide = match[1:].copy(), p.copy()
-    wide[1, 1] += 1.0
+    wide[1, 1] += 0.15**2
     assert put_off(x, wide, OFFSET, z[1:], marks, 1000, SIGMA, lone) == 1  # too uncertain to be taken all the same
     assert lone.tolist() == [1, 1, IGNORED]
     assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == 1
@@ -93,9 +93,9 @@ def test_old_landmarks_that_are_not_expected_narrowly_wait_while_others_hold_the
 
 def test_a_lone_old_wall_must_be_well_within_its_gate() -> None:
     x, p, marks = lone_wall(0.3)
-    p[1, 1] += 0.3**2
+    p[1, 1] += 0.15**2
     for sigmas, taken in ((2.5, True), (3.3, False)):  # 3.3 σ are within the gate of 99.7 %, not in that of 99 %
-        z = np.array([wall_row(x[4] + sigmas * 0.3, math.pi / 2, -1.0, 1.0)])
+        z = np.array([wall_row(x[4] + sigmas * 0.15, math.pi / 2, -1.0, 1.0)])
         match = np.zeros(1, np.int64)
         assert put_off(x, p, OFFSET, z, marks, 1000, SIGMA, match) == (not taken)
         assert match[0] == (0 if taken else IGNORED)
