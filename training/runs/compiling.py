@@ -1,0 +1,48 @@
+"""Says that Numba compiles: after an installation or an update the first run does, for about a minute."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+__all__ = ["SAYS", "compiling_shown"]
+
+SAYS = "compiling kernels"
+"""How each of its lines begins."""
+
+_EPISODE = 220  # kernels of ours that an episode of `mecanum explore` runs
+_OURS = ("slam.", "mecanum_env.", "agents.", "training.")
+
+
+@contextmanager
+def compiling_shown(silent_s: float = 2.0, every_s: float = 10.0) -> Iterator[None]:
+    """Print a line on standard error every so often [s], once ``silent_s`` have been spent compiling."""
+    from numba.core import event
+
+    class Listener(event.Listener):  # type: ignore[misc]  # Numba has no types
+        depth = kernels = 0
+        began = spent_s = 0.0
+        next_s = silent_s
+
+        def on_start(self, _: Any) -> None:
+            if self.depth == 0:
+                self.began = time.monotonic()
+            self.depth += 1
+
+        def on_end(self, done: Any) -> None:
+            self.depth -= 1
+            kernel = getattr(done.data["dispatcher"], "py_func", None)
+            self.kernels += getattr(kernel, "__module__", "").startswith(_OURS)
+            spent_s = self.spent_s + time.monotonic() - self.began
+            if self.depth == 0:
+                self.spent_s = spent_s
+            if spent_s >= self.next_s:
+                self.next_s = spent_s + every_s
+                what = f"{SAYS}, once after an installation: {self.kernels} of about {_EPISODE}"
+                print(f"{what}, {spent_s:.0f} s", file=sys.stderr, flush=True)
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
