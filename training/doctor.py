@@ -186,7 +186,11 @@ def _browser() -> Answers:
 
 def _gpu() -> Answers:
     if importlib.util.find_spec("torch") is None:
-        yield {"works": False, "found": "no PyTorch", "remedy": f"only training uses it: pip install '{_NAME}[train]'"}
+        yield {
+            "works": False,
+            "found": "no PyTorch",
+            "remedy": f"only training uses it: pip install '{_NAME}[train]'",
+        }
         return
     name = _ask(_TORCH)
     yield {

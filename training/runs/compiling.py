@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-__all__ = ["SAYS", "compiling_shown"]
+__all__ = ["VARIABLE", "compiling_shown"]
 
-SAYS = "compiling kernels"
-"""How each of its lines begins."""
+VARIABLE = "MECANUM_COMPILING"
+"""The environment variable that keeps it quiet where it is 0."""
 
 _EPISODE = 220  # kernels of ours that an episode of `mecanum explore` runs
 _OURS = ("slam.", "mecanum_env.", "agents.", "training.")
@@ -20,6 +21,9 @@ _OURS = ("slam.", "mecanum_env.", "agents.", "training.")
 @contextmanager
 def compiling_shown(silent_s: float = 2.0, every_s: float = 10.0) -> Iterator[None]:
     """Print a line on standard error every so often [s], once ``silent_s`` have been spent compiling."""
+    if os.environ.get(VARIABLE) == "0":
+        yield
+        return
     from numba.core import event
 
     class Listener(event.Listener):  # type: ignore[misc]  # Numba has no types
@@ -41,7 +45,7 @@ def compiling_shown(silent_s: float = 2.0, every_s: float = 10.0) -> Iterator[No
                 self.spent_s = spent_s
             if spent_s >= self.next_s:
                 self.next_s = spent_s + every_s
-                what = f"{SAYS}, once after an installation: {self.kernels} of about {_EPISODE}"
+                what = f"compiling kernels, once after an installation: {self.kernels} of about {_EPISODE}"
                 print(f"{what}, {spent_s:.0f} s", file=sys.stderr, flush=True)
 
     with event.install_listener("numba:compile", Listener()):
