@@ -185,19 +185,12 @@ def _browser() -> Answers:
 
 
 def _gpu() -> Answers:
+    remedy = "nothing to do: training runs on processor cores, and nothing else uses a GPU"
     if importlib.util.find_spec("torch") is None:
-        yield {
-            "works": False,
-            "found": "no PyTorch",
-            "remedy": f"only training uses it: pip install '{_NAME}[train]'",
-        }
+        yield {"works": False, "found": "no PyTorch", "remedy": remedy}
         return
     name = _ask(_TORCH)
-    yield {
-        "works": bool(name),
-        "found": name or "PyTorch sees none",
-        "remedy": "nothing to do: training runs on processor cores, and nothing else uses a GPU",
-    }
+    yield {"works": bool(name), "found": name or "PyTorch sees none", "remedy": remedy}
 
 
 _CHECKS: tuple[tuple[str, bool, Callable[[], Answers]], ...] = (

@@ -39,8 +39,9 @@ class Explored:
             for key, (name, factor, unit) in _SHOWN.items()
         )
         pictures = "".join(
-            f"<figure style='display:inline-block;margin:0 1% 0 0;width:48%'><img src='{_data_uri(self.out / file)}' "
-            f"alt='{what}' style='width:100%'><figcaption>{what}</figcaption></figure>"
+            f"<figure style='display:inline-block;margin:0 1% 0 0;width:48%'>"
+            f"<img src='{_data_uri(self.out / file)}' alt='{what}' style='width:100%'>"
+            f"<figcaption>{what}</figcaption></figure>"
             for file, what in (("map.png", "what it believes"), ("truth.png", "what is so"))
         )
         report = html.escape(str(self.out / "report.html"))
@@ -48,10 +49,10 @@ class Explored:
 
 
 def explore(
-    *, out: str | Path = "out/explore", agent: str | None = None, rooms: str | None = None, slam: str | None = None,
-    seed: int | None = None, floor_plan: str | Path | None = None, start: tuple[float, float, float] | None = None,
-    robot: str | None = None, noise: str | None = None, config: str | Path | None = None,
-    max_steps: int | None = None, coverage_target: float | None = None,
+    *, out: str | Path = "out/explore", agent: str | None = None, rooms: str | None = None,
+    slam: str | None = None, seed: int | None = None, floor_plan: str | Path | None = None,
+    start: tuple[float, float, float] | None = None, robot: str | None = None, noise: str | None = None,
+    config: str | Path | None = None, max_steps: int | None = None, coverage_target: float | None = None,
 ) -> Explored:  # fmt: skip
     """Let an agent explore for one episode, write its files into ``out``, and return what came of it.
 

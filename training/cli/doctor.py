@@ -15,8 +15,8 @@ __all__ = ["doctor"]
 def doctor(as_json: Json = False) -> None:
     """Look what works on this machine, and say what to do where something does not.
 
-    Exits with 0 where `mecanum explore` has all it needs, else with 1. A line begins with ok, with FAILS, or with -
-    where something is missing that can be done without.
+    Exits with 0 where `mecanum explore` has all it needs, else with 1. A line begins with ok, with FAILS, or
+    with - where something is missing that can be done without.
 
     \b
     Examples:
