@@ -366,7 +366,8 @@ def test_the_site_builds_whole_and_loads_nothing_from_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hooks()
-    pytest.importorskip("material", reason="the site needs the extra `docs`: mkdocs-material is not installed")
+    for needed in ("material", "mkdocstrings"):
+        pytest.importorskip(needed, reason=f"the site needs the extra `docs`: {needed} is not installed")
     from mkdocs.commands.build import build
     from mkdocs.config import load_config
 
