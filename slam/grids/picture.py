@@ -15,7 +15,7 @@ __all__ = ["draw_known"]
 Array = NDArray[np.float64]
 
 _LONGEST_PX, _MARGIN_CELLS = 480, 8
-_UNSEEN = 225  # its tone; cells likely free are lighter, those likely occupied darker
+_UNSEEN = 175  # its tone: free cells are lighter from their first scan on, occupied ones darker
 _LANDMARK, _ROBOT = (30, 110, 230), (200, 90, 20)  # blue, green, red
 
 

@@ -20,14 +20,14 @@ def test_it_is_drawn_as_it_lies_with_y_upwards_and_cropped_to_what_is_known() ->
         row, col = (y + 8.0) / 0.1 - 92, (x + 5.0) / 0.1 - 92
         return list(map(int, image[int(image.shape[0] - row * scale), int(col * scale)]))
 
-    assert at(4.7, 1.5) == [225, 225, 225]  # nothing known
+    assert at(4.7, 1.5) == [175, 175, 175]  # nothing known
     free, wall = at(5.5, 2.3), at(5.5, 3.95)
-    assert min(free) > 225 > 60 > max(wall)
+    assert min(free) > 210 > 175 > 60 > max(wall)
     blue, _, red = at(8.0, 2.5)
     assert red > 150 > blue  # the landmark, orange
     blue, _, red = at(6.0, 3.0)
     assert blue > 150 > red  # the robot, blue
-    assert at(6.45, 3.0)[0] > 150 > at(6.45, 3.0)[2] and min(at(5.55, 3.0)) > 225  # it looks along x
+    assert at(6.45, 3.0)[0] > 150 > at(6.45, 3.0)[2] and min(at(5.55, 3.0)) > 210  # it looks along x
 
 
 def test_of_nothing_known_there_is_a_picture_too() -> None:
