@@ -13,7 +13,6 @@ import resource
 import shutil
 import subprocess
 import sys
-import sysconfig
 import tomllib
 import zipfile
 from pathlib import Path
@@ -106,7 +105,8 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     python = folder / "bin" / "python"
     site = Path(run(str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))").strip())
     run(sys.executable, "-m", "pip", "--python", str(python), "install", "--no-deps", "--no-index", str(wheel))
-    (site / "libraries.pth").write_text(sysconfig.get_path("purelib"), "utf-8")
+    libraries = [path for path in sys.path if path.endswith("site-packages")]
+    (site / "libraries.pth").write_text("\n".join(libraries), "utf-8")
     for name in files(site):
         shutil.copystat(ROOT / name, site / name)
         cache = (ROOT / name).parent / "__pycache__"
