@@ -89,8 +89,8 @@ def _packages() -> Answers:
 def _numba() -> Answers:
     from numba import njit
 
-    compiled = njit(_twice)(21)
-    yield {"works": compiled == 42, "found": "compiles", "remedy": "pip install --force-reinstall numba llvmlite"}
+    compiler: Any = njit
+    yield {"works": compiler(_twice)(21) == 42, "found": "compiles", "remedy": "pip install --force-reinstall numba llvmlite"}
 
 
 def _twice(x: int) -> int:
@@ -101,7 +101,7 @@ def _numba_cache() -> Answers:
     from slam.geometry import wrap_scalar
 
     # Numba's own word on where this kernel is kept; next to it are those of its file's neighbours.
-    folder = Path(wrap_scalar.stats.cache_path)
+    folder = Path(str(wrap_scalar.stats.cache_path))
     nearest = next(path for path in (folder, *folder.parents) if path.exists())
     writable = os.access(nearest, os.W_OK)
     root = Path(importlib.util.find_spec("slam").origin).parent  # type: ignore[union-attr, arg-type]

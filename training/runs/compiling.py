@@ -26,7 +26,7 @@ def compiling_shown(silent_s: float = 2.0, every_s: float = 10.0) -> Iterator[No
         return
     from numba.core import event
 
-    class Listener(event.Listener):  # type: ignore[misc]  # Numba has no types
+    class Listener(event.Listener):
         depth = kernels = 0
         began = spent_s = 0.0
         next_s = silent_s
