@@ -12,6 +12,6 @@ ENV NUMBA_CACHE_DIR=/home/robot/kernels
 USER robot
 WORKDIR /home/robot
 # Compiles the kernels into the image: the first episode then starts at once.
-RUN mecanum explore --rooms rectangular --out /tmp/warm && rm -r /tmp/warm
+RUN mecanum explore --agent ppo-frontier --rooms rectangular --out /tmp/warm && rm -r /tmp/warm
 ENTRYPOINT ["mecanum"]
 CMD ["explore", "--agent", "ppo-frontier", "--out", "/out"]
