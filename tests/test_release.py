@@ -97,8 +97,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The Python of an environment that has the wheel, and what it depends on, but not this checkout.
 
-    Of what is installed here the libraries are taken as they are; Numba's kernels, too, where they are compiled: it
-    goes by the source's date.
+    Of what is installed here the libraries are taken as they are; Numba's kernels, too, where they are compiled:
+    it goes by the source's date.
     """
     folder = tmp_path_factory.mktemp("installed")
     run(sys.executable, "-m", "venv", "--without-pip", str(folder))
@@ -138,7 +138,8 @@ def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
 def test_the_wheel_explores_on_its_own(installed: Path, tmp_path: Path) -> None:
     mecanum = installed.with_name("mecanum")
     assert run(str(mecanum), "--version").strip() == f"mecanum-slam {VERSION}"
-    where = run(str(installed), "-c", "import slam, training; print(slam.__file__, training.__file__)", cwd=tmp_path)
+    program = "import slam, training; print(slam.__file__, training.__file__)"
+    where = run(str(installed), "-c", program, cwd=tmp_path)
     assert where.count(str(installed.parents[1])) == 2 and str(ROOT) not in where
     run(str(mecanum), "explore", "--agent", "ppo-frontier", "--out", "here", cwd=tmp_path)
     assert (tmp_path / "here" / "metrics.json").is_file()

@@ -90,7 +90,11 @@ def _numba() -> Answers:
     from numba import njit
 
     compiler: Any = njit
-    yield {"works": compiler(_twice)(21) == 42, "found": "compiles", "remedy": "pip install --force-reinstall numba llvmlite"}
+    yield {
+        "works": compiler(_twice)(21) == 42,
+        "found": "compiles",
+        "remedy": "pip install --force-reinstall numba llvmlite",
+    }
 
 
 def _twice(x: int) -> int:
