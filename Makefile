@@ -19,7 +19,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium rllib monte-carlo evaluate benchmark docs speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium package rllib monte-carlo evaluate benchmark docs speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -31,7 +31,7 @@ $(VENV)/core.stamp: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test.stamp: $(VENV)/core.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,multi,human,video,ros,rerun,ray,parquet,docs]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,multi,human,video,ros,rerun,ray,parquet,docs,release]'
 	@touch $@
 
 $(OTHER).stamp: $(VENV)/test.stamp
@@ -57,7 +57,7 @@ explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and ma
 	@echo "  $(BIN)/mecanum explore --floor-plan office.yaml  a plan of your own: ROS map or image"
 	@echo "  $(BIN)/mecanum --help                            all else"
 
-test: lint types pytest other-gymnasium ## everything CI checks (WORKERS)
+test: lint types pytest other-gymnasium package ## everything CI checks (WORKERS)
 
 lint: $(VENV)/test.stamp ## ruff
 	$(BIN)/ruff check .
@@ -74,6 +74,10 @@ other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) $(API_TESTS)
+
+# After the tests: it takes over the kernels that they have compiled.
+package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and exploring
+	$(BIN)/python -m pytest -m release tests/test_release.py
 
 rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in CI: large)
 	$(RLLIB)/bin/python -m pytest tests/examples -k rllib

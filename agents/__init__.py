@@ -9,13 +9,13 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents.base import Agent, Goal
 from slam.settings import unknown_name
 
 if TYPE_CHECKING:
-    from agents.base import Agent
     from mecanum_env.config import LidarConfig, RobotConfig
 
-__all__ = ["check", "make", "names"]
+__all__ = ["Agent", "Goal", "check", "make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {

@@ -43,6 +43,7 @@ _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\(([^()\s]+)\)")
 _MATH = re.compile(r'<(span|div) class="arithmatex">(.*?)</\1>', re.DOTALL)
 # What opens, what closes, what parts an equation.
 _NESTING = re.compile(r"\\\\|\\[{}]|(\{|\\begin\b|\\left\b)|(\}|\\end\b|\\right\b)|(\\q?quad\b)")
+_ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):(?=<code>)")
 _SCHEME = re.compile(r"^[a-z][a-z0-9+.-]*:", re.IGNORECASE)
 
 
@@ -99,7 +100,7 @@ def on_page_content(content: str, *, page: Page, config: MkDocsConfig, files: Fi
             return found[0]
         return f'<div class="equation">{"".join(made)}</div>' if display else made[0]
 
-    return _MATH.sub(mathml, content)
+    return _MATH.sub(mathml, _ROLE.sub("", content).replace(" ::</p>", "</p>"))  # docstrings are no Markdown
 
 
 def slug(heading: str, separator: str = "-") -> str:

@@ -12,14 +12,21 @@ In a process that has not imported it, ``gym.make("mecanum_env:mecanum_env/Explo
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
 if TYPE_CHECKING:
+    from mecanum_env import rooms
+    from mecanum_env.config import EnvConfig, LidarConfig, NoiseConfig, RobotConfig, from_toml, to_toml
+    from mecanum_env.env import ExploreEnv
     from mecanum_env.team.parallel_env import ExploreParallelEnv
 
-__all__ = ["parallel_env", "register_envs"]
+__all__ = [
+    "EnvConfig", "ExploreEnv", "LidarConfig", "NoiseConfig", "RobotConfig", "from_toml", "parallel_env",
+    "register_envs", "rooms", "to_toml",
+]  # fmt: skip
 
 MAX_EPISODE_STEPS = 3000
 
@@ -46,6 +53,15 @@ def parallel_env(robots: int = 3, **settings: Any) -> ExploreParallelEnv:
     from mecanum_env.team.parallel_env import ExploreParallelEnv
 
     return ExploreParallelEnv(robots=robots, **settings)
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is public here when it is first asked for: registering the environments needs none of it."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "rooms":
+        return import_module("mecanum_env.rooms")
+    return getattr(import_module("mecanum_env.env" if name == "ExploreEnv" else "mecanum_env.config"), name)
 
 
 register_envs()

@@ -219,6 +219,16 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         return render_frame(self)
 
+    def _repr_png_(self) -> bytes | None:
+        """Return the frame that a notebook shows; before the first reset there is none."""
+        if not hasattr(self, "truth"):
+            return None
+        import cv2
+
+        from mecanum_env.views.render import render_frame
+
+        return bytes(cv2.imencode(".png", render_frame(self)[..., ::-1])[1])
+
     def close(self) -> None:
         """Close the window, if there is one."""
         self._viewer.close()

@@ -9,6 +9,7 @@ Nothing here knows of a simulator: the same backends run on the logs of real rob
     backend.belief.pose
 """
 
+from slam.backend import Backend, BackendConfig
 from slam.belief import Belief
 from slam.registry import config_type, make, names, register
 from slam.types import CONCAVE, CONVEX, LINE, Observations, Odometry, Scan
@@ -17,6 +18,8 @@ __all__ = [
     "CONCAVE",
     "CONVEX",
     "LINE",
+    "Backend",
+    "BackendConfig",
     "Belief",
     "Observations",
     "Odometry",

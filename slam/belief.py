@@ -107,6 +107,14 @@ class Belief:
                 getattr(self, name)
             object.__setattr__(self, "_read", None)
 
+    def _repr_png_(self) -> bytes:
+        """Return the picture that a notebook shows."""
+        import cv2
+
+        from slam.grids.picture import draw_known
+
+        return bytes(cv2.imencode(".png", draw_known(self.grid, self.landmarks, self.pose))[1])
+
     if not TYPE_CHECKING:  # to a type checker it would say that there is any attribute
 
         def __getattr__(self, name: str) -> Any:

@@ -11,6 +11,8 @@ from hypothesis import settings
 
 # Gymnasium's check_env tries every render mode: windows are drawn to memory, wherever the tests run.
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+# Tests look at every line of standard error: what they say must not depend on what is compiled already.
+os.environ.setdefault("MECANUM_COMPILING", "0")
 
 # A first call compiles its Numba kernel: a deadline would measure that.
 settings.register_profile("mecanum", deadline=None, derandomize=True, max_examples=60)

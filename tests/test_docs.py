@@ -138,7 +138,9 @@ def test_commands_parse(page: Path) -> None:
     extras = project["optional-dependencies"]
     for line, words in command_lines(page):
         where = f"{page.name}:{line}: {shlex.join(words)}"
-        if words[0] == "mecanum":
+        if words[0] == "mecanum" and words[1].startswith("--"):
+            assert words[1] in {option for parameter in cli().params for option in parameter.opts}, where
+        elif words[0] == "mecanum":
             command, arguments = command_of(words, where)
             try:
                 command.make_context(words[1], arguments)  # parses, and does not run
@@ -366,7 +368,8 @@ def test_the_site_builds_whole_and_loads_nothing_from_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hooks()
-    pytest.importorskip("material", reason="the site needs the extra `docs`: mkdocs-material is not installed")
+    for needed in ("material", "mkdocstrings"):
+        pytest.importorskip(needed, reason=f"the site needs the extra `docs`: {needed} is not installed")
     from mkdocs.commands.build import build
     from mkdocs.config import load_config
 

@@ -148,9 +148,10 @@ def _tamer_kin(twist: Array) -> Array:
     """Return what is tried for a twist ``(14, 3)``, in turn: slower, without its turn, turning only, sideways."""
     kin = np.zeros((14, 3))
     for k in range(5):
-        kin[k] = _SPEEDS[k] * twist
+        for i in range(3):
+            kin[k, i] = _SPEEDS[k] * twist[i]
     for k in range(4):
-        kin[5 + k, :2] = kin[k, :2]
+        kin[5 + k, 0], kin[5 + k, 1] = kin[k, 0], kin[k, 1]
     kin[9, 2] = twist[2]
     slow = _SIDESTEP_M_S * twist[:2] / max(math.hypot(twist[0], twist[1]), _SIDESTEP_M_S)
     for k in range(4):

@@ -200,7 +200,7 @@ def _bordering(
             if clearance[row, col] >= min_clearance:
                 if count == len(cells):
                     cells = np.concatenate((cells, np.empty_like(cells)))
-                cells[count] = row, col
+                cells[count, 0], cells[count, 1] = row, col
                 count += 1
     return cells[:count]
 
@@ -237,6 +237,6 @@ def _join(
                         labels[other] = count
                         stack[height] = other
                         height += 1
-        boxes[count] = high_r - low_r + 1, high_c - low_c + 1
+        boxes[count, 0], boxes[count, 1] = high_r - low_r + 1, high_c - low_c + 1
         count += 1
     return count

@@ -108,7 +108,8 @@ def drive_clear(
     rows, cols = clearance.shape
     circumscribed = math.sqrt(half_x * half_x + half_y * half_y)
     for step in range(steps):
-        undo[:] = state
+        for i in range(len(state)):
+            undo[i] = state[i]
         wheel_step(work, fixed, friction, h, substeps)
         # As pymunk does it: mean velocity first, then velocity times time.
         x, y = state[0] + motion[0] / dt * dt, state[1] + motion[1] / dt * dt
@@ -118,10 +119,12 @@ def drive_clear(
         row = math.floor((y - raster[1]) * raster[2])
         far = 0 <= row < rows and 0 <= col < cols and clearance[row, col] > circumscribed + travel
         if not far and not _box_is_clear(x, y, theta, half_x + travel, half_y + travel, segments, circles):
-            state[:] = undo
+            for i in range(len(state)):
+                state[i] = undo[i]
             steps = step
             break
         state[0], state[1], state[2] = x, y, theta
-        readings[step] = state[INCREMENTS]
+        for i in range(4):
+            readings[step, i] = state[INCREMENTS.start + i]
     wrapped[0], wrapped[1], wrapped[2] = state[0], state[1], wrap_scalar(state[2])
     return steps

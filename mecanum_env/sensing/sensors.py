@@ -228,7 +228,8 @@ def _read_encoders(
             turned = readings[step, k] - (readings[step - 1, k] if step else 0.0)
             measured[k] = to_speed * scale[k] * turned
         follow(body, before, measured, dt / count, traction, lost)
-        before[:] = measured
+        for k in range(4):
+            before[k] = measured[k]
     vx, vy, omega = twist[0], twist[1], twist[2]
     # The acceleration of a body whose axes turn with it.
     ahead = creep[0] * ((vx - last[0]) / dt - omega * vy)

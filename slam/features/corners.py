@@ -208,7 +208,8 @@ def walls_first(
         count += 1
     for k in range(corners.shape[0]):
         row = out[count]
-        row[:] = corners[k]
+        for j in range(row.shape[0]):
+            row[j] = corners[k, j]
         one, two = int(corners[k, 8]), int(corners[k, 9])
         first = _is_wall(lines[one], length, points)
         second = two >= 0 and _is_wall(lines[two], length, points)

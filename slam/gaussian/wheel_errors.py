@@ -97,4 +97,6 @@ def _predict(
         for r in range(q, 3):
             for i in range(_STATES):
                 p[q, r] += d[q, i] * (cross[i, r] + ed[i, r]) + cross[i, q] * d[r, i]
-    cross[:, :3] += ed
+    for i in range(cross.shape[0]):
+        for q in range(3):
+            cross[i, q] += ed[i, q]

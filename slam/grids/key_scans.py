@@ -167,8 +167,8 @@ def _hang(
     anchor_ids: NDArray[np.int64], anchor_local: Array,
 ) -> None:  # fmt: skip
     """Write the n-th key scan's pose, and its landmarks in that pose's frame."""
-    poses[n] = sensor_pose
     x, y, theta = sensor_pose
+    poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
     c, s = math.cos(theta), math.sin(theta)
     for k in range(min(ids.shape[0], anchor_ids.shape[1])):
         anchor_ids[n, k] = ids[k]

@@ -317,7 +317,8 @@ def _sightings(
     for i in range(n):
         if tentative[i, _AGE] <= forget_after:
             if kept != i:
-                tentative[kept] = tentative[i]
+                for j in range(tentative.shape[1]):
+                    tentative[kept, j] = tentative[i, j]
             kept += 1
     return found, kept
 

@@ -70,7 +70,8 @@ def joint_compatibility(
         hopeless = hope < best_pairs or (hope == best_pairs and nis[pairs] >= best_nis)
         if k == m and not hopeless:
             best_pairs, best_nis = pairs, nis[pairs]
-            match[:] = chosen
+            for i in range(m):
+                match[i] = chosen[i]
         if k == m or hopeless or option[k] > count[k]:
             if k == 0:
                 break

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from training.cli.benchmark import benchmark
+from training.cli.doctor import doctor
 from training.cli.explore import explore
 from training.cli.measures import complexity, consistency, speed
 from training.cli.play import play
@@ -33,7 +34,6 @@ _ClickException: type[Exception] = next(c for c in typer.BadParameter.__mro__ if
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # plain help needs no rich, and shows the examples as they are typed
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -70,7 +70,7 @@ def _root(
     """  # noqa: D301
 
 
-for command in (explore, rooms, speed, consistency, complexity, replay, benchmark, train, play, policy):
+for command in (explore, rooms, speed, consistency, complexity, replay, benchmark, train, play, policy, doctor):
     app.command(cls=Command)(command)
 # A study's options are its own: what follows the name is handed on as it was typed.
 app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from training.runs.compiling import compiling_shown
 from training.runs.errors import BadInput
 
 if TYPE_CHECKING:
@@ -70,7 +71,12 @@ Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  
 
 
 class Command(TyperCommand):
-    """A command whose ``--ray`` may stand without an address, which Typer does not offer."""
+    """A command that says when its kernels compile, and whose ``--ray`` may stand without an address."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        with compiling_shown():
+            return super().invoke(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put in the address that is meant, then parse."""

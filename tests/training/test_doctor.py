@@ -1,0 +1,99 @@
+"""``mecanum doctor``: it finds what is there, and names the remedy where something is not."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from training import doctor
+from training.cli import main
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_here_an_episode_has_all_it_needs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "_ask", lambda program: "")  # no other process here: the two have their own test
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert {"python", "packages", "numba", "policies", "disk", "cache", "browser", "gpu"} <= {
+        line.split()[1] for line in lines if not line.startswith(" ")
+    }
+    assert main(["doctor", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["ok"] is True
+    assert all(f["works"] or f["remedy"] for f in said["findings"]), "what does not work has a remedy"
+
+
+def test_a_package_that_is_missing_or_too_old_fails_and_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "_ask", lambda program: "")
+    asked = [
+        Requirement("numpy>=99"),
+        Requirement("no-such-package-anywhere>=1"),
+        Requirement('rich>=1; extra == "x"'),
+    ]
+    monkeypatch.setattr(doctor, "_requirements", lambda: asked)
+    assert main(["doctor"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (line,) = [i for i, text in enumerate(lines) if text.startswith("FAILS")]
+    version = importlib.metadata.version("numpy")
+    assert f"numpy {version}, wanted >=99; no-such-package-anywhere is missing" in lines[line]
+    assert lines[line + 1].strip() == "pip install --upgrade mecanum-slam"
+    assert any(re.fullmatch(r"ok +extra +x: there", text) for text in lines)
+
+
+def test_what_breaks_is_a_finding_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> doctor.Answers:
+        raise OSError("no\nway")
+        yield {}
+
+    monkeypatch.setattr(doctor, "_CHECKS", (("thing", True, broken), ("other", False, broken)))
+    needed, other = doctor.examine()
+    assert needed.found == "OSError: no way" and needed.remedy and not needed.ok
+    assert other.ok and not other.works
+
+
+def test_the_cache_is_where_numba_says(tmp_path: Path) -> None:
+    code = "from training import doctor; print(*doctor._numba_cache())"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert "empty: the first episode compiles its kernels" in done.stdout
+    assert str(tmp_path / "kernels") in done.stdout
+
+
+def test_a_program_apart_that_fails_or_hangs_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor._ask("print('first'); print('x11')") == "x11"
+    assert doctor._ask("import no_such_module") == ""
+    monkeypatch.setattr(doctor, "_ASKED_S", 0.05)
+    assert doctor._ask("import time; time.sleep(60)") == ""
+
+
+@pytest.mark.parametrize(
+    ("shell", "words"),
+    [("bash", "complete -o default"), ("zsh", "#compdef mecanum"), ("fish", "complete --command")],
+)
+def test_completion_of_the_shell(shell: str, words: str) -> None:
+    assert words in run(_MECANUM_COMPLETE=f"source_{shell}")
+    if shell == "bash":
+        completed = run(_MECANUM_COMPLETE="complete_bash", COMP_WORDS="mecanum ex", COMP_CWORD="1")
+        assert completed.split() == ["explore"]
+        assert "--install-completion" in run("--help")
+
+
+def run(*arguments: str, **variables: str) -> str:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)} | variables
+    command = [sys.executable, "-m", "training.cli", *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
