@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol, TypeVar
 
 from mecanum_env.rooms.floor_plan import FloorPlan
-from slam.settings import from_mapping, unknown_name
+from slam.settings import check_name, from_mapping
 
 __all__ = ["Generator", "make", "names", "register"]
 
@@ -44,8 +44,7 @@ def names() -> tuple[str, ...]:
 
 def check(name: str, config: Mapping[str, Any] | Any | None = None) -> Any:
     """Return a generator's whole config, or raise the ``ValueError`` for an unknown name or key."""
-    if name not in _GENERATORS:
-        raise unknown_name("rooms", name, _GENERATORS)
+    check_name("rooms", name, _GENERATORS)
     return from_mapping(_GENERATORS[name][1], config)
 
 

@@ -17,7 +17,7 @@ from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
 from mecanum_env.sensing.calibration import odometry_noise
 from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit
 from slam.motion import OdometryNoise
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
 from training.runs.options import Json, Seed
@@ -84,8 +84,7 @@ def study(
     presets = list(dict.fromkeys(noise.split(",")))
     with bad_input():
         for preset in presets:
-            if preset not in NOISE_PRESETS:
-                raise unknown_name("noise preset", preset, NOISE_PRESETS)
+            check_name("noise preset", preset, NOISE_PRESETS)
     results = {}
     for preset in presets:
         print(f"driving {preset} …", file=sys.stderr)

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 
 from mecanum_env.rooms.layout.furniture import Box, cells
-from mecanum_env.rooms.layout.limits import interval
-from slam.settings import shares
+from slam.settings import Config, Share, Span
 
 __all__ = ["ApartmentConfig", "Door", "Layout", "draw_layout"]
 
@@ -24,25 +24,19 @@ _DOOR_EDGE = 4  # 0.2 m: least wall between a door and the room's corner
 
 
 @dataclass(frozen=True, kw_only=True)
-class ApartmentConfig:
+class ApartmentConfig(Config):
     """Limits between which a flat is drawn, by seed."""
 
-    area_m2: tuple[float, float] = (70.0, 130.0)  # floor between the walls, furniture included
-    rooms: tuple[int, int] = (5, 8)
-    corridor_m: tuple[float, float] = (1.2, 1.8)
-    door_m: tuple[float, float] = (0.9, 1.2)
-    wall_m: tuple[float, float] = (0.1, 0.2)
-    links: float = 0.35  # probability of a door between two neighbouring rooms; there is always one
-    furniture: float = 0.75  # 0 empty rooms, 1 as full as can be driven through
-
-    def __post_init__(self) -> None:
-        interval(self, "area_m2", low=60.0, high=200.0)
-        interval(self, "rooms", low=4, high=12, whole=True)
-        interval(self, "corridor_m", low=1.1, high=3.0)
-        # Below 0.9 m the disc that must get everywhere does not pass on the lattice.
-        interval(self, "door_m", low=0.9, high=1.6)
-        interval(self, "wall_m", low=0.1, high=0.5)
-        shares(self, "links", "furniture")
+    area_m2: Annotated[tuple[float, float], Span("[60, 200]")] = (
+        70.0,
+        130.0,
+    )  # floor between the walls, furniture included
+    rooms: Annotated[tuple[int, int], Span("[4, 12]")] = (5, 8)
+    corridor_m: Annotated[tuple[float, float], Span("[1.1, 3]")] = (1.2, 1.8)
+    door_m: Annotated[tuple[float, float], Span("[0.9, 1.6]")] = (0.9, 1.2)
+    wall_m: Annotated[tuple[float, float], Span("[0.1, 0.5]")] = (0.1, 0.2)
+    links: Share = 0.35  # probability of a door between two neighbouring rooms; there is always one
+    furniture: Share = 0.75  # 0 empty rooms, 1 as full as can be driven through
 
 
 @dataclass(frozen=True, slots=True)
