@@ -87,7 +87,10 @@ class ActiveConfig(TourConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.firm_share < self.slippery_share, "ActiveConfig needs firm_share < slippery_share")
+        require(
+            self.firm_share < self.slippery_share,
+            f"ActiveConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
+        )
 
 
 class ActiveSlam(Tour):

@@ -188,9 +188,15 @@ class EnvConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.physics_step_s <= self.step_s, "EnvConfig.physics_step_s must not be above step_s")
+        require(
+            self.physics_step_s <= self.step_s,
+            f"EnvConfig.physics_step_s must be at most step_s, {self.step_s}, got {self.physics_step_s}",
+        )
         substeps = self.step_s / self.physics_step_s
-        require(abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s")
+        require(
+            abs(substeps - round(substeps)) < 1e-6,
+            f"EnvConfig.step_s must be a multiple of physics_step_s, {self.physics_step_s}, got {self.step_s}",
+        )
         for name in ("rooms_config", "slam_config", "odometry_filter_config"):
             object.__setattr__(self, name, _plain(getattr(self, name)))
 

@@ -31,7 +31,10 @@ class SlipConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.firm_share < self.slippery_share, "SlipConfig needs firm_share < slippery_share")
+        require(
+            self.firm_share < self.slippery_share,
+            f"SlipConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
+        )
 
     def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
         """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
@@ -48,7 +51,10 @@ class ChooserConfig(TourConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.stations.spacing_m == 0, "ChooserConfig.stations.spacing_m must be 0: it drives anywhere")
+        require(
+            self.stations.spacing_m == 0,
+            f"ChooserConfig.stations.spacing_m must be 0, as it drives anywhere, got {self.stations.spacing_m}",
+        )
 
 
 class Chooser(Tour):

@@ -29,7 +29,10 @@ class RectangularConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.turned + self.round <= 1, "RectangularConfig needs turned + round ≤ 1")
+        require(
+            self.turned + self.round <= 1,
+            f"RectangularConfig needs turned + round ≤ 1, got {self.turned} + {self.round}",
+        )
 
 
 def rectangular(config: RectangularConfig, *, seed: int) -> FloorPlan:

@@ -72,4 +72,8 @@ class TeamConfig(Config):
         super().__post_init__()
         joint = self.belief == "joint"
         all_known = self.known_starts and self.communication.model == "unlimited"
-        require(not joint or all_known, "TeamConfig.belief joint needs known_starts and unlimited communication")
+        require(
+            not joint or all_known,
+            "TeamConfig.belief joint needs known_starts and unlimited communication, got "
+            f"{self.known_starts} and {self.communication.model}",
+        )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 from slam.backend import BackendConfig
 from slam.graph.loop_closing import ClosingConfig
 from slam.grids.scan_matching import MatchConfig
-from slam.settings import Angle, Gap, Length, NotNegative, Within
+from slam.settings import Angle, Gap, Length, NotNegative, Within, argument
 
 __all__ = ["GraphSlamConfig"]
 
@@ -35,3 +35,8 @@ class GraphSlamConfig(BackendConfig):
     closing: ClosingConfig = field(default_factory=ClosingConfig)
     # Patches farther from the robot than a beam of it reaches, and so much more, leave the window.
     beyond_m: Gap = 2.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        with argument("GraphSlamConfig.closing.farthest_m and farthest_rad"):
+            replace(self.matching, window_m=self.closing.farthest_m, window_rad=self.closing.farthest_rad)

@@ -29,6 +29,7 @@ __all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "r
 Array = NDArray[np.float64]
 Values = NDArray[np.float32]
 
+_MOST_PLACES = 2_000_000  # of one search: some seconds
 _MARGIN_M = 1.0  # of a field around its points
 _PHASES = 8  # sub-cell positions a side at which a surface point is drawn
 _FLAT_INFO = 1e-3  # [1/m², 1/rad²] added so that a featureless scan still has a (very wide) covariance
@@ -39,7 +40,7 @@ class MatchConfig(Config):
     """The field, the window of the search, and how much a beam is believed."""
 
     cell_m: Annotated[float, Within("[0.01, 1]")] = 0.05
-    smooth_m: Annotated[float, Within("[0.01, 10]")] = 0.1  # s: reach of a surface in the field
+    smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.1  # s: reach of a surface in the field
     window_m: Annotated[float, Within("[0, 10]")] = 0.3  # the search goes as far as this to either side …
     window_rad: Annotated[float, Within("[0, 3.2]")] = 0.25
     step_rad: Annotated[float, Within("[0.001, 3.2]")] = 0.0125  # … in steps of one cell and of this
@@ -52,7 +53,16 @@ class MatchConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.smooth_m >= self.cell_m, "MatchConfig.smooth_m must be at least MatchConfig.cell_m")
+        require(
+            self.smooth_m >= self.cell_m,
+            f"MatchConfig.smooth_m must be at least cell_m, {self.cell_m}, got {self.smooth_m}",
+        )
+        places = (2 * self.window_m / self.cell_m + 1) ** 2 * (2 * self.window_rad / self.step_rad + 1)
+        require(
+            places <= _MOST_PLACES,
+            f"MatchConfig.window_m, window_rad, cell_m and step_rad make {places:.0f} places to search; at most "
+            f"{_MOST_PLACES} are allowed",
+        )
 
     @property
     def gain(self) -> float:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from slam.health.evidence import Agreement
-from slam.settings import Config, Count, Finite, Gap, Length, NotNegative, Share, Within, require
+from slam.settings import Config, Count, Finite, Gap, Length, Share, Within, require
 
 __all__ = ["HealthConfig", "HealthMonitor"]
 
@@ -42,7 +42,7 @@ class HealthConfig(Config):
     sharp_fine: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.01, 0.06, 0.20, 0.30, 0.43)
     sharp_lost: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.35, 0.30, 0.20, 0.10, 0.05)
     # Scans one after the other err together: each counts as this part of one.
-    scan_weight: NotNegative = 0.3
+    scan_weight: Annotated[float, Within("[0, 10]")] = 0.3
     # how likely a robot gets lost from one scan to the next
     lost_per_scan: Annotated[float, Within("[1e-9, 1)")] = 1e-5
     blur_m: Length = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
@@ -66,7 +66,7 @@ class HealthConfig(Config):
             for state in ("fine", "lost"):
                 values = getattr(self, f"{name}_{state}")
                 require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values, got {len(values)}")
-        require(self.give_up < self.found, "HealthConfig needs give_up < found")
+        require(self.give_up < self.found, f"HealthConfig.give_up {self.give_up} must be below found {self.found}")
 
 
 _LEAST_ODDS = 2e-5  # of being lost

@@ -71,7 +71,7 @@ class RelocalisationConfig(Config):
     # scans in a row that do not speak against where the wheels have it, to go on from there
     unopposed: Annotated[int, Within("[1, 1000000]")] = 30
     # reach of a surface when a place is refined last
-    sharp_smooth_m: Annotated[float, Within("[0.01, 10]")] = 0.05
+    sharp_smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     matching: MatchConfig = field(
         default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01)
     )
@@ -81,7 +81,13 @@ class RelocalisationConfig(Config):
         stages = len(self.radii_m)
         require(
             stages >= 1 and len(self.scans_each) == stages - 1 and len(self.every) == stages,
-            "RelocalisationConfig needs one of every and, but for the last, of scans_each for each of radii_m",
+            "RelocalisationConfig needs one of every and, but the last, of scans_each for each of radii_m, got "
+            f"{len(self.every)}, {len(self.scans_each)} and {stages}",
+        )
+        require(
+            self.sharp_smooth_m >= self.matching.cell_m,
+            f"RelocalisationConfig.sharp_smooth_m must be at least matching.cell_m, {self.matching.cell_m}, got "
+            f"{self.sharp_smooth_m}",
         )
 
 

@@ -239,20 +239,22 @@ def _resume(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer) ->
 
 def study(
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
-    rounds: Annotated[int, typer.Option(min=1, help="Of lessons, each driven by what was learned before.")] = 2,
+    rounds: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Of lessons, each driven by what was learned before.")
+    ] = 2,
     plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the first round, seeds 0 ….")] = 1000,
     later_plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the others, seeds 0 ….")] = 380,
-    validation_plans: Annotated[int, typer.Option(min=1, help=f"Seeds {_VALIDATION} ….")] = 60,
-    epochs: Annotated[int, typer.Option(min=1)] = 12,
-    batch: Annotated[int, typer.Option(min=1)] = 64,
-    rate: Annotated[float, typer.Option(help="Of learning.")] = 1.5e-3,
-    weight_decay: Annotated[float, typer.Option()] = 1e-2,
+    validation_plans: Annotated[int, typer.Option(min=1, max=1_000_000, help=f"Seeds {_VALIDATION} ….")] = 60,
+    epochs: Annotated[int, typer.Option(min=1, max=1_000_000)] = 12,
+    batch: Annotated[int, typer.Option(min=1, max=1_000_000)] = 64,
+    rate: Annotated[float, typer.Option(min=1e-9, max=1, help="Of learning.")] = 1.5e-3,
+    weight_decay: Annotated[float, typer.Option(min=0, max=1)] = 1e-2,
     untold: Annotated[
         float, typer.Option(min=0, max=1, help="Share of lessons that do not tell how far the plan extends.")
     ] = 0.125,
-    free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that gather lessons.")] = 1,
+    free_weight: Annotated[float, typer.Option(min=0, max=1e6, help="Of foreseeing what is free.")] = 0.3,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes that gather lessons.")] = 1,
     ray: Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""

@@ -75,8 +75,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def study(
     noise: Annotated[str, typer.Option(help="Noise presets, separated by commas.")] = "nominal,slippery,cavity",
-    episodes: Annotated[int, typer.Option(min=1, help="Drives of a preset.")] = 60,
-    steps: Annotated[int, typer.Option(min=10, help="Of a drive.")] = 400,
+    episodes: Annotated[int, typer.Option(min=1, max=1_000_000, help="Drives of a preset.")] = 60,
+    steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Of a drive.")] = 400,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
