@@ -84,6 +84,8 @@ def make_config(
         require(isinstance(floor_plan, str | Path), f"floor_plan must be a path, got {shown(floor_plan)}")
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
+    plan = made.floor_plan
+    require(plan is None or Path(plan).is_file(), f"floor_plan must be a file that exists, got {shown(plan)}")
     with argument("rooms" if "rooms_config" in changes else "rooms_config"):
         check_rooms(made.rooms, made.rooms_config)
     with argument("slam" if "slam_config" in changes else "slam_config"):

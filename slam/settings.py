@@ -95,7 +95,7 @@ Seed = Annotated[int, Within("[0, 2147483647]")]
 
 
 class SettingError(ValueError):
-    """A setting that is not allowed: the class it was given to, its path in there, and what is wrong with it."""
+    """A setting that is not allowed: the class or argument it is of, its path in there, what is wrong with it."""
 
     def __init__(self, owner: str, path: str, problem: str) -> None:
         super().__init__(owner, path, problem)
@@ -197,7 +197,7 @@ def argument(name: str) -> Iterator[None]:
     try:
         yield
     except SettingError as error:
-        raise ValueError(f"{name}.{error.path} {error.problem}") from error
+        raise SettingError(name, error.path, error.problem) from error
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
@@ -226,7 +226,8 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
         return cls() if base is None else base
     if not isinstance(values, Mapping):
         raise ValueError(f"{cls.__name__} takes a mapping or a {cls.__name__}, not {shown(values)}")
-    names = [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    names = [f.name for f in fields]
     hints = get_type_hints(cls) if base is not None else {}
     changes: dict[str, Any] = {}
     for key, value in values.items():
@@ -239,6 +240,10 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
             except ValueError as error:
                 raise _located(error, cls.__name__, key) from None
         changes[key] = value
+    missing = [
+        f.name for f in fields if f.default is dataclasses.MISSING is f.default_factory and f.name not in changes
+    ]
+    require(base is not None or not missing, f"{cls.__name__} needs {', '.join(missing)}")
     return cls(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
 
 
@@ -328,8 +333,13 @@ def _name(mark: OneOf) -> _Kind:
 def _number(cls: type[int | float], bounds: Within) -> _Kind:
     def convert(value: Any) -> Any:
         value = _plain(value)
-        good = isinstance(value, (int, cls)) and not isinstance(value, bool) and value in bounds
-        return cls(value) if good else None
+        if not isinstance(value, (int, cls)) or isinstance(value, bool):
+            return None
+        try:
+            number = cls(value)
+        except OverflowError:  # a whole number that no float holds
+            return None
+        return number if number in bounds else None
 
     return _Kind(f"{'' if cls is float else 'a whole number '}in {bounds.interval}", convert)
 

@@ -65,7 +65,10 @@ class HealthConfig(Config):
             bins = len(getattr(self, f"{name}_edges")) + 1
             for state in ("fine", "lost"):
                 values = getattr(self, f"{name}_{state}")
-                require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values, got {len(values)}")
+                require(
+                    len(values) == bins,
+                    f"HealthConfig.{name}_{state} must hold one more than {name}_edges, got {len(values)} values",
+                )
         require(self.give_up < self.found, f"HealthConfig.give_up {self.give_up} must be below found {self.found}")
 
 

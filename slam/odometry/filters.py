@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import MODELS, make_model
 from slam.odometry.riccati import Rules, Tolerances, Workspace, advance
-from slam.settings import Config, NotNegative, OneOf, Within, check_name, from_mapping
+from slam.settings import Config, NotNegative, OneOf, Within, argument, check_name, from_mapping
 from slam.types import Odometry
 
 __all__ = ["ODOMETRY_FILTERS", "OdometryFilter", "OdometryFilterConfig", "make_odometry_filter"]
@@ -148,4 +148,5 @@ def make_odometry_filter(
         if config:
             raise ValueError('the odometry filter "none" has no settings; name "differential-transform" with them')
         return None
-    return OdometryFilter(from_mapping(OdometryFilterConfig, config))
+    with argument("config"):
+        return OdometryFilter(from_mapping(OdometryFilterConfig, config))

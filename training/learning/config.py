@@ -49,8 +49,8 @@ class RoomsConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(len(self.rooms) > 0, "RoomsConfig.rooms must name some")
-        check_names("rooms", self.rooms, room_registry.names())
+        require(len(self.rooms) > 0, f"{type(self).__name__}.rooms must name some")
+        check_names(f"{type(self).__name__}.rooms", self.rooms, room_registry.names())
 
     @property
     def reward(self) -> dict[str, float]:
@@ -70,8 +70,8 @@ class WorldConfig(RoomsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(len(self.noises) > 0, "WorldConfig.noises must name some")
-        check_names("noise preset", self.noises, NOISE_PRESETS)
+        require(len(self.noises) > 0, f"{type(self).__name__}.noises must name some")
+        check_names(f"{type(self).__name__}.noises", self.noises, NOISE_PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,7 @@ class DriveWorldConfig(RoomsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_names("noise preset", [self.noise], NOISE_PRESETS)
+        check_names(f"{type(self).__name__}.noise", [self.noise], NOISE_PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)
