@@ -59,8 +59,8 @@ class Agent(ABC):
         lidar: LidarConfig | Mapping[str, Any] | str | None = None,
         step_s: float = 0.1,
     ) -> None:
-        self._robot = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
-        self._lidar = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
+        self._robot = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot preset")
+        self._lidar = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar preset")
         self._step_s: float = checked("step_s", StepTime, step_s)
         with argument("config"):
             self.config = config if self.config_type is None else from_mapping(self.config_type, config)

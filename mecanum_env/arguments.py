@@ -76,7 +76,7 @@ def make_config(
     if lidar is not None:
         changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
     if noise is not None:
-        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise")
+        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
     if reward is not None:
         with argument("reward"):
             changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
@@ -85,7 +85,9 @@ def make_config(
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
     plan = made.floor_plan
-    require(plan is None or Path(plan).is_file(), f"floor_plan must be a file that exists, got {shown(plan)}")
+    require(
+        plan is None or Path(plan).is_file(), f"floor_plan {plan} does not exist, or is no file; check the path"
+    )
     with argument("rooms" if "rooms_config" in changes else "rooms_config"):
         check_rooms(made.rooms, made.rooms_config)
     with argument("slam" if "slam_config" in changes else "slam_config"):
