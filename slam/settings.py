@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -94,6 +94,9 @@ Count = Annotated[int, Within("[1, 10000]")]
 Seed = Annotated[int, Within("[0, 2147483647]")]
 
 
+_ANY_NUMBER = Within("[-inf, inf]")
+
+
 class SettingError(ValueError):
     """A setting that is not allowed: the class or argument it is of, its path in there, what is wrong with it."""
 
@@ -108,8 +111,8 @@ class SettingError(ValueError):
 class _NotAllowed(ValueError):
     """A value is none of its kind: the message says what is."""
 
-    def __init__(self, kind: str, value: object) -> None:
-        super().__init__(f"must be {kind}, got {shown(value)}")
+    def __init__(self, kind: _Kind, value: object) -> None:
+        super().__init__(f"must be {kind.text}, got {shown(value)}{_suggestion(value, kind.names)}")
 
 
 class _Kind(NamedTuple):
@@ -118,6 +121,7 @@ class _Kind(NamedTuple):
     text: str
     convert: Callable[[Any], Any]
     optional: bool = False  # None stands for itself
+    names: tuple[str, ...] = ()
 
     def take(self, value: Any) -> Any:
         """Return the value as it is kept; ``_NotAllowed`` where it is not of the kind."""
@@ -125,7 +129,7 @@ class _Kind(NamedTuple):
             return None
         kept = self.convert(value)
         if kept is None:
-            raise _NotAllowed(self.text, value)
+            raise _NotAllowed(self, value)
         return kept
 
 
@@ -157,9 +161,12 @@ class Config:
 def unknown_name(what: str, name: object, valid: Iterable[str]) -> ValueError:
     """Return the error for a name that is not registered: one line that lists the valid ones."""
     names = sorted(valid)
-    close = difflib.get_close_matches(str(name), names, n=1) if isinstance(name, str) else []
-    hint = f" (did you mean {close[0]!r}?)" if close else ""
-    return ValueError(f"unknown {what} {shown(name)}{hint}; valid: {', '.join(names)}")
+    return ValueError(f"unknown {what} {shown(name)}{_suggestion(name, names)}; valid: {', '.join(names)}")
+
+
+def _suggestion(name: object, valid: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, valid, n=1) if isinstance(name, str) else []
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def check_name(what: str, name: object, valid: Iterable[str]) -> None:
@@ -234,16 +241,17 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
         if key not in names:
             raise unknown_name(f"key of {cls.__name__}", key, names)
         inner = _config_of(hints.get(key))
-        if inner is not None and isinstance(value, Mapping):
-            try:
+        try:
+            if inner is not None and isinstance(value, Mapping):
                 value = from_mapping(inner, value, base=getattr(base, key))
-            except ValueError as error:
-                raise _located(error, cls.__name__, key) from None
+            if not issubclass(cls, Config):  # a dataclass of somebody's own, which does not look itself
+                value = _kinds(cls)[key].take(value)
+        except ValueError as error:
+            raise _located(error, cls.__name__, key) from None
         changes[key] = value
-    missing = [
-        f.name for f in fields if f.default is dataclasses.MISSING is f.default_factory and f.name not in changes
-    ]
-    require(base is not None or not missing, f"{cls.__name__} needs {', '.join(missing)}")
+    lacking = [f.name for f in fields if f.default is dataclasses.MISSING is f.default_factory]
+    missing = [name for name in lacking if base is None and name not in changes]
+    require(not missing, f"{cls.__name__} needs {', '.join(missing)}")
     return cls(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
 
 
@@ -281,10 +289,10 @@ def _kinds(cls: Any) -> dict[str, _Kind]:
     return {f.name: _kind(hints[f.name]) for f in dataclasses.fields(cls)}
 
 
-def _config_of(hint: Any) -> type[Config] | None:
+def _config_of(hint: Any) -> type[Any] | None:
     """Return the configuration that a field of this annotation holds, if any."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    return next((o for o in options if isinstance(o, type) and issubclass(o, Config)), None)
+    return next((o for o in options if isinstance(o, type) and dataclasses.is_dataclass(o)), None)
 
 
 @cache
@@ -293,21 +301,22 @@ def _kind(hint: Any, mark: Within | OneOf | None = None) -> _Kind:
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _kind(parts[0], parts[1])
-    if origin in (Union, UnionType):
-        (inner,) = (part for part in parts if part is not type(None))
-        kind = _kind(inner, mark)
+    if origin in (Union, UnionType) and len(parts) == 2 and type(None) in parts:
+        kind = _kind(parts[0] if parts[1] is type(None) else parts[1], mark)
         return _Kind(f"{kind.text}, or None", kind.convert, optional=True)
     if origin is tuple:
         return _tuple(_kind(parts[0], mark), None if parts[-1] is Ellipsis else len(parts), isinstance(mark, Span))
     if hint in (int, float):
-        return _number(hint, mark) if isinstance(mark, Within) else _number(hint, Within("(-inf, inf)"))
+        return _number(hint, mark if isinstance(mark, Within) else _ANY_NUMBER)
     if hint is str:
         return _name(mark) if isinstance(mark, OneOf) else _instance("a string", str)
     if hint is bool:
         return _instance("True or False", bool)
-    if issubclass(origin or hint, Mapping):
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return _config(hint)
+    if isinstance(origin, type) and issubclass(origin, Mapping):
         return _instance("a mapping", Mapping)
-    return _config(hint)
+    return _Kind("anything", lambda value: value, optional=True)
 
 
 def _plain(value: Any) -> Any:
@@ -327,6 +336,7 @@ def _name(mark: OneOf) -> _Kind:
     return _Kind(
         f"one of {', '.join(mark.names)}",
         lambda value: value if isinstance(value, str) and value in mark.names else None,
+        names=mark.names,
     )
 
 
@@ -341,6 +351,8 @@ def _number(cls: type[int | float], bounds: Within) -> _Kind:
             return None
         return number if number in bounds else None
 
+    if bounds == _ANY_NUMBER:
+        return _Kind("a number" if cls is float else "a whole number", convert)
     return _Kind(f"{'' if cls is float else 'a whole number '}in {bounds.interval}", convert)
 
 
@@ -352,11 +364,11 @@ def _tuple(each: _Kind, length: int | None, rising: bool) -> _Kind:
         kept = tuple(map(each.convert, value))
         return None if None in kept or (rising and kept[0] > kept[1]) else kept
 
-    text = f"a list of {'any number of' if length is None else length}, each {each.text}"
+    text = f"a list{'' if length is None else f' of {length}'}, each {each.text}"
     return _Kind(f"{text}, the least first" if rising else text, convert)
 
 
-def _config(cls: type[Config]) -> _Kind:
+def _config(cls: type[Any]) -> _Kind:
     return _Kind(
         f"a mapping or a {cls.__name__}",
         lambda value: from_mapping(cls, value) if isinstance(value, (Mapping, cls, type(None))) else None,

@@ -411,3 +411,19 @@ def test_an_option_out_of_bounds_is_one_line(words: list[str], capsys: pytest.Ca
     assert main(words) == 2
     said = capsys.readouterr().err
     assert words[1] in said and words[2] in said and said.count("\n") == 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Plain:
+    """A configuration of somebody else's, without bounds."""
+
+    speed: float = 1.0
+    name: int | str = "a"
+    seeds: tuple[int, ...] = ()
+
+
+def test_a_dataclass_of_ones_own_is_held_to_its_types() -> None:
+    assert repr(from_mapping(Plain, {"speed": 2, "seeds": [1, 2]})) == "Plain(speed=2.0, name='a', seeds=(1, 2))"
+    for key, value in (("speed", True), ("speed", "2"), ("speed", math.nan), ("seeds", [1.5]), ("seeds", 3)):
+        with pytest.raises(ValueError, match=f"^Plain.{key} must be "):
+            from_mapping(Plain, {key: value})
