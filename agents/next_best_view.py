@@ -44,7 +44,7 @@ class NextBestViewConfig(ExplorerConfig):
     range_m: Length = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
     depth_m: Length = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
     spacing_m: Annotated[float, Within("[0.05, 1000]")] = 0.4  # of the lattice of places
-    # places weighed in one choice; beyond that so many drawn from the lattice
+    # Places weighed in one choice; beyond that so many drawn from the lattice.
     samples: Annotated[int, Within("[0, 10000]")] = 200
     switch_share: NotNegative = 0.2  # another place must be worth more by this share to be worth turning round
 

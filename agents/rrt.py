@@ -43,7 +43,7 @@ class RrtConfig(ExplorerConfig):
     capacity: Annotated[int, Within("[1, 100000]")] = 4000  # nodes of the global tree
     bandwidth_m: Length = 0.5  # of the mean shift
     near_piece_m: Length = 0.8  # a frontier point farther than this from every piece has been seen since
-    # information gain: the unknown in view within this
+    # Information gain: the unknown in view within this.
     gain_radius_m: Annotated[float, Within("[0.05, 50]")] = 2.0
     min_gain_m2: NotNegative = 0.1  # frontier points with less in view are dropped
     weight_m_m2: NotNegative = 1.0  # λ: weighted metres that a square metre of gain is worth

@@ -39,7 +39,7 @@ class TourConfig(ExplorerConfig):
     stations: StationsConfig = field(default_factory=StationsConfig)
     places: Few = 25  # nearest view points that the tour is over; those farther away can wait
     tries: Few = 6  # choices of view points that the best tour is taken from
-    # a tour that starts elsewhere must be shorter by this [weighted m] to turn round for
+    # A tour that starts elsewhere must be shorter by this [weighted m] to turn round for.
     hold_m: NotNegative = 1.0
     hurry: NotNegative = 2.0  # 0: the shortest tour; above: what shows much new area is reached early
     depth_m: Gap = 3.0  # how far behind a frontier new area is expected

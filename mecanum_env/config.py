@@ -137,9 +137,9 @@ class NoiseConfig(Config):
     range_sigma_m: Annotated[float, Within("[0, 1)")] = 0.01
     dropout: Annotated[float, Within("[0, 1)")] = 0.005  # probability that a beam is lost
     encoder: Annotated[float, Within("[0, 1)")] = 0.01  # 1σ of a wheel's measured increment, as a share of it
-    # largest relative error of each wheel's radius, drawn per episode
+    # Largest relative error of each wheel's radius, drawn per episode.
     radius_error: Annotated[float, Within("[0, 1)")] = 0.01
-    # largest relative error of the lever l, drawn per episode
+    # Largest relative error of the lever l, drawn per episode.
     base_error: Annotated[float, Within("[0, 1)")] = 0.01
     slip: Annotated[float, Within("[0, 1)")] = 0.0  # mean share of the commanded motion that is lost at random
     friction: Annotated[float, Within("[0.01, 2]")] = 0.6  # μ of the floor
@@ -181,7 +181,7 @@ class EnvConfig(Config):
     physics_step_s: StepTime = 0.02
     grid_resolution_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     coverage_target: PositiveShare = 0.95
-    # what ``progress`` counts against where the environment has no step limit
+    # What ``progress`` counts against where the environment has no step limit.
     time_limit_s: Annotated[float, Within("[0.001, 1e9]")] = 300.0
     terminate_on_collision: bool = False
     max_landmarks_observed: Count = 32

@@ -41,7 +41,7 @@ class BackendConfig(Config):
     key_scans: KeyScanConfig = field(default_factory=KeyScanConfig)
     health: HealthConfig = field(default_factory=HealthConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    # of the start pose where none is given: never exactly zero
+    # Of the start pose where none is given: never exactly zero.
     start_sigma_m: Annotated[float, Within("[1e-9, 10]")] = 1e-4
     start_sigma_rad: Annotated[float, Within("[1e-9, 10]")] = 1e-4
 

@@ -58,7 +58,7 @@ class DpSlamConfig(BackendConfig):
     # than it does: particles that all go one way cannot close a loop (docs/reference/dp_slam.md).
     drift_m: Sigma = 0.02
     drift_rad: Sigma = 0.01
-    # side of the pieces of the map that have an error each, in the covariance
+    # Side of the pieces of the map that have an error each, in the covariance.
     tile_m: Annotated[float, Within("[0.1, 1000]")] = 2.0
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
     # of no surface: what is new says less against a particle than what contradicts its map.

@@ -39,7 +39,7 @@ _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since wall
 class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
     """Right-invariant EKF-SLAM over walls and corners, in regions where the map is large."""
 
-    # larger regions than its parent's: another one takes as long as a hundred steps
+    # Larger regions than its parent's: another one takes as long as a hundred steps.
     leave_share: Annotated[float, Within("[0.001, 10]")] = 1.5
     whole_up_to: Annotated[int, Within("[0, 10000]")] = 300
     rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-8

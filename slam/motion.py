@@ -30,7 +30,7 @@ class LastingErrors(Config):
 
     radius_sigma: Annotated[float, Within("[0, 10]")] = 0.0  # relative
     lever_sigma: Annotated[float, Within("[0, 10]")] = 0.0  # relative
-    # relative, of the right wheels' radii and, by as much less, of the left ones'
+    # Relative, of the right wheels' radii and, by as much less, of the left ones'.
     difference_sigma: Annotated[float, Within("[0, 10]")] = 0.0
     white_speed_share: NotNegative | None = None  # OdometryNoise's shares without what lasts; None: all of them
     white_turn_share_rad_m: NotNegative | None = None

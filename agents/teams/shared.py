@@ -30,7 +30,7 @@ class SharingConfig(Config):
     most: Few = 40  # pieces of frontier that are shared out: those nearest to any robot
     service_m_m2: NotNegative = 0.0  # what a square metre of new area counts for, as a way
     depth_m: Length = 3.0  # how far behind a frontier new area is expected
-    # shorter is the way to what a robot is on its way to: parts that change hands cost turns
+    # Shorter is the way to what a robot is on its way to: parts that change hands cost turns.
     hold_m: NotNegative = 3.0
 
 

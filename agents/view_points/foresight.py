@@ -55,7 +55,7 @@ _MOST = 32  # landmarks in one update: those that the sensor sees best
 class ForesightConfig(Config):
     """How a path is thought through."""
 
-    # the scans of a leg are taken together, as seen from its end
+    # The scans of a leg are taken together, as seen from its end.
     leg_m: Annotated[float, Within("[0.05, 1000]")] = 0.75
     most_legs: Few = 8  # of a path: those of a long one are longer
     speed_m_s: Rate = 0.45  # at which paths are driven, on average

@@ -31,9 +31,9 @@ class FrontierConfig(Config):
     min_unknown_m2: NotNegative = 0.05  # smaller unknown pockets hold nothing to find
     min_unknown_width_m: Gap = 0.3  # thinner ones are the insides of walls
     min_clearance_m: Gap = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
-    # a long cluster is looked at in pieces of about this size
+    # A long cluster is looked at in pieces of about this size.
     spacing_m: Annotated[float, Within("[0.05, 1000]")] = 0.6
-    # farthest place to look from, squarely; never beyond 0.8 of the lidar's range
+    # Farthest place to look from, squarely; never beyond 0.8 of the lidar's range.
     view_range_m: Annotated[float, Within("[0.05, 1000]")] = 4.0
     beyond_m: Gap = 0.3  # how far behind the frontier a view point must see
 

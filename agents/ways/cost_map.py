@@ -44,18 +44,18 @@ class PlannerConfig(Config):
     """
 
     resolution_m: Annotated[float, Within("[0.02, 1]")] = 0.1  # of the planning grid; made finer for a small robot
-    # comfortable: circumscribed radius + margin + 2σ of the position, capped
+    # Comfortable: circumscribed radius + margin + 2σ of the position, capped.
     margin_m: Annotated[float, Within("[0, 10]")] = 0.05
     tight_margin_m: Annotated[float, Within("[0, 10]")] = 0.07  # tight: inscribed radius + this + the same
-    # far from the start σ is large, and the walls nearby are no less certain
+    # Far from the start σ is large, and the walls nearby are no less certain.
     max_sigma_margin_m: Annotated[float, Within("[0, 10]")] = 0.05
     unknown_margin_m: Annotated[float, Within("[0, 10]")] = 0.02  # from what is not known: inscribed radius + this
-    # clearance beyond the comfortable one from which nearness costs nothing
+    # Clearance beyond the comfortable one from which nearness costs nothing.
     preferred_m: Annotated[float, Within("[0.001, 10]")] = 0.2
     near_cost: NotNegative = 1.0  # added to the price of a metre at the comfortable clearance
     tight_cost: NotNegative = 3.0  # added again at the tight clearance
     path_spacing_m: Annotated[float, Within("[0.01, 1000]")] = 0.1
-    # added to the price of a metre where another robot is nearer than would do to pass …
+    # Added to the price of a metre where another robot is nearer than would do to pass …
     robot_cost: NotNegative = 6.0
     robot_margin_m: Annotated[float, Within("[0, 10]")] = 0.1  # … which is both bodies' radii and this …
     robots_within_m: Gap = 3.0  # … if it is no farther than this: what is farther off will have moved on

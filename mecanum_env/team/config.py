@@ -53,12 +53,12 @@ class TeamConfig(Config):
     """A team of like robots."""
 
     robots: Robots = 3
-    # around the plan's start; or "scattered" over all that can be reached
+    # Around the plan's start; or "scattered" over all that can be reached.
     starts: Annotated[str, OneOf(STARTS)] = "together"
     known_starts: bool = True  # every robot knows where the others start; else each has a frame of its own
     start_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0  # how far off that knowledge is, 1σ of x and of y
     start_sigma_rad: Annotated[float, Within("[0, 10]")] = 0.0
-    # each robot a filter of its own; or "joint": one over all (slam.teams.centralised)
+    # Each robot a filter of its own; or "joint": one over all (slam.teams.centralised).
     belief: Annotated[str, OneOf(BELIEFS)] = "own"
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)
     sighting: SightingConfig = field(default_factory=SightingConfig)

@@ -35,9 +35,9 @@ class FeatureConfig(Config):
     split_floor_m: Gap = 0.02  # … and by more than this
     min_points: Annotated[int, Within("[4, 10000]")] = 6
     min_length_m: Gap = 0.25
-    # flattest incidence at which neighbouring points still belong together
+    # Flattest incidence at which neighbouring points still belong together.
     grazing_deg: Annotated[float, Within("[0.1, 45)")] = 8.0
-    # between the surfaces of a corner; pieces of a round column meet at less
+    # Between the surfaces of a corner; pieces of a round column meet at less.
     min_angle_deg: Annotated[float, Within("[5, 85]")] = 55.0
     max_gap_m: Gap = 0.12  # from the corner to the nearest point of either surface
     edge_length_m: Gap = 0.35  # of a surface whose visible end is taken for a corner
@@ -53,7 +53,7 @@ class FeatureConfig(Config):
     sigma_floor_m: Sigma = 0.0005
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: Length = 0.6
-    # through a door the walls beyond are seen by a few beams, and nothing else tells as much
+    # Through a door the walls beyond are seen by a few beams, and nothing else tells as much.
     wall_points: Count = 5
     # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
     # jamb. As noise of each it counts for so much more, and adds up to no less.

@@ -43,7 +43,7 @@ class HealthConfig(Config):
     sharp_lost: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.35, 0.30, 0.20, 0.10, 0.05)
     # Scans one after the other err together: each counts as this part of one.
     scan_weight: Annotated[float, Within("[0, 10]")] = 0.3
-    # how likely a robot gets lost from one scan to the next
+    # How likely a robot gets lost from one scan to the next.
     lost_per_scan: Annotated[float, Within("[1e-9, 1)")] = 1e-5
     blur_m: Length = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
     unsure_m: Gap = 0.3  # σ of the beams' ends, now or when they were drawn, at which an old drawing gives way

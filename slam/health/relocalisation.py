@@ -63,14 +63,14 @@ class RelocalisationConfig(Config):
         2,
         10,
     )  # scans between two searches of each radius: they take long
-    # places of the lattice that take so long; of twice as many, half as often
+    # Places of the lattice that take so long; of twice as many, half as often.
     places_each: Annotated[int, Within("[1, 1000000]")] = 60_000
-    # times as many scans between two searches of all of the map, where the robot has not moved
+    # Times as many scans between two searches of all of the map, where the robot has not moved.
     standing: Annotated[int, Within("[1, 1000000]")] = 8
     confirm: Annotated[int, Within("[1, 1000000]")] = 3  # scans that a place must explain, one after the other
-    # scans in a row that do not speak against where the wheels have it, to go on from there
+    # Scans in a row that do not speak against where the wheels have it, to go on from there.
     unopposed: Annotated[int, Within("[1, 1000000]")] = 30
-    # reach of a surface when a place is refined last
+    # Reach of a surface when a place is refined last.
     sharp_smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     matching: MatchConfig = field(
         default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01)

@@ -45,7 +45,7 @@ class AlignmentConfig(Config):
     rival_share: NotNegative = 0.6  # of the best one's matches that any other may explain
     rival_m: Gap = 0.5  # farther off than this, or turned by more, it is another one
     rival_rad: Gap = 0.15
-    # probability of χ² of all matches together, and that none of them …
+    # Probability of χ² of all matches together, and that none of them …
     gate: Annotated[float, Within("(0, 1)")] = 0.999
     outlier_gate: Annotated[float, Within("(0, 1)")] = 0.9999  # … has of being farther from what the others say
     most_refused: Share = 0.25  # share of the matches that may fail there

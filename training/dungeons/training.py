@@ -50,7 +50,7 @@ class TrainingConfig(Config):
 
     rounds: Few = 2  # of lessons, each driven by what was learned in the one before
     plans: Annotated[int, Within("[1, 1000000]")] = 1000  # seeds 0 … of the first round
-    # seeds 0 … of the others: a network takes more time to drive than the tour
+    # Seeds 0 … of the others: a network takes more time to drive than the tour.
     later_plans: Annotated[int, Within("[1, 1000000]")] = 380
     validation_plans: Annotated[int, Within("[1, 1000000]")] = 60  # seeds 1000 …
     epochs: Annotated[int, Within("[1, 1000000]")] = 12

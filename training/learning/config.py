@@ -124,7 +124,7 @@ class RehearsalConfig(PpoConfig):
     gamma: Share = 1.0
     gae_lambda: Share = 0.9
     chunk: Count = 4
-    # seconds that a metre less still to go, by hindsight, counts for; 0: no such reward
+    # Seconds that a metre less still to go, by hindsight, counts for; 0: no such reward.
     shaping_s_m: NotNegative = 0.0
     replan_s: Duration = 3.0  # that a choice lasts at most: the longer, the more it is felt
     every: Count = 8  # chunks, between two trials on validation seeds …
@@ -144,7 +144,7 @@ class TrainConfig(Config):
     """A training run of ``ppo-frontier``."""
 
     seed: Seed = 1
-    # networks that are trained apart, each as all that follows says, and choose together
+    # Networks that are trained apart, each as all that follows says, and choose together.
     members: Annotated[int, Within("[1, 100]")] = 1
     width: Annotated[int, Within("[1, 4096]")] = 64
     heads: Annotated[int, Within("[1, 64]")] = 4

@@ -86,9 +86,7 @@ def test_policies() -> None:
     assert [every_third.due(1.0, 100, k) for k in (1, 2, 3)] == [False, False, True]
     half = ResamplingPolicy(when="n_eff", share=0.5)
     assert half.due(49.9, 100, 1) and not half.due(50.0, 100, 9)
-    with pytest.raises(
-        ValueError, match=r"ResamplingPolicy.when must be .*, got 'n_ef' \(did you mean 'n_eff'\?\)"
-    ):
+    with pytest.raises(ValueError, match=r"Policy.when must be .*, got 'n_ef' \(did you mean 'n_eff'\?\)"):
         ResamplingPolicy(when="n_ef")
     with pytest.raises(ValueError, match=r"share must be in \[1e-6, 1\], got 0.0"):
         ResamplingPolicy(share=0.0)

@@ -33,7 +33,7 @@ class DriveLessonsConfig(Config):
 
     teacher: Annotated[str, OneOf(("nearest-frontier", "tour"))] = "nearest-frontier"  # whose frontiers are goals
     teacher_shares: Annotated[tuple[float, ...], Within("[0, 1]")] = (1.0, 0.5, 0.2, 0.0)
-    # driven by the teacher on its own map, before the first round
+    # Driven by the teacher on its own map, before the first round.
     guided_episodes: Annotated[int, Within("[1, 1000000]")] = 400
     episodes: Annotated[int, Within("[1, 1000000]")] = 60  # a round, of each family
     time_limit_s: Duration = 120.0
