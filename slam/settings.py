@@ -148,7 +148,7 @@ class Config:
     """
 
     def __post_init__(self) -> None:
-        for name, kind in _kinds(type(self)).items():
+        for name, kind in _kinds(type(self)).items():  # type: ignore[arg-type]
             given = getattr(self, name)
             try:
                 value = kind.take(given)
@@ -245,7 +245,7 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
             if inner is not None and isinstance(value, Mapping):
                 value = from_mapping(inner, value, base=getattr(base, key))
             if not issubclass(cls, Config):  # a dataclass of somebody's own, which does not look itself
-                value = _kinds(cls)[key].take(value)
+                value = _kinds(cls)[key].take(value)  # type: ignore[arg-type]
         except ValueError as error:
             raise _located(error, cls.__name__, key) from None
         changes[key] = value

@@ -93,6 +93,7 @@ class Command(TyperCommand):
         except typer.BadParameter as error:
             error.message = f"{error.message.rstrip('.')}, got {_given(words, error.param)}"
             raise
+        option: Any
         for option in self.params:
             given = ctx.params.get(option.name or "")
             if isinstance(given, float) and not math.isfinite(given):
