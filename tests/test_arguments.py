@@ -245,7 +245,7 @@ SLOW = {"relocalisation", "particles", "update_m", "update_rad", "spacing_m", "s
 
 @pytest.mark.parametrize("kind", ["slam", "agent", "env", "filter", "rooms", "team"])
 @given(data=st.data())
-@settings(max_examples=20)
+@settings(max_examples=12)
 def test_what_is_allowed_works(kind: str, data: st.DataObject) -> None:
     those = [
         s for s in SETTINGS if s[0].split()[0] == kind and s[1][-1] not in SLOW and "relocalisation" not in s[1]
