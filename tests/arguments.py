@@ -91,6 +91,13 @@ def nested(path: tuple[str, ...], value: Any) -> dict[str, Any]:
     return {path[0]: value if len(path) == 1 else nested(path[1:], value)}
 
 
+def refused(error: BaseException, name: str) -> None:
+    """Assert that an error is one a user can act on: one line that names the argument."""
+    message = str(error)
+    assert isinstance(error, ValueError), repr(error)
+    assert name in message and "\n" not in message and len(message) < 600, message
+
+
 # ---- what runs with them ---------------------------------------------------------------------------------------
 
 
