@@ -1,4 +1,4 @@
-"""What files and options say wrongly: one line with the key's path or the option, what is allowed, what was given."""
+"""What files and options get wrong: one line with the key or option, what is allowed, what was given."""
 
 from __future__ import annotations
 
