@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.base import Agent, Goal
-from slam.settings import unknown_name
+from slam.settings import check_name, shown
 
 if TYPE_CHECKING:
     from mecanum_env.config import LidarConfig, RobotConfig
@@ -63,10 +63,10 @@ def names() -> tuple[str, ...]:
 
 def check(name: str, *others: str) -> None:
     """Raise ``ValueError`` in one line unless :func:`make` takes the name, or it is one of the others."""
-    if name.endswith(".safetensors"):
+    if isinstance(name, str) and name.endswith(".safetensors"):
         _reader(name)
-    elif name not in (valid := (*names(), *others)):
-        raise unknown_name("agent", name, valid)
+    else:
+        check_name("agent", name, (*names(), *others))
 
 
 def _reader(policy: str) -> str:
@@ -107,7 +107,7 @@ def make(
     check(name)
     if name.endswith(".safetensors"):
         if not isinstance(config, Mapping | None):
-            raise ValueError(f"with a policy's file {name} the agent's configuration is a mapping, or none")
+            raise ValueError(f"config: with a policy's file {name} it must be a mapping, got {shown(config)}")
         config = {**(config or {}), "policy": name}
         name = _reader(name)
     module, _, attribute = _installed()[name].partition(":")

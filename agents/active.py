@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,37 +27,42 @@ from agents.tour import Outlook, Tour, TourConfig
 from agents.view_points.foresight import Foresight, ForesightConfig, Marks, anchoring, marks_of, spread_m
 from agents.view_points.sightings import expected_sightings
 from slam.belief import Belief
-from slam.settings import not_negative, positive, require
+from slam.settings import (
+    Config,
+    Count,
+    Duration,
+    Few,
+    Length,
+    NotNegative,
+    Positive,
+    PositiveShare,
+    Within,
+    require,
+)
 from slam.types import Array
 
 __all__ = ["ActiveConfig", "ActiveSlam", "LookConfig", "RevisitConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class LookConfig:
+class LookConfig(Config):
     """How long to look before the first drive."""
 
-    at_most_s: float = 6.0
-    blind_s: float = 0.5  # … where nothing is seen that could be a landmark
-    step_s: float = 0.5  # what looking on for so long would bring is asked
-    most: int = 24  # landmarks that are counted
-    worth: float = 4.0  # times what the spread is worth on the way: this error is that of everything seen later
-
-    def __post_init__(self) -> None:
-        positive(self)
+    at_most_s: Duration = 6.0
+    blind_s: Duration = 0.5  # … where nothing is seen that could be a landmark
+    step_s: Duration = 0.5  # what looking on for so long would bring is asked
+    most: Count = 24  # landmarks that are counted
+    worth: Positive = 4.0  # times what the spread is worth on the way: this error is that of everything seen later
 
 
 @dataclass(frozen=True, kw_only=True)
-class RevisitConfig:
+class RevisitConfig(Config):
     """When going back is thought of at all."""
 
-    above_m: float = 0.01  # the pose's spread from which on it is …
-    times: float = 2.0  # … and how much better it must have been known at the place to go back to
-    again_s: float = 30.0  # between two such ways
-    spacing_m: float = 1.0  # between the places that are remembered
-
-    def __post_init__(self) -> None:
-        positive(self)
+    above_m: Length = 0.01  # the pose's spread from which on it is …
+    times: Positive = 2.0  # … and how much better it must have been known at the place to go back to
+    again_s: Duration = 30.0  # between two such ways
+    spacing_m: Length = 1.0  # between the places that are remembered
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,28 +72,24 @@ class ActiveConfig(TourConfig):
     foresight: ForesightConfig = field(default_factory=ForesightConfig)
     look: LookConfig = field(default_factory=LookConfig)
     revisit: RevisitConfig = field(default_factory=RevisitConfig)
-    worth_s_per_m: float = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
-    delay: float = 8.0  # what a second's delay of what is left to see costs [s]
-    switch_s: float = 1.5  # another frontier must be better by this …
-    switch_share: float = 0.15  # … and by this share of the way to the present one
-    most: int = 5  # candidates that are thought through: the cheapest to reach, and where the best tour begins
-    thought_tries: int = 2  # choices of view points that the best tour from each is taken from
-    gentle_m_s2: float = 0.6  # acceleration on a floor found slippery …
-    gentle_speed_share: float = 0.7  # … and speed, as a share of the robot's limit: more looks at what it passes
-    firm_share: float = 0.02  # of the wheels' speed: no greater error of the odometry is taken for slip …
-    slippery_share: float = 0.04  # … from here on it is driven as gently as it can be
+    worth_s_per_m: NotNegative = 5000.0  # time that a metre less of the pose's spread is worth: 5 s a millimetre
+    delay: NotNegative = 8.0  # what a second's delay of what is left to see costs [s]
+    switch_s: NotNegative = 1.5  # another frontier must be better by this …
+    switch_share: NotNegative = 0.15  # … and by this share of the way to the present one
+    most: Few = 5  # candidates that are thought through: the cheapest to reach, and where the best tour begins
+    thought_tries: Few = 2  # choices of view points that the best tour from each is taken from
+    gentle_m_s2: Positive = 0.6  # acceleration on a floor found slippery …
+    # … and speed, as a share of the robot's limit: more looks at what it passes
+    gentle_speed_share: Annotated[float, Within("[0.01, 1]")] = 0.7
+    firm_share: PositiveShare = 0.02  # of the wheels' speed: no greater error of the odometry is taken for slip …
+    slippery_share: PositiveShare = 0.04  # … from here on it is driven as gently as it can be
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        not_negative(self, "worth_s_per_m", "delay", "switch_s", "switch_share")
-        positive(self, "gentle_m_s2")
-        for name in ("most", "thought_tries"):
-            require(getattr(self, name) >= 1, f"ActiveConfig.{name} must be at least 1, got {getattr(self, name)}")
         require(
-            0 < self.gentle_speed_share <= 1,
-            f"ActiveConfig.gentle_speed_share must be above 0 and at most 1, got {self.gentle_speed_share}",
+            self.firm_share < self.slippery_share,
+            f"ActiveConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
         )
-        require(0 < self.firm_share < self.slippery_share, "ActiveConfig needs 0 < firm_share < slippery_share")
 
 
 class ActiveSlam(Tour):

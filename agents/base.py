@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, resolve
+from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, StepTime, resolve
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import argument, checked, from_mapping
 from slam.types import Array
 
 __all__ = ["ENDINGS", "Agent", "Goal"]
@@ -59,11 +58,11 @@ class Agent(ABC):
         lidar: LidarConfig | Mapping[str, Any] | str | None = None,
         step_s: float = 0.1,
     ) -> None:
-        require(math.isfinite(step_s) and 0 < step_s <= 1, f"step_s must be in (0, 1] s, got {step_s}")
         self._robot = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot preset")
         self._lidar = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar preset")
-        self._step_s = float(step_s)
-        self.config = config if self.config_type is None else from_mapping(self.config_type, config)
+        self._step_s: float = checked("step_s", StepTime, step_s)
+        with argument("config"):
+            self.config = config if self.config_type is None else from_mapping(self.config_type, config)
         self._rng = np.random.default_rng(0)
         self._goal: Goal | None = None
         self._frontiers: Array = np.zeros((0, 2))

@@ -16,7 +16,7 @@ import numpy as np
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
 from slam.belief import Belief
-from slam.settings import not_negative, positive
+from slam.settings import Length, NotNegative
 from slam.types import Array
 
 __all__ = ["CostUtility", "CostUtilityConfig"]
@@ -26,15 +26,12 @@ __all__ = ["CostUtility", "CostUtilityConfig"]
 class CostUtilityConfig(ExplorerConfig):
     """The parts of the agent, what it expects to see, and what a metre of the way must bring."""
 
-    beta_m2_m: float = 2.0  # β [m² per weighted m]
-    range_m: float = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
-    depth_m: float = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
-    switch_m2: float = 0.5  # another target must be better by this …
-    switch_share: float = 0.2  # … and by this share of what the present one is worth, to be worth turning round
-
-    def __post_init__(self) -> None:
-        positive(self, "range_m", "depth_m")
-        not_negative(self, "beta_m2_m", "switch_m2", "switch_share")
+    beta_m2_m: NotNegative = 2.0  # β [m² per weighted m]
+    range_m: Length = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
+    depth_m: Length = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
+    switch_m2: NotNegative = 0.5  # another target must be better by this …
+    # … and by this share of what the present one is worth, to be worth turning round
+    switch_share: NotNegative = 0.2
 
 
 class CostUtility(Explorer):

@@ -18,7 +18,7 @@ from agents.driving.control import PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import positive
+from slam.settings import Angle, Config, Length, Positive
 from slam.types import Array
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
@@ -27,16 +27,13 @@ _HOME = np.zeros(3)  # the belief's frame is that of the start pose
 
 
 @dataclass(frozen=True, kw_only=True)
-class HomingConfig:
+class HomingConfig(Config):
     """How near to the start, by the belief, is there."""
 
-    arrived_m: float = 0.05
-    arrived_rad: float = 0.1
-    arrival_m_s: float = 0.06  # speed at which the start is reached
-    last_leg_m: float = 0.25  # so far it goes straight: the start may lie too near to a wall to be planned to
-
-    def __post_init__(self) -> None:
-        positive(self)
+    arrived_m: Length = 0.05
+    arrived_rad: Angle = 0.1
+    arrival_m_s: Positive = 0.06  # speed at which the start is reached
+    last_leg_m: Length = 0.25  # so far it goes straight: the start may lie too near to a wall to be planned to
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, SupportsInt, cast
+from typing import Annotated, Any, SupportsInt, cast
 
 import gymnasium
 import numpy as np
@@ -16,11 +16,13 @@ from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
-from slam.settings import from_mapping, require
+from slam.settings import Within, argument, checked, from_mapping
 
 __all__ = ["ChoiceEnv", "ExploreFrontierEnv", "as_observation", "choice_space"]
 
 Observation = dict[str, NDArray[Any]]
+
+Discount = Annotated[float, Within("(0, 1]")]
 
 _DONE_AFTER_S = 2.0  # with nothing to choose from: what is seen a moment later may change that
 
@@ -150,14 +152,15 @@ class ExploreFrontierEnv(ChoiceEnv):
         render_mode: str | None = None,
         **kwargs: Any,
     ) -> None:
-        require(0 < discount <= 1, f"discount must be in (0, 1], got {discount}")
-        super().__init__(from_mapping(ChooserConfig, driver))
+        self.discount = checked("discount", Discount, discount)
+        with argument("driver"):
+            super().__init__(from_mapping(ChooserConfig, driver))
         self.base = _Beneath(action="twist", render_mode=render_mode, **kwargs)
         self.config = self.base.config
         # A limit of its own, in its own steps: the one that may be around this environment counts decisions.
         limit = math.ceil(self.config.time_limit_s / self.config.step_s - 1e-9)
         self._limited = TimeLimit(self.base, max_episode_steps=limit)
-        self.discount, self.render_mode = discount, render_mode
+        self.render_mode = render_mode
         self.agent = Chooser(
             self.driver, robot=self.config.robot, lidar=self.config.lidar, step_s=self.config.step_s
         )

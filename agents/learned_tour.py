@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from agents.tour import Tour, TourConfig
 from agents.ways.routing import draw_luck
 from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
-from slam.settings import not_negative, require
+from slam.settings import Few, NotNegative, Within, require
 
 __all__ = ["FORMAT", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_station_policy"]
 
@@ -38,21 +38,19 @@ class LearnedTourConfig(TourConfig):
     """The tour's, and which experience."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
-    extent: tuple[float, ...] = ()  # x, y of the two corners [m] that all lies between; (): not known
-    most: int = 5  # openings that are weighed
-    most_loss_m: float = 40.0  # what by the tour itself is worse by more is not
+    extent: Annotated[
+        tuple[float, ...], Within("[-10000, 10000]")
+    ] = ()  # x, y of the two corners [m] that all lies between; (): not known
+    most: Few = 5  # openings that are weighed
+    most_loss_m: NotNegative = 40.0  # what by the tour itself is worse by more is not
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        low, high = self.extent[:2], self.extent[2:]
         require(
-            not self.extent
-            or (
-                len(self.extent) == 4 and all(a < b for a, b in zip(self.extent[:2], self.extent[2:], strict=True))
-            ),
+            not self.extent or (len(self.extent) == 4 and all(a < b for a, b in zip(low, high, strict=True))),
             f"LearnedTourConfig.extent must be x and y of the lower corner, then of the upper, got {self.extent}",
         )
-        require(self.most >= 1, f"LearnedTourConfig.most must be at least 1, got {self.most}")
-        not_negative(self, "most_loss_m")
 
 
 def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:

@@ -16,7 +16,7 @@ from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.stop import StationAgent, StationsConfig
 from slam.belief import Belief
-from slam.settings import not_negative
+from slam.settings import NotNegative
 
 __all__ = ["NearestFrontier", "NearestFrontierConfig"]
 
@@ -26,11 +26,8 @@ class NearestFrontierConfig(ExplorerConfig):
     """The parts of the agent, and how firmly it holds on to a goal."""
 
     stations: StationsConfig = field(default_factory=StationsConfig)
-    switch_m: float = 0.5  # another frontier must be cheaper by this [weighted m] …
-    switch_share: float = 0.15  # … and by this share of the present goal's cost, to be worth turning round
-
-    def __post_init__(self) -> None:
-        not_negative(self, "switch_m", "switch_share")
+    switch_m: NotNegative = 0.5  # another frontier must be cheaper by this [weighted m] …
+    switch_share: NotNegative = 0.15  # … and by this share of the present goal's cost, to be worth turning round
 
 
 class NearestFrontier(StationAgent, Explorer):

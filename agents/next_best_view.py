@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from agents.view_points.sight import first_in_good_sight
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief
-from slam.settings import not_negative, positive
+from slam.settings import Length, NotNegative, Within
 from slam.types import Array
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
@@ -39,16 +40,13 @@ _NEARER = 0.85  # share of the range of good sight that a place keeps to: the ro
 class NextBestViewConfig(ExplorerConfig):
     """The parts of the agent, what it expects to see, and how it weighs that against the way."""
 
-    decay_1_m: float = 0.2  # λ: how fast the worth of a place falls with the cost of the way [1/weighted m]
-    range_m: float = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
-    depth_m: float = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
-    spacing_m: float = 0.4  # of the lattice of places
-    samples: int = 200  # places weighed in one choice; beyond that so many drawn from the lattice
-    switch_share: float = 0.2  # another place must be worth more by this share to be worth turning round
-
-    def __post_init__(self) -> None:
-        positive(self, "range_m", "depth_m", "spacing_m")
-        not_negative(self, "decay_1_m", "samples", "switch_share")
+    decay_1_m: NotNegative = 0.2  # λ: how fast the worth of a place falls with the cost of the way [1/weighted m]
+    range_m: Length = 5.0  # how far it counts on seeing; never beyond 0.8 of the lidar's range
+    depth_m: Length = 2.0  # how far into the unknown: behind every frontier there is a wall sooner or later
+    spacing_m: Annotated[float, Within("[0.05, 1000]")] = 0.4  # of the lattice of places
+    # Places weighed in one choice; beyond that so many drawn from the lattice.
+    samples: Annotated[int, Within("[0, 10000]")] = 200
+    switch_share: NotNegative = 0.2  # another place must be worth more by this share to be worth turning round
 
 
 class NextBestView(Explorer):

@@ -21,7 +21,7 @@ from mecanum_env.observation import draw_maps
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import positive
+from slam.settings import Config, Duration, Positive
 from slam.types import Array
 
 __all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
@@ -31,15 +31,12 @@ SHIPPED = Path(__file__).parent / "policies" / "ppo.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PpoConfig:
+class PpoConfig(Config):
     """Which policy."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
-    patience_s: float = 30.0  # with nothing new in sight, until the place is held for explored
-    new_m2: float = 0.3  # what counts for new
-
-    def __post_init__(self) -> None:
-        positive(self, "patience_s", "new_m2")
+    patience_s: Duration = 30.0  # with nothing new in sight, until the place is held for explored
+    new_m2: Positive = 0.3  # what counts for new
 
 
 def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:

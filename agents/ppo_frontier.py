@@ -16,7 +16,7 @@ from agents.learned.choice_network import ChoiceEnsemble
 from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
 from slam.belief import Belief
-from slam.settings import from_mapping
+from slam.settings import Config, argument, from_mapping
 
 __all__ = ["FORMAT", "SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
 
@@ -25,7 +25,7 @@ SHIPPED = Path(__file__).parent / "policies" / "ppo-frontier.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PpoFrontierConfig:
+class PpoFrontierConfig(Config):
     """Which policy."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
@@ -62,10 +62,13 @@ class PpoFrontier(Chooser):
     """
 
     def __init__(self, config: PpoFrontierConfig | Mapping[str, Any] | None = None, **body: Any) -> None:
-        settings = from_mapping(PpoFrontierConfig, config)
+        with argument("config"):
+            settings = from_mapping(PpoFrontierConfig, config)
         self.policy_path = Path(settings.policy or SHIPPED)
         self._network, driver, self.about = load_choice_policy(self.policy_path)
-        super().__init__(from_mapping(ChooserConfig, settings.driver, base=driver), **body)
+        with argument("config.driver"):
+            driver = from_mapping(ChooserConfig, settings.driver, base=driver)
+        super().__init__(driver, **body)
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,21 +13,18 @@ from numpy.typing import NDArray
 from agents.base import Agent, Goal
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import positive
+from slam.settings import Config, Duration, Within
 
 __all__ = ["RandomAgent", "RandomConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomConfig:
+class RandomConfig(Config):
     """An Ornstein-Uhlenbeck walk of the action."""
 
-    correlation_s: float = 1.5  # time in which the action forgets itself by a factor e
-    spread: float = 0.5  # standard deviation of each component of the action
-    preview_s: float = 1.0  # how far ahead the goal lies that it shows
-
-    def __post_init__(self) -> None:
-        positive(self)
+    correlation_s: Duration = 1.5  # time in which the action forgets itself by a factor e
+    spread: Annotated[float, Within("[0.001, 1000]")] = 0.5  # standard deviation of each component of the action
+    preview_s: Duration = 1.0  # how far ahead the goal lies that it shows
 
 
 class RandomAgent(Agent):

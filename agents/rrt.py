@@ -14,8 +14,8 @@ nothing is left, and would leave what lies behind a narrow door to chance.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from agents.view_points.gain import expected_area
 from agents.view_points.rrt_tree import Tree, mean_shift
 from agents.ways.cost_map import CostMap
 from slam.belief import Belief
-from slam.settings import not_negative, positive, require
+from slam.settings import Gap, Length, NotNegative, Within
 from slam.types import Array
 
 __all__ = ["Rrt", "RrtConfig"]
@@ -36,26 +36,18 @@ _REMEMBERED = 400  # frontier points; the latest stay
 class RrtConfig(ExplorerConfig):
     """The parts of the agent, its trees, and what a frontier point is worth."""
 
-    stride_m: float = 1.0  # η, longest edge
-    draws: int = 300  # points that each tree is grown towards in one choice
-    capacity: int = 4000  # nodes of the global tree
-    bandwidth_m: float = 0.5  # of the mean shift
-    near_piece_m: float = 0.8  # a frontier point farther than this from every piece has been seen since
-    gain_radius_m: float = 2.0  # information gain: the unknown in view within this
-    min_gain_m2: float = 0.1  # frontier points with less in view are dropped
-    weight_m_m2: float = 1.0  # λ: weighted metres that a square metre of gain is worth
-    near_gain: float = 2.0  # hysteresis h of frontier points …
-    near_m: float = 3.0  # … that are this near to the robot
-    switch_m: float = 1.0  # another piece must earn more by this [weighted m] to be worth turning round
-
-    def __post_init__(self) -> None:
-        positive(self, "stride_m", "bandwidth_m", "near_piece_m", "gain_radius_m")
-        not_negative(self, "min_gain_m2", "weight_m_m2", "near_m", "switch_m", "draws")
-        require(
-            math.isfinite(self.near_gain) and self.near_gain >= 1,
-            f"RrtConfig.near_gain must be ≥ 1, got {self.near_gain}",
-        )
-        require(self.capacity >= 1, f"RrtConfig.capacity must be ≥ 1, got {self.capacity}")
+    stride_m: Annotated[float, Within("[0.05, 1000]")] = 1.0  # η, longest edge
+    draws: Annotated[int, Within("[0, 100000]")] = 300  # points that each tree is grown towards in one choice
+    capacity: Annotated[int, Within("[1, 100000]")] = 4000  # nodes of the global tree
+    bandwidth_m: Length = 0.5  # of the mean shift
+    near_piece_m: Length = 0.8  # a frontier point farther than this from every piece has been seen since
+    # Information gain: the unknown in view within this.
+    gain_radius_m: Annotated[float, Within("[0.05, 50]")] = 2.0
+    min_gain_m2: NotNegative = 0.1  # frontier points with less in view are dropped
+    weight_m_m2: NotNegative = 1.0  # λ: weighted metres that a square metre of gain is worth
+    near_gain: Annotated[float, Within("[1, 1e6]")] = 2.0  # hysteresis h of frontier points …
+    near_m: Gap = 3.0  # … that are this near to the robot
+    switch_m: NotNegative = 1.0  # another piece must earn more by this [weighted m] to be worth turning round
 
 
 class Rrt(Explorer):

@@ -22,7 +22,7 @@ from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import not_negative, require
+from slam.settings import Few, Gap, NotNegative
 from slam.types import Array
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
@@ -37,16 +37,12 @@ class TourConfig(ExplorerConfig):
     """The parts of the agent, and what makes a tour a good one."""
 
     stations: StationsConfig = field(default_factory=StationsConfig)
-    places: int = 25  # nearest view points that the tour is over; those farther away can wait
-    tries: int = 6  # choices of view points that the best tour is taken from
-    hold_m: float = 1.0  # a tour that starts elsewhere must be shorter by this [weighted m] to turn round for
-    hurry: float = 2.0  # 0: the shortest tour; above: what shows much new area is reached early
-    depth_m: float = 3.0  # how far behind a frontier new area is expected
-
-    def __post_init__(self) -> None:
-        not_negative(self, "hold_m", "hurry", "depth_m")
-        for name in ("places", "tries"):
-            require(getattr(self, name) >= 1, f"TourConfig.{name} must be at least 1, got {getattr(self, name)}")
+    places: Few = 25  # nearest view points that the tour is over; those farther away can wait
+    tries: Few = 6  # choices of view points that the best tour is taken from
+    # A tour that starts elsewhere must be shorter by this [weighted m] to turn round for.
+    hold_m: NotNegative = 1.0
+    hurry: NotNegative = 2.0  # 0: the shortest tour; above: what shows much new area is reached early
+    depth_m: Gap = 3.0  # how far behind a frontier new area is expected
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from slam.backend import Backend
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
-from slam.settings import from_mapping
+from slam.settings import argument, from_mapping, require, shown
 
 __all__ = ["Settings", "make_backend", "make_config", "make_plan"]
 
@@ -53,7 +53,11 @@ def make_config(
     ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
     Unknown names and keys raise ``ValueError`` that lists the valid ones.
     """
-    base = from_toml(config) if isinstance(config, str | Path) else from_mapping(EnvConfig, config)
+    if isinstance(config, str | Path):
+        base = from_toml(config)
+    else:
+        with argument("config"):
+            base = from_mapping(EnvConfig, config)
     changes: dict[str, Any] = {}
     if isinstance(robot, str) and robot in ROBOT_PRESETS:
         given_parts = config if isinstance(config, Mapping) else {}
@@ -62,9 +66,10 @@ def make_config(
     for name, given in (("rooms", rooms), ("slam", slam), ("odometry_filter", odometry_filter)):
         if isinstance(given, Mapping):
             options = dict(given)
-            changes[name] = str(options.pop("name", getattr(base, name)))
+            changes[name] = options.pop("name", getattr(base, name))
             changes[f"{name}_config"] = options
         elif given is not None:
+            require(isinstance(given, str), f"{name} must be a name or a mapping, got {shown(given)}")
             changes[name] = given
             if given != getattr(base, name):
                 changes[f"{name}_config"] = {}
@@ -75,13 +80,22 @@ def make_config(
     if noise is not None:
         changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
     if reward is not None:
-        changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
+        with argument("reward"):
+            changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
     if floor_plan is not None:
+        require(isinstance(floor_plan, str | Path), f"floor_plan must be a path, got {shown(floor_plan)}")
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
-    check_rooms(made.rooms, made.rooms_config)
-    from_mapping(config_type(made.slam), backend_settings(made))
-    make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
+    plan = made.floor_plan
+    require(
+        plan is None or Path(plan).is_file(), f"floor_plan {plan} does not exist, or is no file; check the path"
+    )
+    with argument("rooms" if "rooms_config" in changes else "rooms_config"):
+        check_rooms(made.rooms, made.rooms_config)
+    with argument("slam" if "slam_config" in changes else "slam_config"):
+        from_mapping(config_type(made.slam), backend_settings(made))
+    with argument("odometry_filter" if "odometry_filter_config" in changes else "odometry_filter_config"):
+        make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
     return made
 
 

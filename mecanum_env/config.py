@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tomli_w
 
-from slam.settings import from_mapping, not_negative, positive, require, to_mapping, unknown_name
+from slam.settings import (
+    Config,
+    Count,
+    Finite,
+    PositiveShare,
+    Sigma,
+    Span,
+    Within,
+    argument,
+    check_name,
+    from_mapping,
+    require,
+    to_mapping,
+)
 
 __all__ = [
     "LIDAR_PRESETS",
@@ -24,6 +36,8 @@ __all__ = [
     "NoiseConfig",
     "RewardConfig",
     "RobotConfig",
+    "StepTime",
+    "Steps",
     "from_toml",
     "resolve",
     "to_toml",
@@ -31,34 +45,35 @@ __all__ = [
 
 T = TypeVar("T")
 
+StepTime = Annotated[float, Within("[0.001, 1]")]
+"""Of one control step [s]."""
+
+Steps = Annotated[int, Within("[1, 1000000000]")]
+"""Of an episode, at most."""
+
 
 @dataclass(frozen=True, kw_only=True)
-class RobotConfig:
+class RobotConfig(Config):
     """Body, wheels and motors of a mecanum robot with X rollers (theory.md, "The robot itself").
 
     The motor constants are those of a geared servo drive: a speed loop with a first-order lag, a torque limit
     at the wheel, and the rotor's inertia as the wheel feels it through the gear.
     """
 
-    length_m: float = 0.58
-    width_m: float = 0.38
-    mass_kg: float = 20.0
-    wheel_radius_m: float = 0.0475
-    wheelbase_m: float = 0.471
-    track_m: float = 0.300
-    max_speed_m_s: float = 0.8
-    max_turn_rate_rad_s: float = 1.5
-    motor_lag_s: float = 0.05
-    motor_torque_nm: float = 2.0
-    motor_gain: float = 2.0  # torque per speed error [N·m·s/rad]
-    wheel_inertia_kg_m2: float = 0.01
-    wheel_friction: float = 0.01  # viscous, torque per wheel speed [N·m·s/rad]
-    slip_speed_m_s: float = 0.015  # width of the regularised Coulomb law, s₀
-
-    def __post_init__(self) -> None:
-        may_be_zero = ("motor_lag_s", "wheel_friction")
-        not_negative(self, *may_be_zero)
-        positive(self, *(f.name for f in dataclasses.fields(self) if f.name not in may_be_zero))
+    length_m: Annotated[float, Within("[0.05, 2]")] = 0.58
+    width_m: Annotated[float, Within("[0.05, 2]")] = 0.38
+    mass_kg: Annotated[float, Within("[0.1, 1000]")] = 20.0
+    wheel_radius_m: Annotated[float, Within("[0.005, 1]")] = 0.0475
+    wheelbase_m: Annotated[float, Within("[0.01, 2]")] = 0.471
+    track_m: Annotated[float, Within("[0.01, 2]")] = 0.300
+    max_speed_m_s: Annotated[float, Within("[0.01, 10]")] = 0.8
+    max_turn_rate_rad_s: Annotated[float, Within("[0.01, 20]")] = 1.5
+    motor_lag_s: Annotated[float, Within("[0, 10]")] = 0.05
+    motor_torque_nm: Annotated[float, Within("[0.001, 1000]")] = 2.0
+    motor_gain: Annotated[float, Within("[0.001, 1000]")] = 2.0  # torque per speed error [N·m·s/rad]
+    wheel_inertia_kg_m2: Sigma = 0.01
+    wheel_friction: Annotated[float, Within("[0, 100]")] = 0.01  # viscous, torque per wheel speed [N·m·s/rad]
+    slip_speed_m_s: Annotated[float, Within("[0.001, 1]")] = 0.015  # width of the regularised Coulomb law, s₀
 
     @cached_property
     def lever_m(self) -> float:
@@ -87,26 +102,21 @@ class RobotConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LidarConfig:
+class LidarConfig(Config):
     """A planar lidar mounted on the robot's centre line, at A ahead of the centre of mass C."""
 
-    beams: int = 360
-    field_of_view_deg: float = 360.0
-    range_min_m: float = 0.02
-    range_max_m: float = 8.0
-    offset_m: float = 0.2  # L, theory.md A
+    beams: Annotated[int, Within("[8, 10000]")] = 360
+    field_of_view_deg: Annotated[float, Within("[1, 360]")] = 360.0
+    range_min_m: Annotated[float, Within("[0, 100]")] = 0.02
+    range_max_m: Annotated[float, Within("[0.01, 100]")] = 8.0
+    offset_m: Annotated[float, Within("[-10, 10]")] = 0.2  # L, theory.md A
 
     def __post_init__(self) -> None:
-        require(self.beams >= 8, f"LidarConfig.beams must be at least 8, got {self.beams}")
+        super().__post_init__()
         require(
-            0 < self.field_of_view_deg <= 360,
-            f"LidarConfig.field_of_view_deg must be in (0, 360], got {self.field_of_view_deg}",
+            self.range_min_m < self.range_max_m,
+            f"LidarConfig needs range_min_m < range_max_m, got {self.range_min_m} and {self.range_max_m}",
         )
-        require(
-            0 <= self.range_min_m < self.range_max_m <= 100,
-            "LidarConfig needs 0 ≤ range_min_m < range_max_m ≤ 100",
-        )
-        require(math.isfinite(self.offset_m), "LidarConfig.offset_m must be finite")
 
     @property
     def angle_increment(self) -> float:
@@ -121,46 +131,39 @@ class LidarConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class NoiseConfig:
+class NoiseConfig(Config):
     """Everything random about the robot's dealings with the world, as declared to the estimators."""
 
-    range_sigma_m: float = 0.01
-    dropout: float = 0.005  # probability that a beam is lost
-    encoder: float = 0.01  # 1σ of a wheel's measured increment, as a share of it
-    radius_error: float = 0.01  # largest relative error of each wheel's radius, drawn per episode
-    base_error: float = 0.01  # largest relative error of the lever l, drawn per episode
-    slip: float = 0.0  # mean share of the commanded motion that is lost at random
-    friction: float = 0.6  # μ of the floor
-    patch_friction: tuple[float, float] = (0.15, 0.3)  # μ of the slippery patches, drawn per patch
-    patch_share: float = 0.0  # share of the floor that slippery patches cover
-
-    def __post_init__(self) -> None:
-        for name in (f.name for f in dataclasses.fields(self) if "friction" not in f.name):
-            value = getattr(self, name)
-            require(math.isfinite(value) and 0 <= value < 1, f"NoiseConfig.{name} must be in [0, 1), got {value}")
-        require(0 < self.friction <= 2, f"NoiseConfig.friction must be in (0, 2], got {self.friction}")
-        low, high = self.patch_friction
-        require(0 < low <= high <= 2, "NoiseConfig.patch_friction needs 0 < low ≤ high ≤ 2")
+    range_sigma_m: Annotated[float, Within("[0, 1)")] = 0.01
+    dropout: Annotated[float, Within("[0, 1)")] = 0.005  # probability that a beam is lost
+    encoder: Annotated[float, Within("[0, 1)")] = 0.01  # 1σ of a wheel's measured increment, as a share of it
+    # Largest relative error of each wheel's radius, drawn per episode.
+    radius_error: Annotated[float, Within("[0, 1)")] = 0.01
+    # Largest relative error of the lever l, drawn per episode.
+    base_error: Annotated[float, Within("[0, 1)")] = 0.01
+    slip: Annotated[float, Within("[0, 1)")] = 0.0  # mean share of the commanded motion that is lost at random
+    friction: Annotated[float, Within("[0.01, 2]")] = 0.6  # μ of the floor
+    patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (
+        0.15,
+        0.3,
+    )  # μ of the slippery patches, drawn per patch
+    patch_share: Annotated[float, Within("[0, 1)")] = 0.0  # share of the floor that slippery patches cover
 
 
 @dataclass(frozen=True, kw_only=True)
-class RewardConfig:
+class RewardConfig(Config):
     """Weights of the reward's terms."""
 
-    area: float = 0.1  # per m² newly mapped
-    pose_entropy: float = 0.01  # per nat of pose entropy lost
-    map_entropy: float = 0.0  # per bit-m² of map entropy lost
-    collision: float = -1.0  # per contact
-    effort: float = -0.002  # per second at full speed
-    time: float = -0.001  # per second
-
-    def __post_init__(self) -> None:
-        for f in dataclasses.fields(self):
-            require(math.isfinite(getattr(self, f.name)), f"RewardConfig.{f.name} must be finite")
+    area: Finite = 0.1  # per m² newly mapped
+    pose_entropy: Finite = 0.01  # per nat of pose entropy lost
+    map_entropy: Finite = 0.0  # per bit-m² of map entropy lost
+    collision: Finite = -1.0  # per contact
+    effort: Finite = -0.002  # per second at full speed
+    time: Finite = -0.001  # per second
 
 
 @dataclass(frozen=True, kw_only=True)
-class EnvConfig:
+class EnvConfig(Config):
     """An environment, whole. A string names a preset, generator or backend; ``*_config`` sets its details."""
 
     rooms: str = "apartment"
@@ -174,30 +177,36 @@ class EnvConfig:
     lidar: LidarConfig = field(default_factory=LidarConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     reward: RewardConfig = field(default_factory=RewardConfig)
-    step_s: float = 0.1
-    physics_step_s: float = 0.02
-    grid_resolution_m: float = 0.05
-    coverage_target: float = 0.95
-    time_limit_s: float = 300.0  # what ``progress`` counts against where the environment has no step limit
+    step_s: StepTime = 0.1
+    physics_step_s: StepTime = 0.02
+    grid_resolution_m: Annotated[float, Within("[0.01, 1]")] = 0.05
+    coverage_target: PositiveShare = 0.95
+    # What ``progress`` counts against where the environment has no step limit.
+    time_limit_s: Annotated[float, Within("[0.001, 1e9]")] = 300.0
     terminate_on_collision: bool = False
-    max_landmarks_observed: int = 32
+    max_landmarks_observed: Count = 32
 
     def __post_init__(self) -> None:
-        require(0 < self.physics_step_s <= self.step_s <= 1, "EnvConfig needs 0 < physics_step_s ≤ step_s ≤ 1")
+        super().__post_init__()
+        require(
+            self.physics_step_s <= self.step_s,
+            f"EnvConfig.physics_step_s must be at most step_s, {self.step_s}, got {self.physics_step_s}",
+        )
         substeps = self.step_s / self.physics_step_s
-        require(abs(substeps - round(substeps)) < 1e-6, "EnvConfig.step_s must be a multiple of physics_step_s")
-        require(0.01 <= self.grid_resolution_m <= 1, "EnvConfig.grid_resolution_m must be in [0.01, 1]")
-        require(0 < self.coverage_target <= 1, "EnvConfig.coverage_target must be in (0, 1]")
-        require(self.time_limit_s > 0, "EnvConfig.time_limit_s must be > 0")
-        require(self.max_landmarks_observed >= 1, "EnvConfig.max_landmarks_observed must be at least 1")
+        require(
+            abs(substeps - round(substeps)) < 1e-6,
+            f"EnvConfig.step_s must be a multiple of physics_step_s, {self.physics_step_s}, got {self.step_s}",
+        )
         for name in ("rooms_config", "slam_config", "odometry_filter_config"):
-            value = getattr(self, name)
-            require(isinstance(value, Mapping), f"EnvConfig.{name} must be a table of settings")
-            object.__setattr__(self, name, _plain(value))
+            object.__setattr__(self, name, _plain(getattr(self, name)))
 
 
 def _plain(value: Any) -> Any:
     """Return settings as TOML gives them back: tables of their own, without None; sequences as tuples."""
+    if isinstance(value, Config):
+        value = to_mapping(value)
+    if hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
     if isinstance(value, Mapping):
         return {key: _plain(inner) for key, inner in value.items() if inner is not None}
     if isinstance(value, list | tuple):
@@ -237,15 +246,19 @@ NOISE_PRESETS: dict[str, NoiseConfig] = {
 
 
 def resolve(cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str) -> T:
-    """Return a config from a preset's name, a mapping (laid over its ``preset`` key's), or a config."""
+    """Return a config from a preset's name, a mapping (laid over its ``preset`` key's), or a config.
+
+    ``what`` is the argument, and a word for its names perhaps, of which ``ValueError`` speaks.
+    """
     if isinstance(value, str):
-        if value not in presets:
-            raise unknown_name(what, value, presets)
+        check_name(what, value, presets)
         return presets[value]
+    base = None
     if isinstance(value, Mapping) and "preset" in value:
         base = resolve(cls, str(value["preset"]), presets, what)
-        return from_mapping(cls, {k: v for k, v in value.items() if k != "preset"}, base=base)
-    return from_mapping(cls, value)
+        value = {key: inner for key, inner in value.items() if key != "preset"}
+    with argument(what.partition(" ")[0]):
+        return from_mapping(cls, value, base=base)
 
 
 def from_toml(path: str | Path) -> EnvConfig:

@@ -31,7 +31,7 @@ from slam.dead_reckoning import TruthSlam
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.odometry.filters import make_odometry_filter
-from slam.settings import unknown_name
+from slam.settings import check_name
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["ExploreEnv"]
@@ -80,10 +80,9 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         floor_plan: str | Path | FloorPlan | None = None,
         **settings: Any,
     ) -> None:
-        if action not in ACTIONS:
-            raise unknown_name("action", action, ACTIONS)
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
+        check_name("action", action, ACTIONS)
+        if render_mode is not None:
+            check_name("render_mode", render_mode, self.metadata["render_modes"])
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
         self.render_mode = render_mode
@@ -108,8 +107,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         super().reset(seed=seed)
         options = options or {}
         for key in options:
-            if key not in ("floor_plan", "start_pose", "room_seed"):
-                raise unknown_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
+            check_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         room_seed = options.get("room_seed")
         plan = make_plan(

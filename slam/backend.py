@@ -6,7 +6,7 @@ import abc
 import copy
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,30 +20,28 @@ from slam.health.recovery import Recovery
 from slam.health.relocalisation import RelocalisationConfig
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
-from slam.settings import require
+from slam.settings import Config, Within
 from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class BackendConfig:
+class BackendConfig(Config):
     """What every backend needs to know of the robot, and of the map it shall draw."""
 
-    lidar_offset_m: float = 0.2  # L: how far ahead of the body's centre the sensor sits (theory.md A)
-    body_radius_m: float = 0.25  # of the disc that is marked as visited
-    grid_resolution_m: float = 0.05
+    # L: how far ahead of the body's centre the sensor sits (theory.md A)
+    lidar_offset_m: Annotated[float, Within("[-10, 10]")] = 0.2
+    body_radius_m: Annotated[float, Within("[0.01, 10]")] = 0.25  # of the disc that is marked as visited
+    grid_resolution_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     features: FeatureConfig = field(default_factory=FeatureConfig)
     key_scans: KeyScanConfig = field(default_factory=KeyScanConfig)
     health: HealthConfig = field(default_factory=HealthConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    start_sigma_m: float = 1e-4  # of the start pose where none is given: never exactly zero
-    start_sigma_rad: float = 1e-4
-
-    def __post_init__(self) -> None:
-        require(math.isfinite(self.lidar_offset_m), "BackendConfig.lidar_offset_m must be finite")
-        require(self.start_sigma_m > 0 and self.start_sigma_rad > 0, "BackendConfig.start_sigma_* must be > 0")
+    # Of the start pose where none is given: never exactly zero.
+    start_sigma_m: Annotated[float, Within("[1e-9, 10]")] = 1e-4
+    start_sigma_rad: Annotated[float, Within("[1e-9, 10]")] = 1e-4
 
 
 class Backend(abc.ABC):

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -29,7 +29,7 @@ from slam.gaussian.low_rank import FEWEST_SAMPLES, factor, root_of_loss
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
-from slam.settings import require
+from slam.settings import Gap, Within
 from slam.types import LINE, Array, Observations, Scan
 
 __all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
@@ -39,23 +39,14 @@ __all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
 class CompressedEkfConfig(EkfConfig):
     """EKF-SLAM with postponed updates."""
 
-    leave_share: float = 0.5  # of the sensor's reach: having moved so far, the robot takes another region
-    crowd: int = 100  # landmarks: a region of more is smaller, and sooner left
-    crowd_share: float = 0.5  # ``leave_share`` of such a region, at least
-    margin_m: float = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
-    whole_up_to: int = 0  # landmarks: so many are one region, wherever they are
-    rank_tolerance: float = (
-        1e-10  # what is left out of all correlations with what is far: root of the squares' sum
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(0 < self.leave_share <= 10, "CompressedEkfConfig.leave_share must be in (0, 10]")
-        require(self.crowd >= 0, "CompressedEkfConfig.crowd must be ≥ 0")
-        require(self.crowd_share > 0, "CompressedEkfConfig.crowd_share must be > 0")
-        require(self.margin_m >= 0, "CompressedEkfConfig.margin_m must be ≥ 0")
-        require(self.whole_up_to >= 0, "CompressedEkfConfig.whole_up_to must be ≥ 0")
-        require(self.rank_tolerance > 0, "CompressedEkfConfig.rank_tolerance must be > 0")
+    # Of the sensor's reach: having moved so far, the robot takes another region.
+    leave_share: Annotated[float, Within("[0.001, 10]")] = 0.5
+    crowd: Annotated[int, Within("[0, 10000]")] = 100  # landmarks: a region of more is smaller, and sooner left
+    crowd_share: Annotated[float, Within("[0.001, 10]")] = 0.5  # ``leave_share`` of such a region, at least
+    margin_m: Gap = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
+    whole_up_to: Annotated[int, Within("[0, 10000]")] = 0  # landmarks: so many are one region, wherever they are
+    # What is left out of all correlations with what is far: root of the squares' sum.
+    rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-10
 
 
 class Change(NamedTuple):

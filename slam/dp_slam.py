@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from slam.particles.resampling import (
     systematic,
 )
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
-from slam.settings import require
+from slam.settings import Few, Gap, PositiveShare, Sigma, Within
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]
@@ -47,18 +48,19 @@ _LEAD_SHARE = 0.5  # the map's particle is followed until another weighs more th
 class DpSlamConfig(BackendConfig):
     """DP-SLAM: particles, when they are updated, how freely they are drawn."""
 
-    particles: int = 30
-    update_m: float = 0.2  # the particles are updated when the robot has moved …
-    update_rad: float = 0.2  # … or turned so far since the last time
+    particles: Few = 30
+    update_m: Gap = 0.2  # the particles are updated when the robot has moved …
+    update_rad: Gap = 0.2  # … or turned so far since the last time
     # What scan-matched odometry may have drifted from one update to the next, besides its own covariance. More
     # than it does: particles that all go one way cannot close a loop (docs/reference/dp_slam.md).
-    drift_m: float = 0.02
-    drift_rad: float = 0.01
-    tile_m: float = 2.0  # side of the pieces of the map that have an error each, in the covariance
+    drift_m: Sigma = 0.02
+    drift_rad: Sigma = 0.01
+    # Side of the pieces of the map that have an error each, in the covariance.
+    tile_m: Annotated[float, Within("[0.1, 1000]")] = 2.0
     # Likelihood of a beam's end, against 1 on a surface, where a particle's map knows nothing, and where it knows
     # of no surface: what is new says less against a particle than what contradicts its map.
-    unknown: float = 0.3
-    free: float = 0.1
+    unknown: PositiveShare = 0.3
+    free: PositiveShare = 0.1
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     matching: MatchConfig = field(default_factory=MatchConfig)
     scan_odometry: ScanOdometryConfig = field(default_factory=ScanOdometryConfig)
@@ -68,14 +70,6 @@ class DpSlamConfig(BackendConfig):
         against_fine=(0.60, 0.25, 0.10, 0.04, 0.01), sharp_fine=(0.02, 0.12, 0.33, 0.33, 0.20), bias=2.7
     ))  # fmt: skip
     copies: bool = False  # a grid of its own for each particle instead of the shared one: the same, dearer
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.particles >= 1, "DpSlamConfig.particles must be at least 1")
-        require(self.update_m >= 0 and self.update_rad >= 0, "DpSlamConfig.update_* must be ≥ 0")
-        require(self.tile_m > 0, "DpSlamConfig.tile_m must be > 0")
-        require(self.drift_m > 0 and self.drift_rad > 0, "DpSlamConfig.drift_* must be > 0")
-        require(0 < self.free <= 1 and 0 < self.unknown <= 1, "DpSlamConfig.free and unknown must be in (0, 1]")
 
 
 class DpSlam(SurfaceBackend):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import abc
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ from slam.particles.resampling import (
     scattered,
     systematic,
 )
-from slam.settings import require
+from slam.settings import Count, NotNegative, Positive, Within
 from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
@@ -48,21 +49,17 @@ Indices = NDArray[np.int64]
 class FastSlamConfig(BackendConfig):
     """FastSLAM: particles, resampling, gating and landmark management."""
 
-    particles: int = 100
+    particles: Count = 100
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
-    gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
-    max_turn_deg: float = 35.0  # difference in a corner's direction
-    known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
+    gate: Positive = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
+    max_turn_deg: Annotated[float, Within("[0, 180]")] = 35.0  # difference in a corner's direction
+    known_gate: Annotated[float, Within("(0, inf]")] = (
+        math.inf
+    )  # the same for observations with ids: a finite one refuses misread labels
     # An observation that no landmark of a particle explains weighs as one at this squared distance from a
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
-    unexplained: float = 11.83
+    unexplained: NotNegative = 11.83
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.particles >= 1, "FastSlamConfig.particles must be at least 1")
-        require(self.gate > 0 and self.known_gate > 0, "FastSlamConfig.gate and known_gate must be > 0")
-        require(self.unexplained >= 0, "FastSlamConfig.unexplained must be ≥ 0")
 
 
 class FastSlam(LandmarkBackend):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -24,6 +25,7 @@ from slam.gaussian.tiles import add_combination, downdate, product
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
+from slam.settings import Within
 from slam.types import LINE, Array, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
@@ -35,9 +37,10 @@ _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since wall
 class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
     """Right-invariant EKF-SLAM over walls and corners, in regions where the map is large."""
 
-    leave_share: float = 1.5  # larger regions than its parent's: another one takes as long as a hundred steps
-    whole_up_to: int = 300
-    rank_tolerance: float = 1e-8
+    # Larger regions than its parent's: another one takes as long as a hundred steps.
+    leave_share: Annotated[float, Within("[0.001, 10]")] = 1.5
+    whole_up_to: Annotated[int, Within("[0, 10000]")] = 300
+    rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-8
 
     wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
 

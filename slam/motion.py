@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 
 from slam.geometry import wrap_scalar
-from slam.settings import require
+from slam.settings import Config, NotNegative, Positive, Within
 from slam.types import Array, Odometry
 
 __all__ = ["LastingErrors", "OdometryNoise", "Twist", "jacobians", "move", "predict_robot", "twist_between"]
@@ -22,24 +23,19 @@ _UNEVEN = 0.25  # share of what slips along that turns the body: found on the si
 
 
 @dataclass(frozen=True, kw_only=True)
-class LastingErrors:
+class LastingErrors(Config):
     """How far off a wheel's radius and the lever may be, and the noise that is left of V when they are known."""
 
-    radius_sigma: float = 0.0  # relative
-    lever_sigma: float = 0.0  # relative
-    difference_sigma: float = 0.0  # relative, of the right wheels' radii and, by as much less, of the left ones'
-    white_speed_share: float | None = None  # OdometryNoise's shares without what lasts; None: all of them
-    white_turn_share_rad_m: float | None = None
-
-    def __post_init__(self) -> None:
-        shares = ("white_speed_share", "white_turn_share_rad_m")
-        for name in ("radius_sigma", "lever_sigma", "difference_sigma", *shares):
-            value = getattr(self, name)
-            require(value is None or (math.isfinite(value) and value >= 0), f"LastingErrors.{name} must be ≥ 0")
+    radius_sigma: Annotated[float, Within("[0, 10]")] = 0.0  # relative
+    lever_sigma: Annotated[float, Within("[0, 10]")] = 0.0  # relative
+    # Relative, of the right wheels' radii and, by as much less, of the left ones'.
+    difference_sigma: Annotated[float, Within("[0, 10]")] = 0.0
+    white_speed_share: NotNegative | None = None  # OdometryNoise's shares without what lasts; None: all of them
+    white_turn_share_rad_m: NotNegative | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
-class OdometryNoise:
+class OdometryNoise(Config):
     """V, the covariance of the measured twist, diagonal: each σ is a floor plus a share of the wheels' speed.
 
     The wheels' speed is √(vx² + vy² + (lω)²). The shares are larger than the encoders' white noise alone, since
@@ -48,22 +44,15 @@ class OdometryNoise:
     ``grip_m_s2`` adds its own share.
     """
 
-    lever_m: float = 0.3855  # l: half the wheelbase plus half the track
-    speed_floor_m_s: float = 0.002
-    speed_share: float = 0.012
-    turn_floor_rad_s: float = 0.003
-    turn_share_rad_m: float = 0.03
-    grip_m_s2: float = 1.5  # change of the wheels' speed over time from which they slip
-    slip_share: float = 0.55  # σ, of what may have slipped
-    slide_m_s2: float = 1.5  # by which the floor lets the body follow wheels that slip
+    lever_m: Annotated[float, Within("[0.01, 10]")] = 0.3855  # l: half the wheelbase plus half the track
+    speed_floor_m_s: Annotated[float, Within("[0, 100]")] = 0.002
+    speed_share: Annotated[float, Within("[0, 100]")] = 0.012
+    turn_floor_rad_s: Annotated[float, Within("[0, 100]")] = 0.003
+    turn_share_rad_m: Annotated[float, Within("[0, 100]")] = 0.03
+    grip_m_s2: Positive = 1.5  # change of the wheels' speed over time from which they slip
+    slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may have slipped
+    slide_m_s2: Positive = 1.5  # by which the floor lets the body follow wheels that slip
     lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
-
-    def __post_init__(self) -> None:
-        for name in ("speed_floor_m_s", "speed_share", "turn_floor_rad_s", "turn_share_rad_m"):
-            require(getattr(self, name) >= 0, f"OdometryNoise.{name} must be ≥ 0")
-        require(self.lever_m > 0, "OdometryNoise.lever_m must be > 0")
-        require(self.grip_m_s2 > 0 and self.slide_m_s2 > 0, "OdometryNoise.grip_m_s2, slide_m_s2 must be > 0")
-        require(self.slip_share >= 0, "OdometryNoise.slip_share must be ≥ 0")
 
     def variances(
         self, vx: float, vy: float, omega: float, *, slip: tuple[float, float] = NO_SLIP

@@ -15,7 +15,7 @@ from slam.gaussian.settings import EkfConfig, EkfLinesConfig
 from slam.graph.graph_slam import GraphSlam
 from slam.graph.settings import GraphSlamConfig
 from slam.invariant import InvariantEkfConfig, InvariantEkfSlam
-from slam.settings import from_mapping, unknown_name
+from slam.settings import argument, check_name, from_mapping
 
 __all__ = ["config_type", "make", "names", "register"]
 
@@ -53,8 +53,7 @@ def names() -> tuple[str, ...]:
 
 def config_type(name: str) -> type[BackendConfig]:
     """Return the config dataclass of a backend; ``ValueError`` lists the valid names."""
-    if name not in _BACKENDS:
-        raise unknown_name("SLAM backend", name, _BACKENDS)
+    check_name("SLAM backend", name, _BACKENDS)
     return _BACKENDS[name][1]
 
 
@@ -63,5 +62,7 @@ def make(name: str, *, config: Mapping[str, Any] | BackendConfig | None = None) 
 
     Raises ``ValueError`` that lists what is valid where the name or a key is unknown.
     """
-    settings = from_mapping(config_type(name), config)
+    cls = config_type(name)
+    with argument("config"):
+        settings = from_mapping(cls, config)
     return _BACKENDS[name][0](settings)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from agents.driving.sides import parting_lines
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.settings import positive, require
+from slam.settings import Angle, Config, Duration, Length, Rate, Within
 from slam.types import Array
 
 __all__ = ["ControlConfig", "PathFollower"]
@@ -26,36 +26,32 @@ _CREEP_HALF_RAD = 0.35  # half the width of the way that must be free
 
 
 @dataclass(frozen=True, kw_only=True)
-class ControlConfig:
+class ControlConfig(Config):
     """Speeds, accelerations and gaps of the path follower."""
 
-    speed_share: float = 0.95  # of the robot's limit
-    near_wall_m_s: float = 0.4  # speed at the least clearance at which the robot may turn
-    open_m: float = 0.25  # clearance beyond that one from which walls no longer slow it
-    acceleration_m_s2: float = 1.2
-    deceleration_m_s2: float = 0.8  # towards the goal and into turns
-    braking_m_s2: float = 1.5  # what the safety check counts on: a slippery floor gives no more
-    turn_rate_rad_s: float = 0.8
-    turn_gain: float = 2.0  # turn rate per heading error [1/s]
-    turn_acceleration_rad_s2: float = 3.0
+    speed_share: Annotated[float, Within("[0.01, 1]")] = 0.95  # of the robot's limit
+    near_wall_m_s: Rate = 0.4  # speed at the least clearance at which the robot may turn
+    open_m: Length = 0.25  # clearance beyond that one from which walls no longer slow it
+    acceleration_m_s2: Rate = 1.2
+    deceleration_m_s2: Rate = 0.8  # towards the goal and into turns
+    braking_m_s2: Rate = 1.5  # what the safety check counts on: a slippery floor gives no more
+    turn_rate_rad_s: Rate = 0.8
+    turn_gain: Rate = 2.0  # turn rate per heading error [1/s]
+    turn_acceleration_rad_s2: Rate = 3.0
     any_side: bool = False  # whichever side leads is quickest; for lidars that see all round
-    lag_s: float = 0.2  # a step and the motors' lag: how long a twist is held before braking shows
-    look_ahead_s: float = 0.7
-    min_look_ahead_m: float = 0.25
-    max_look_ahead_m: float = 0.6
-    lateral_m_s2: float = 0.5  # in turns of the path
-    align_rad: float = 0.25  # heading error within which a tight passage is entered
-    map_gap_m: float = 0.04  # between body and occupied cells, and 2σ of the position more, capped
-    max_sigma_gap_m: float = 0.05  # the planner's cap: where a path is planned, it can be driven
-    scan_gap_m: float = 0.04  # between body and what the scan hit
-    robot_gap_m: float = 0.05  # between body and the line that parts it from another robot
-    arrival_m_s: float = 0.2  # speed at which the goal is reached; what is left is braked away there
-    arrived_m: float = 0.12
-    arrived_rad: float = 0.2
-
-    def __post_init__(self) -> None:
-        positive(self, *(f.name for f in fields(self) if f.name != "any_side"))
-        require(self.speed_share <= 1, f"ControlConfig.speed_share must be ≤ 1, got {self.speed_share}")
+    lag_s: Duration = 0.2  # a step and the motors' lag: how long a twist is held before braking shows
+    look_ahead_s: Duration = 0.7
+    min_look_ahead_m: Length = 0.25
+    max_look_ahead_m: Length = 0.6
+    lateral_m_s2: Rate = 0.5  # in turns of the path
+    align_rad: Angle = 0.25  # heading error within which a tight passage is entered
+    map_gap_m: Length = 0.04  # between body and occupied cells, and 2σ of the position more, capped
+    max_sigma_gap_m: Length = 0.05  # the planner's cap: where a path is planned, it can be driven
+    scan_gap_m: Length = 0.04  # between body and what the scan hit
+    robot_gap_m: Length = 0.05  # between body and the line that parts it from another robot
+    arrival_m_s: Rate = 0.2  # speed at which the goal is reached; what is left is braked away there
+    arrived_m: Length = 0.12
+    arrived_rad: Angle = 0.2
 
 
 class PathFollower:

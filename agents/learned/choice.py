@@ -7,7 +7,8 @@ the rows carry no order: what is learned on few candidates goes for many.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -23,7 +24,7 @@ from agents.ways.travel import between
 from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
-from slam.settings import positive
+from slam.settings import Config, Duration, Few, Length, Within
 from slam.types import Array
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
@@ -50,21 +51,18 @@ STATE = ("time", "known_m2", "candidates", "sigma_m", "sigma_rad", "share_visite
 
 
 @dataclass(frozen=True, kw_only=True)
-class ChoiceConfig:
+class ChoiceConfig(Config):
     """How much of the choice is shown."""
 
-    most: int = 24  # candidates: the cheapest to reach
-    patch_cells: int = 16  # side of a patch
-    patch_m: float = 0.5  # side of one of its cells …
-    wide_m: float = 1.0  # … and of a wider one's
-    beyond_m: float = 2.0  # from the frontier to the patches' middle, into the unknown
-    near_m: float = 2.0  # how far into the unknown an optimist sees …
-    far_m: float = 5.0  # … and a greater one
-    horizon_s: float = 300.0  # that time counts against
+    most: Few = 24  # candidates: the cheapest to reach
+    patch_cells: Annotated[int, Within("[1, 256]")] = 16  # side of a patch
+    patch_m: Length = 0.5  # side of one of its cells …
+    wide_m: Length = 1.0  # … and of a wider one's
+    beyond_m: Length = 2.0  # from the frontier to the patches' middle, into the unknown
+    near_m: Length = 2.0  # how far into the unknown an optimist sees …
+    far_m: Length = 5.0  # … and a greater one
+    horizon_s: Duration = 300.0  # that time counts against
     uncertainty: bool = True  # covariance and landmarks are shown; else 0 stands in their columns
-
-    def __post_init__(self) -> None:
-        positive(self, *(f.name for f in fields(self) if f.name != "uncertainty"))
 
 
 @dataclass(frozen=True, eq=False)

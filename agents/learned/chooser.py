@@ -15,23 +15,26 @@ from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
 from slam.belief import Belief
-from slam.settings import positive, require
+from slam.settings import Config, PositiveShare, Rate, require
 
 __all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlipConfig:
+class SlipConfig(Config):
     """How a floor found slippery is driven on: beyond what it grips wheels slide, and odometry tells less."""
 
-    acceleration_m_s2: float = 1.0
-    lateral_m_s2: float = 0.75  # in turns of the path
-    firm_share: float = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
-    slippery_share: float = 0.02  # … from here on it is driven as gently as it can be
+    acceleration_m_s2: Rate = 1.0
+    lateral_m_s2: Rate = 0.75  # in turns of the path
+    firm_share: PositiveShare = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
+    slippery_share: PositiveShare = 0.02  # … from here on it is driven as gently as it can be
 
     def __post_init__(self) -> None:
-        positive(self)
-        require(self.firm_share < self.slippery_share, "SlipConfig needs firm_share < slippery_share")
+        super().__post_init__()
+        require(
+            self.firm_share < self.slippery_share,
+            f"SlipConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
+        )
 
     def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
         """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
@@ -48,7 +51,10 @@ class ChooserConfig(TourConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(self.stations.spacing_m == 0, "ChooserConfig.stations.spacing_m must be 0: it drives anywhere")
+        require(
+            self.stations.spacing_m == 0,
+            f"ChooserConfig.stations.spacing_m must be 0, as it drives anywhere, got {self.stations.spacing_m}",
+        )
 
 
 class Chooser(Tour):

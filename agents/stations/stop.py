@@ -14,7 +14,7 @@ from agents.base import Agent, Goal
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import not_negative, positive, require
+from slam.settings import Config, Few, Gap, Length
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
@@ -23,17 +23,12 @@ Cell = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StationsConfig:
+class StationsConfig(Config):
     """The lattice that the robot hops on, where it is no robot that drives anywhere and looks all the while."""
 
-    spacing_m: float = 0.0  # between stations, through the start; 0: there are none
-    hop: int = 2  # stations a hop goes at most along each axis
-    reach_m: float = 12.0  # from which a piece of frontier is looked at
-
-    def __post_init__(self) -> None:
-        not_negative(self, "spacing_m")
-        require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
-        positive(self, "reach_m")
+    spacing_m: Gap = 0.0  # between stations, through the start; 0: there are none
+    hop: Few = 2  # stations a hop goes at most along each axis
+    reach_m: Length = 12.0  # from which a piece of frontier is looked at
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,23 +19,20 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from agents.teams.team_tour import TeamTour, TeamTourConfig
 from slam.belief import Belief
-from slam.settings import positive
+from slam.settings import Config, Duration, Rate
 from slam.types import Array
 
 __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class AppointmentsConfig:
+class AppointmentsConfig(Config):
     """When robots meet."""
 
-    every_s: float = 60.0  # from the beginning on
-    wait_s: float = 10.0  # for those that are late
-    heard_s: float = 2.0  # who was heard so lately is there
-    speed_m_s: float = 0.4  # at which the way there is driven, about
-
-    def __post_init__(self) -> None:
-        positive(self)
+    every_s: Duration = 60.0  # from the beginning on
+    wait_s: Duration = 10.0  # for those that are late
+    heard_s: Duration = 2.0  # who was heard so lately is there
+    speed_m_s: Rate = 0.4  # at which the way there is driven, about
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from agents.teams.sharing import share_tours
 from agents.view_points.gain import expected_area
 from agents.ways.travel import between
 from slam.belief import Belief
-from slam.settings import not_negative, positive
+from slam.settings import Config, Duration, Few, Length, NotNegative
 
 __all__ = ["Shared", "SharingConfig"]
 
@@ -21,18 +21,15 @@ _FAR = 1e6  # [m] farther than anything is
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharingConfig:
+class SharingConfig(Config):
     """How what is left is shared out."""
 
-    trust_s: float = 20.0  # how long a robot that is no longer heard is counted on, where it was
-    most: int = 40  # pieces of frontier that are shared out: those nearest to any robot
-    service_m_m2: float = 0.0  # what a square metre of new area counts for, as a way
-    depth_m: float = 3.0  # how far behind a frontier new area is expected
-    hold_m: float = 3.0  # shorter is the way to what a robot is on its way to: parts that change hands cost turns
-
-    def __post_init__(self) -> None:
-        positive(self, "trust_s", "most", "depth_m")
-        not_negative(self, "service_m_m2", "hold_m")
+    trust_s: Duration = 20.0  # how long a robot that is no longer heard is counted on, where it was
+    most: Few = 40  # pieces of frontier that are shared out: those nearest to any robot
+    service_m_m2: NotNegative = 0.0  # what a square metre of new area counts for, as a way
+    depth_m: Length = 3.0  # how far behind a frontier new area is expected
+    # Shorter is the way to what a robot is on its way to: parts that change hands cost turns.
+    hold_m: NotNegative = 3.0
 
 
 _USUAL = SharingConfig()

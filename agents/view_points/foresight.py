@@ -14,8 +14,9 @@ proportions between errors of different units.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -31,7 +32,7 @@ from slam.gaussian.stacked_update import whiten, work_space
 from slam.gaussian.tiles import downdate
 from slam.landmarks.association import predicted
 from slam.motion import OdometryNoise, predict_robot, twist_between
-from slam.settings import positive
+from slam.settings import Config, Few, Length, Rate, Within
 from slam.types import LINE, Array
 
 __all__ = [
@@ -49,18 +50,16 @@ _MOST = 32  # landmarks in one update: those that the sensor sees best
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForesightConfig:
+class ForesightConfig(Config):
     """How a path is thought through."""
 
-    leg_m: float = 0.75  # the scans of a leg are taken together, as seen from its end
-    most_legs: int = 8  # of a path: those of a long one are longer
-    speed_m_s: float = 0.45  # at which paths are driven, on average
-    turn_rate_rad_s: float = 0.8
-    lever_m: float = 4.0  # an error of the heading counts as what it moves at this distance
+    # The scans of a leg are taken together, as seen from its end.
+    leg_m: Annotated[float, Within("[0.05, 1000]")] = 0.75
+    most_legs: Few = 8  # of a path: those of a long one are longer
+    speed_m_s: Rate = 0.45  # at which paths are driven, on average
+    turn_rate_rad_s: Rate = 0.8
+    lever_m: Length = 4.0  # an error of the heading counts as what it moves at this distance
     sensor: SensorModel = field(default_factory=SensorModel)
-
-    def __post_init__(self) -> None:
-        positive(self, *(f.name for f in fields(self) if f.name != "sensor"))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -12,32 +13,30 @@ from numpy.typing import NDArray
 from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import not_negative, positive
+from slam.settings import Config, Gap, Length, NotNegative, Within
 from slam.types import Array
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrontierConfig:
+class FrontierConfig(Config):
     """What counts as a frontier, and from where one is looked at."""
 
-    min_extent_m: float = 0.4  # longer side of a cluster's bounding box; at most the body's width
-    far_extent_m: float = 0.7  # the same at a travel cost of far_m and beyond; at most twice the body's width
-    far_m: float = 6.0  # [weighted m]; up to there in proportion
-    remote_m: float = 30.0  # [weighted m]; what is farther off must show, or it is not worth the way, …
-    remote_m2_m: float = 0.05  # … so much of the unknown for each metre beyond
-    opening_m2: float = 2.0  # unknown in view from one that is smaller, for it to be gone to at last
-    min_unknown_m2: float = 0.05  # smaller unknown pockets hold nothing to find
-    min_unknown_width_m: float = 0.3  # thinner ones are the insides of walls
-    min_clearance_m: float = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
-    spacing_m: float = 0.6  # a long cluster is looked at in pieces of about this size
-    view_range_m: float = 4.0  # farthest place to look from, squarely; never beyond 0.8 of the lidar's range
-    beyond_m: float = 0.3  # how far behind the frontier a view point must see
-
-    def __post_init__(self) -> None:
-        not_negative(self)
-        positive(self, "spacing_m", "view_range_m", "far_m")
+    min_extent_m: Gap = 0.4  # longer side of a cluster's bounding box; at most the body's width
+    far_extent_m: Gap = 0.7  # the same at a travel cost of far_m and beyond; at most twice the body's width
+    far_m: Length = 6.0  # [weighted m]; up to there in proportion
+    remote_m: Length = 30.0  # [weighted m]; what is farther off must show, or it is not worth the way, …
+    remote_m2_m: NotNegative = 0.05  # … so much of the unknown for each metre beyond
+    opening_m2: NotNegative = 2.0  # unknown in view from one that is smaller, for it to be gone to at last
+    min_unknown_m2: NotNegative = 0.05  # smaller unknown pockets hold nothing to find
+    min_unknown_width_m: Gap = 0.3  # thinner ones are the insides of walls
+    min_clearance_m: Gap = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
+    # A long cluster is looked at in pieces of about this size.
+    spacing_m: Annotated[float, Within("[0.05, 1000]")] = 0.6
+    # Farthest place to look from, squarely; never beyond 0.8 of the lidar's range.
+    view_range_m: Annotated[float, Within("[0.05, 1000]")] = 4.0
+    beyond_m: Gap = 0.3  # how far behind the frontier a view point must see
 
     def for_body(self, width_m: float) -> FrontierConfig:
         """Return the same for a body of this width [m]: where a small one could pass is worth a look."""

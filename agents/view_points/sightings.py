@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import CostMap, kind_at
 from mecanum_env.config import LidarConfig
 from slam.grids.occupancy import FREE
-from slam.settings import positive
+from slam.settings import Config, Length, Positive, Sigma
 from slam.types import LINE, Array
 
 __all__ = ["BEAM", "SensorModel", "expected_sightings"]
@@ -33,19 +33,16 @@ _MOST_PIECES = 40
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorModel:
+class SensorModel(Config):
     """What is needed of the lidar beside its geometry."""
 
-    range_sigma_m: float = 0.01  # of one beam
-    corner_share: float = 0.5  # 1σ of a corner, as a share of the beams' spacing there
-    corner_sigma_m: float = 0.004  # … and what remains however near it is
-    wall_length_m: float = 0.6  # least of a wall to be taken for one
-    wall_beams: float = 10.0
-    wall_sigma_m: float = 0.0003  # that straight walls are not
-    wall_sigma_rad: float = 0.0002
-
-    def __post_init__(self) -> None:
-        positive(self)
+    range_sigma_m: Sigma = 0.01  # of one beam
+    corner_share: Sigma = 0.5  # 1σ of a corner, as a share of the beams' spacing there
+    corner_sigma_m: Sigma = 0.004  # … and what remains however near it is
+    wall_length_m: Length = 0.6  # least of a wall to be taken for one
+    wall_beams: Positive = 10.0
+    wall_sigma_m: Sigma = 0.0003  # that straight walls are not
+    wall_sigma_rad: Sigma = 0.0002
 
 
 def expected_sightings(

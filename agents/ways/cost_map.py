@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from agents.ways.keeping import KeptBlocks
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
-from slam.settings import not_negative, positive
+from slam.settings import Config, Gap, NotNegative, Within
 from slam.types import Array
 
 __all__ = [
@@ -33,7 +34,7 @@ _OLD_S = 5.0  # what is older says no longer where a robot is in the way
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannerConfig:
+class PlannerConfig(Config):
     """How near to walls the robot's centre may pass, and what nearness costs.
 
     Clearance is the distance from the robot's centre to the nearest occupied cell's edge. Above the comfortable
@@ -41,22 +42,22 @@ class PlannerConfig:
     path, which the follower sees to.
     """
 
-    resolution_m: float = 0.1  # of the planning grid; made finer for a small robot
-    margin_m: float = 0.05  # comfortable: circumscribed radius + margin + 2σ of the position, capped
-    tight_margin_m: float = 0.07  # tight: inscribed radius + this + the same
-    max_sigma_margin_m: float = 0.05  # far from the start σ is large, and the walls nearby are no less certain
-    unknown_margin_m: float = 0.02  # from what is not known: inscribed radius + this
-    preferred_m: float = 0.2  # clearance beyond the comfortable one from which nearness costs nothing
-    near_cost: float = 1.0  # added to the price of a metre at the comfortable clearance
-    tight_cost: float = 3.0  # added again at the tight clearance
-    path_spacing_m: float = 0.1
-    robot_cost: float = 6.0  # added to the price of a metre where another robot is nearer than would do to pass …
-    robot_margin_m: float = 0.1  # … which is both bodies' radii and this …
-    robots_within_m: float = 3.0  # … if it is no farther than this: what is farther off will have moved on
-
-    def __post_init__(self) -> None:
-        not_negative(self)
-        positive(self, "resolution_m", "preferred_m", "path_spacing_m")
+    resolution_m: Annotated[float, Within("[0.02, 1]")] = 0.1  # of the planning grid; made finer for a small robot
+    # Comfortable: circumscribed radius + margin + 2σ of the position, capped.
+    margin_m: Annotated[float, Within("[0, 10]")] = 0.05
+    tight_margin_m: Annotated[float, Within("[0, 10]")] = 0.07  # tight: inscribed radius + this + the same
+    # Far from the start σ is large, and the walls nearby are no less certain.
+    max_sigma_margin_m: Annotated[float, Within("[0, 10]")] = 0.05
+    unknown_margin_m: Annotated[float, Within("[0, 10]")] = 0.02  # from what is not known: inscribed radius + this
+    # Clearance beyond the comfortable one from which nearness costs nothing.
+    preferred_m: Annotated[float, Within("[0.001, 10]")] = 0.2
+    near_cost: NotNegative = 1.0  # added to the price of a metre at the comfortable clearance
+    tight_cost: NotNegative = 3.0  # added again at the tight clearance
+    path_spacing_m: Annotated[float, Within("[0.01, 1000]")] = 0.1
+    # Added to the price of a metre where another robot is nearer than would do to pass …
+    robot_cost: NotNegative = 6.0
+    robot_margin_m: Annotated[float, Within("[0, 10]")] = 0.1  # … which is both bodies' radii and this …
+    robots_within_m: Gap = 3.0  # … if it is no farther than this: what is farther off will have moved on
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts, travel_costs, way_cells
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief, Teammate
-from slam.settings import positive
+from slam.settings import Config, Duration, Length, Rate
 from slam.types import Array
 
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
@@ -27,21 +27,18 @@ _SLOW_M_S = 0.06  # that is held up
 
 
 @dataclass(frozen=True, kw_only=True)
-class GivingWayConfig:
+class GivingWayConfig(Config):
     """When a robot gives way, and for how long."""
 
-    near_m: float = 1.3  # between centres: nearer than this robots can hold each other up
-    patience_s: float = 0.8  # with one that has right of way
-    firm_s: float = 4.0  # with one that has not
-    idle_near_m: float = 2.0  # one without a goal looks out for others as far as this
-    pass_s: float = 3.0  # to wait beside the way
-    speed_m_s: float = 0.4  # at which it drives there, about
-    beside_m: float = 0.1  # between the bodies when one passes, both turned as it likes
-    far_m: float = 15.0  # [weighted m] that a place may be off
-    avoid_s: float = 10.0  # how long what lies beyond the other is put last
-
-    def __post_init__(self) -> None:
-        positive(self)
+    near_m: Length = 1.3  # between centres: nearer than this robots can hold each other up
+    patience_s: Duration = 0.8  # with one that has right of way
+    firm_s: Duration = 4.0  # with one that has not
+    idle_near_m: Length = 2.0  # one without a goal looks out for others as far as this
+    pass_s: Duration = 3.0  # to wait beside the way
+    speed_m_s: Rate = 0.4  # at which it drives there, about
+    beside_m: Length = 0.1  # between the bodies when one passes, both turned as it likes
+    far_m: Length = 15.0  # [weighted m] that a place may be off
+    avoid_s: Duration = 10.0  # how long what lies beyond the other is put last
 
 
 class GivingWay:

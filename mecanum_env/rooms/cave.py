@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -13,10 +14,9 @@ from numpy.typing import NDArray
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M
-from mecanum_env.rooms.layout.limits import interval
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise
-from slam.settings import require, shares
+from slam.settings import Config, Share, Span, require
 from slam.types import Array
 
 __all__ = ["CaveConfig", "cave"]
@@ -44,26 +44,25 @@ _PILLAR_GAP_M = 0.95  # between a pillar and everything else
 
 
 @dataclass(frozen=True, kw_only=True)
-class CaveConfig:
+class CaveConfig(Config):
     """Limits between which a cave is drawn, by seed."""
 
-    area_m2: tuple[float, float] = (60.0, 150.0)  # free floor
-    chamber_m: tuple[float, float] = (1.2, 2.3)  # radius of a chamber
-    passage_m: tuple[float, float] = (1.4, 2.2)  # width of a passage, before the noise
-    loops: float = 0.6  # probability of a passage beyond those that join every chamber
-    roughness: float = 0.5  # 0 smooth ovals and tubes, 1 as ragged as can be
-    pillars: tuple[int, int] = (0, 3)
+    area_m2: Annotated[tuple[float, float], Span("[30, 300]")] = (60.0, 150.0)  # free floor
+    chamber_m: Annotated[tuple[float, float], Span("[1, 4]")] = (1.2, 2.3)  # radius of a chamber
+    passage_m: Annotated[tuple[float, float], Span("[1.3, 4]")] = (
+        1.4,
+        2.2,
+    )  # width of a passage, before the noise
+    loops: Share = 0.6  # probability of a passage beyond those that join every chamber
+    roughness: Share = 0.5  # 0 smooth ovals and tubes, 1 as ragged as can be
+    pillars: Annotated[tuple[int, int], Span("[0, 10]")] = (0, 3)
 
     def __post_init__(self) -> None:
-        interval(self, "area_m2", low=30.0, high=300.0)
+        super().__post_init__()
         least, most = self.area_m2
         # Of 5 % width 11 of 12 intervals are met; a narrower one would cost seconds of drawing before this advice.
         require(most >= _AREA_WIDTH * least, f"CaveConfig.area_m2 needs most ≥ {_AREA_WIDTH} · least, got "
                                              f"{self.area_m2}; widen it")  # fmt: skip
-        interval(self, "chamber_m", low=1.0, high=4.0)
-        interval(self, "passage_m", low=1.3, high=4.0)
-        interval(self, "pillars", low=0, high=10, whole=True)
-        shares(self, "loops", "roughness")
 
 
 def cave(config: CaveConfig, *, seed: int) -> FloorPlan:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,8 @@ from numpy.typing import NDArray
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, cells
-from mecanum_env.rooms.layout.limits import interval
 from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
-from slam.settings import shares
+from slam.settings import Config, Share, Span
 
 __all__ = ["Grid", "MazeConfig", "draw_grid", "maze"]
 
@@ -21,21 +21,17 @@ _BRANCH = 0.2  # probability to go on from any place reached, not from the last 
 
 
 @dataclass(frozen=True, kw_only=True)
-class MazeConfig:
+class MazeConfig(Config):
     """Limits between which a maze is drawn, by seed."""
 
-    columns: tuple[int, int] = (6, 8)
-    rows: tuple[int, int] = (6, 8)
-    corridor_m: tuple[float, float] = (1.2, 1.6)  # width, drawn for each column and each row
-    wall_m: tuple[float, float] = (0.1, 0.2)  # thickness, one for the maze
-    loops: float = 0.15  # share of the perfect maze's inner walls that are taken out
-
-    def __post_init__(self) -> None:
-        for name in ("columns", "rows"):
-            interval(self, name, low=2, high=24, whole=True)
-        interval(self, "corridor_m", low=1.1, high=4.0)
-        interval(self, "wall_m", low=0.05, high=1.0)
-        shares(self, "loops")
+    columns: Annotated[tuple[int, int], Span("[2, 24]")] = (6, 8)
+    rows: Annotated[tuple[int, int], Span("[2, 24]")] = (6, 8)
+    corridor_m: Annotated[tuple[float, float], Span("[1.1, 4]")] = (
+        1.2,
+        1.6,
+    )  # width, drawn for each column and each row
+    wall_m: Annotated[tuple[float, float], Span("[0.05, 1]")] = (0.1, 0.2)  # thickness, one for the maze
+    loops: Share = 0.15  # share of the perfect maze's inner walls that are taken out
 
 
 @dataclass(frozen=True, slots=True)

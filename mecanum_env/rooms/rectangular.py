@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.rooms.layout.assembly import assemble, generator
 from mecanum_env.rooms.layout.furniture import Furnisher, cells
-from mecanum_env.rooms.layout.limits import interval
-from slam.settings import require, shares
+from slam.settings import Config, Share, Span, require
 
 __all__ = ["RectangularConfig", "rectangular"]
 
@@ -18,20 +18,21 @@ _MARGIN = 4  # solid cells around the room
 
 
 @dataclass(frozen=True, kw_only=True)
-class RectangularConfig:
+class RectangularConfig(Config):
     """Limits between which a room is drawn, by seed."""
 
-    length_m: tuple[float, float] = (5.0, 10.0)  # along x
-    width_m: tuple[float, float] = (4.0, 8.0)  # along y
-    furniture: float = 0.65  # 0 an empty room, 1 as full as can be driven through
-    turned: float = 0.2  # share of the pieces that stand free at an angle
-    round: float = 0.2  # share of the pieces that are round tables and columns
+    length_m: Annotated[tuple[float, float], Span("[2, 30]")] = (5.0, 10.0)  # along x
+    width_m: Annotated[tuple[float, float], Span("[2, 30]")] = (4.0, 8.0)  # along y
+    furniture: Share = 0.65  # 0 an empty room, 1 as full as can be driven through
+    turned: Share = 0.2  # share of the pieces that stand free at an angle
+    round: Share = 0.2  # share of the pieces that are round tables and columns
 
     def __post_init__(self) -> None:
-        for name in ("length_m", "width_m"):
-            interval(self, name, low=2.0, high=30.0)
-        shares(self, "furniture", "turned", "round")
-        require(self.turned + self.round <= 1, "RectangularConfig needs turned + round ≤ 1")
+        super().__post_init__()
+        require(
+            self.turned + self.round <= 1,
+            f"RectangularConfig needs turned + round ≤ 1, got {self.turned} + {self.round}",
+        )
 
 
 def rectangular(config: RectangularConfig, *, seed: int) -> FloorPlan:

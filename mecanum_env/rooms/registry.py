@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any, Protocol, TypeVar
 
 from mecanum_env.rooms.floor_plan import FloorPlan
-from slam.settings import from_mapping, unknown_name
+from slam.settings import argument, check_name, from_mapping
 
-__all__ = ["Generator", "make", "names", "register"]
+__all__ = ["Generator", "config_type", "make", "names", "register"]
 
 C = TypeVar("C", contravariant=True)
 
@@ -42,11 +42,15 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_GENERATORS))
 
 
+def config_type(name: str) -> type[Any]:
+    """Return the config dataclass of a generator; ``ValueError`` lists the valid names."""
+    check_name("rooms", name, _GENERATORS)
+    return _GENERATORS[name][1]
+
+
 def check(name: str, config: Mapping[str, Any] | Any | None = None) -> Any:
     """Return a generator's whole config, or raise the ``ValueError`` for an unknown name or key."""
-    if name not in _GENERATORS:
-        raise unknown_name("rooms", name, _GENERATORS)
-    return from_mapping(_GENERATORS[name][1], config)
+    return from_mapping(config_type(name), config)
 
 
 def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None) -> FloorPlan:
@@ -66,5 +70,7 @@ def make(name: str, *, seed: int, config: Mapping[str, Any] | Any | None = None)
     ValueError
         For an unknown name or key, a value out of its limits, or a seed that is no integer ≥ 0.
     """
-    settings = check(name, config)
+    check_name("rooms", name, _GENERATORS)
+    with argument("config"):
+        settings = check(name, config)
     return _GENERATORS[name][0](settings, seed=seed)

@@ -62,8 +62,9 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
         "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
         "features": {"range_sigma_m": config.noise.range_sigma_m},
     }
-    given = config.slam_config.get("odometry", {})
-    if "lasting" not in given and given.keys() & {"speed_share", "turn_share_rad_m"}:
+    given = config.slam_config.get("odometry")
+    whole = {"speed_share", "turn_share_rad_m"}
+    if isinstance(given, Mapping) and "lasting" not in given and given.keys() & whole:
         del settings["odometry"]["lasting"]  # these speak of V as a whole
     return _overlay(settings, config.slam_config)
 

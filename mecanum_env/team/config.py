@@ -4,46 +4,43 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.settings import not_negative, positive, require, unknown_name
+from slam.settings import Config, Duration, Length, NotNegative, OneOf, Sigma, Within, require
 
-__all__ = ["BELIEFS", "COMMUNICATION", "STARTS", "CommunicationConfig", "SightingConfig", "TeamConfig"]
+__all__ = ["BELIEFS", "COMMUNICATION", "STARTS", "CommunicationConfig", "Robots", "SightingConfig", "TeamConfig"]
 
 STARTS = ("together", "scattered")
 BELIEFS = ("own", "joint")
 COMMUNICATION = ("unlimited", "range", "line-of-sight", "walls", "none")
 
+Robots = Annotated[int, Within("[1, 64]")]
+
+_HALF_DEGREE, _TWO_DEGREES = math.radians(0.5), math.radians(2.0)
+
 
 @dataclass(frozen=True, kw_only=True)
-class CommunicationConfig:
+class CommunicationConfig(Config):
     """Who hears whom, and how often maps are exchanged; whoever hears one of a chain hears all of it."""
 
-    model: str = "unlimited"  # "line-of-sight": within range and no wall between; "walls": each wall costs signal
-    range_m: float = 10.0  # in the open
-    wall_loss_db: float = 5.0  # of a wall in between
-    path_loss: float = 2.0  # exponent of the distance: 2 in the open
-    every_s: float = 1.0  # between two exchanges of maps; poses and goals are told at every step
-
-    def __post_init__(self) -> None:
-        if self.model not in COMMUNICATION:
-            raise unknown_name("communication model", self.model, COMMUNICATION)
-        positive(self, "range_m", "path_loss", "every_s")
-        not_negative(self, "wall_loss_db")
+    # "line-of-sight": within range and no wall between; "walls": each wall costs signal
+    model: Annotated[str, OneOf(COMMUNICATION)] = "unlimited"
+    range_m: Length = 10.0  # in the open
+    wall_loss_db: NotNegative = 5.0  # of a wall in between
+    path_loss: Annotated[float, Within("[0.01, 100]")] = 2.0  # exponent of the distance: 2 in the open
+    every_s: Duration = 1.0  # between two exchanges of maps; poses and goals are told at every step
 
 
 @dataclass(frozen=True, kw_only=True)
-class SightingConfig:
+class SightingConfig(Config):
     """How well a robot measures another that its lidar sees (by a reflective marker): 1σ."""
 
-    range_sigma_m: float = 0.02
-    bearing_sigma_rad: float = math.radians(0.5)
-    heading_sigma_rad: float = math.radians(2.0)
-
-    def __post_init__(self) -> None:
-        positive(self)
+    range_sigma_m: Sigma = 0.02
+    bearing_sigma_rad: Sigma = _HALF_DEGREE
+    heading_sigma_rad: Sigma = _TWO_DEGREES
 
     @property
     def sigmas(self) -> NDArray[np.float64]:
@@ -52,15 +49,17 @@ class SightingConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeamConfig:
+class TeamConfig(Config):
     """A team of like robots."""
 
-    robots: int = 3
-    starts: str = "together"  # around the plan's start; or "scattered" over all that can be reached
+    robots: Robots = 3
+    # Around the plan's start; or "scattered" over all that can be reached.
+    starts: Annotated[str, OneOf(STARTS)] = "together"
     known_starts: bool = True  # every robot knows where the others start; else each has a frame of its own
-    start_sigma_m: float = 0.0  # how far off that knowledge is, 1σ of x and of y
-    start_sigma_rad: float = 0.0
-    belief: str = "own"  # each robot a filter of its own; or "joint": one over all (slam.teams.centralised)
+    start_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0  # how far off that knowledge is, 1σ of x and of y
+    start_sigma_rad: Annotated[float, Within("[0, 10]")] = 0.0
+    # Each robot a filter of its own; or "joint": one over all (slam.teams.centralised).
+    belief: Annotated[str, OneOf(BELIEFS)] = "own"
     communication: CommunicationConfig = field(default_factory=CommunicationConfig)
     sighting: SightingConfig = field(default_factory=SightingConfig)
 
@@ -70,12 +69,11 @@ class TeamConfig:
         return self.known_starts and self.start_sigma_m == 0.0 and self.start_sigma_rad == 0.0
 
     def __post_init__(self) -> None:
-        require(1 <= self.robots <= 64, f"TeamConfig.robots must be 1 to 64, got {self.robots}")
-        if self.starts not in STARTS:
-            raise unknown_name("way to start", self.starts, STARTS)
-        if self.belief not in BELIEFS:
-            raise unknown_name("belief of a team", self.belief, BELIEFS)
-        not_negative(self, "start_sigma_m", "start_sigma_rad")
+        super().__post_init__()
         joint = self.belief == "joint"
         all_known = self.known_starts and self.communication.model == "unlimited"
-        require(not joint or all_known, "TeamConfig.belief joint needs known_starts and unlimited communication")
+        require(
+            not joint or all_known,
+            "TeamConfig.belief joint needs known_starts and unlimited communication, got "
+            f"{self.known_starts} and {self.communication.model}",
+        )

@@ -13,7 +13,7 @@ from mecanum_env.team.member import Member
 from mecanum_env.team.picture import render_team
 from mecanum_env.team.team import Team
 from slam.belief import Belief
-from slam.settings import unknown_name
+from slam.settings import check_name
 from slam.types import Array
 
 try:
@@ -47,8 +47,8 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     }  # fmt: skip
 
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise unknown_name("render_mode", render_mode, self.metadata["render_modes"])
+        if render_mode is not None:
+            check_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.team = Team(**settings)
         self.possible_agents = [f"robot_{k}" for k in range(len(self.team.members))]
@@ -95,8 +95,7 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
 
     def member(self, agent: str) -> Member:
         """Return the environment of one robot: its belief, truth and metrics."""
-        if agent not in self._numbers:
-            raise unknown_name("agent", agent, self.possible_agents)
+        check_name("agent", agent, self.possible_agents)
         return self.team.members[self._numbers[agent]]
 
     def belief(self, agent: str) -> Belief:

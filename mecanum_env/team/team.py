@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mecanum_env.arguments import make_config, make_plan
-from mecanum_env.config import EnvConfig
+from mecanum_env.config import EnvConfig, Steps
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
 from mecanum_env.physics.fleet import Fleet
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.sensing.calibration import backend_settings
 from mecanum_env.team.communication import groups
-from mecanum_env.team.config import TeamConfig
+from mecanum_env.team.config import Robots, TeamConfig
 from mecanum_env.team.coverage import TeamCoverage
 from mecanum_env.team.member import Member
 from mecanum_env.team.starts import start_poses
 from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
-from slam.settings import from_mapping, require, unknown_name
+from slam.settings import argument, check_name, checked, from_mapping
 from slam.teams.account import Account
 from slam.teams.centralised import JointEkf
 from slam.types import Array
@@ -78,12 +78,12 @@ class Team:
         max_steps: int = 3000,
         **settings: Any,
     ) -> None:
-        require(max_steps >= 1, f"max_steps must be at least 1, got {max_steps}")
-        given = from_mapping(TeamConfig, team)
-        self.team = given if robots is None else replace(given, robots=robots)
+        self.max_steps = checked("max_steps", Steps, max_steps)
+        with argument("team"):
+            given = from_mapping(TeamConfig, team)
+        self.team = given if robots is None else replace(given, robots=checked("robots", Robots, robots))
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
-        self.max_steps = max_steps
         self.joint: JointEkf | None = None
         """The one filter of a joint belief."""
         if self.team.belief == "joint":
@@ -113,8 +113,7 @@ class Team:
         """
         options = dict(options or {})
         for key in options:
-            if key not in _OPTIONS:
-                raise unknown_name("reset option", key, _OPTIONS)
+            check_name("reset option", key, _OPTIONS)
         if seed is not None:
             self._rng = np.random.default_rng(seed)
         seed = int(self._rng.integers(2**31)) if seed is None else int(seed)

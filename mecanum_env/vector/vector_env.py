@@ -9,7 +9,7 @@ from copy import copy as shallow_copy
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import gymnasium
 import numpy as np
@@ -19,15 +19,19 @@ from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
+from mecanum_env.config import Steps
 from mecanum_env.env import ExploreEnv
 from mecanum_env.vector.board import Board
 from mecanum_env.vector.workers import CALL, LISTEN, RESET, SET, STEP, Answer, Share, Worker
+from slam.settings import Within, check_name, checked, require, shown
 
 __all__ = ["ExploreVectorEnv"]
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Observations = dict[str, NDArray[Any]]
+
+Environments = Annotated[int, Within("[1, 4096]")]
 
 
 class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
@@ -79,9 +83,15 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
     ) -> None:
         super().__init__()
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        for name, value in (("num_envs", num_envs), ("workers", cores if workers is None else workers)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}")
+        num_envs = checked("num_envs", Environments, num_envs)
+        workers = cores if workers is None else checked("workers", Environments, workers)
+        limit = None if max_episode_steps is None else checked("max_episode_steps", Steps, max_episode_steps)
+        copy = checked("copy", bool, copy)
+        if context is not None:
+            check_name("context", context, multiprocessing.get_all_start_methods())
+        require(make is None or callable(make), f"make must be a function, got {shown(make)}")
+        if not isinstance(autoreset_mode, AutoresetMode):
+            check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         if make is not None and settings:
             raise ValueError(
                 f"settings are what make gives its environments: {', '.join(settings)} is one too many"
@@ -97,8 +107,8 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         self.observation_space = batch_space(observation, num_envs)
         self.action_space = batch_space(action, num_envs)
         processes = multiprocessing.get_context(context)
-        make = partial(_limited, make, max_episode_steps)
-        shares = min(cores if workers is None else workers, num_envs)
+        make = partial(_limited, make, limit)
+        shares = min(workers, num_envs)
         # The first is the caller's, who has more to do than its share: where they differ, the smaller one.
         edges = [num_envs * k // shares for k in range(shares + 1)]
         self._rows = [range(first, last) for first, last in pairwise(edges)]

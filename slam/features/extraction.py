@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -17,62 +18,52 @@ from numpy.typing import NDArray
 
 from slam.features.corners import all_on, edge, meet, walls_first
 from slam.features.surfaces import ENDS, FIRST, LAST, MAX_LINES, MAX_STEP, fit, points_in_order, split
-from slam.settings import require
+from slam.settings import Config, Count, Gap, Length, NotNegative, Positive, Sigma, Within
 from slam.types import Array, Scan
 
 __all__ = ["FeatureConfig", "FeatureExtractor"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeatureConfig:
+class FeatureConfig(Config):
     """What counts as a straight surface and as a corner."""
 
-    range_sigma_m: float = 0.01  # of one beam, along it
-    split_sigmas: float = 4.0  # a piece is split where it departs from its chord by more than this
-    split_floor_m: float = 0.02  # … and by more than this
-    min_points: int = 6
-    min_length_m: float = 0.25
-    grazing_deg: float = 8.0  # flattest incidence at which neighbouring points still belong together
-    min_angle_deg: float = 55.0  # between the surfaces of a corner; pieces of a round column meet at less
-    max_gap_m: float = 0.12  # from the corner to the nearest point of either surface
-    edge_length_m: float = 0.35  # of a surface whose visible end is taken for a corner
-    edge_points: int = 8  # … and the points on it: fewer would let a piece of a round column pass for straight
-    edge_face_m: float = 0.25  # thickest wall of which the end face may show
+    range_sigma_m: Annotated[float, Within("[0, 10]")] = 0.01  # of one beam, along it
+    split_sigmas: NotNegative = 4.0  # a piece is split where it departs from its chord by more than this
+    split_floor_m: Gap = 0.02  # … and by more than this
+    min_points: Annotated[int, Within("[4, 10000]")] = 6
+    min_length_m: Gap = 0.25
+    # Flattest incidence at which neighbouring points still belong together.
+    grazing_deg: Annotated[float, Within("[0.1, 45)")] = 8.0
+    # Between the surfaces of a corner; pieces of a round column meet at less.
+    min_angle_deg: Annotated[float, Within("[5, 85]")] = 55.0
+    max_gap_m: Gap = 0.12  # from the corner to the nearest point of either surface
+    edge_length_m: Gap = 0.35  # of a surface whose visible end is taken for a corner
+    edge_points: Count = 8  # … and the points on it: fewer would let a piece of a round column pass for straight
+    edge_face_m: Gap = 0.25  # thickest wall of which the end face may show
     # 1σ of a visible end along the surface, as a share of the beams' spacing there. A uniform error would have
     # 0.29, but it lasts while the robot stands.
-    edge_sigma: float = 1.0
-    edge_jump_m: float = 0.15  # how far beyond the surface the next beam must go
-    edge_spacing_m: float = 0.2  # farthest apart that two beams may meet the surface there
+    edge_sigma: Positive = 1.0
+    edge_jump_m: Gap = 0.15  # how far beyond the surface the next beam must go
+    edge_spacing_m: Gap = 0.2  # farthest apart that two beams may meet the surface there
     # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen
     # so that over apartments of the training seeds 100-149 the average pose NEES/3 is near 1.
-    sigma_floor_m: float = 0.0005
+    sigma_floor_m: Sigma = 0.0005
     # Of a surface that is a landmark itself, where the backend takes walls.
-    wall_length_m: float = 0.6
-    wall_points: int = 5  # through a door the walls beyond are seen by a few beams, and nothing else tells as much
+    wall_length_m: Length = 0.6
+    # Through a door the walls beyond are seen by a few beams, and nothing else tells as much.
+    wall_points: Count = 5
     # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
     # jamb; so does what is not seen of where a surface ends. As noise of each it counts for so much more, and adds
     # up to no less.
-    wall_lasting_scans: float = 16.0
+    wall_lasting_scans: Annotated[float, Within("[1, 1e6]")] = 16.0
     # Of a wall's curvature (slam.landmarks.curved_walls): the probability that it has one, 1σ of it where it has,
     # and the share by which it changes along the wall. Chosen in caves of the training seeds 100-115.
-    wall_curved_share: float = 0.25
-    wall_curvature_sigma: float = 0.1  # [1/m]
-    wall_shape_share: float = 0.1
-    wall_sigma_m: float = 0.0003  # 1σ that the model of a straight wall leaves out, across it …
-    wall_sigma_rad: float = 0.0002  # … and in its direction
-
-    def __post_init__(self) -> None:
-        require(self.range_sigma_m >= 0, "FeatureConfig.range_sigma_m must be ≥ 0")
-        require(self.min_points >= 4, "FeatureConfig.min_points must be at least 4")
-        require(0 < self.grazing_deg < 45, "FeatureConfig.grazing_deg must be in (0, 45)")
-        require(5 <= self.min_angle_deg <= 85, "FeatureConfig.min_angle_deg must be in [5, 85]")
-        require(self.sigma_floor_m > 0, "FeatureConfig.sigma_floor_m must be > 0")
-        require(self.wall_length_m > 0, "FeatureConfig.wall_length_m must be > 0")
-        require(self.wall_lasting_scans >= 1, "FeatureConfig.wall_lasting_scans must be at least 1")
-        require(0 <= self.wall_curved_share < 1, "FeatureConfig.wall_curved_share must be in [0, 1)")
-        require(self.wall_curvature_sigma > 0, "FeatureConfig.wall_curvature_sigma must be > 0")
-        require(self.wall_shape_share >= 0, "FeatureConfig.wall_shape_share must be ≥ 0")
-        require(self.wall_sigma_m > 0 and self.wall_sigma_rad > 0, "FeatureConfig.wall_sigma_* must be > 0")
+    wall_curved_share: Annotated[float, Within("[0, 1)")] = 0.25
+    wall_curvature_sigma: Positive = 0.1  # [1/m]
+    wall_shape_share: NotNegative = 0.1
+    wall_sigma_m: Sigma = 0.0003  # 1σ that the model of a straight wall leaves out, across it …
+    wall_sigma_rad: Sigma = 0.0002  # … and in its direction
 
 
 class FeatureExtractor:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from slam.backend import BackendConfig
 from slam.landmarks.book import LandmarkPolicy
-from slam.settings import require, unknown_name
+from slam.settings import OneOf, Positive, Within
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig"]
 
@@ -15,24 +16,24 @@ ASSOCIATIONS = ("nearest", "individual", "joint")
 """How observations are matched: each to the nearest landmark within its gate; only where a single landmark is
 within the gate; or as many as one pose can explain together (JCBB)."""
 
+Association = Annotated[str, OneOf(ASSOCIATIONS)]
+
 
 @dataclass(frozen=True, kw_only=True)
 class EkfConfig(BackendConfig):
     """EKF-SLAM: gating and landmark management."""
 
-    association: str = "nearest"  # or "individual", "joint": see ASSOCIATIONS
-    gate: float = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
-    known_gate: float = math.inf  # the same for observations with ids: a finite one refuses misread labels
-    max_turn_deg: float = 35.0  # difference in a corner's direction
-    loop_sigma_m: float = math.inf  # old landmarks expected no better than to this count only together
+    association: Association = "nearest"  # or "individual", "joint": see ASSOCIATIONS
+    gate: Positive = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
+    known_gate: Annotated[float, Within("(0, inf]")] = (
+        math.inf
+    )  # the same for observations with ids: a finite one refuses misread labels
+    max_turn_deg: Annotated[float, Within("[0, 180]")] = 35.0  # difference in a corner's direction
+    loop_sigma_m: Annotated[float, Within("(0, inf]")] = (
+        math.inf
+    )  # old landmarks expected no better than to this count only together
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.gate > 0 and self.known_gate > 0, "EkfConfig.gate and known_gate must be > 0")
-        if self.association not in ASSOCIATIONS:
-            raise unknown_name("EkfConfig.association", self.association, ASSOCIATIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,5 +44,5 @@ class EkfLinesConfig(EkfConfig):
     # What two landmarks could have made is left alone: a wall's corners lie close together, and one taken for
     # another bends the map. Over apartments of the training seeds 100-149 at three times the noise, the average
     # pose NEES/3 was 1.15 with the nearest and 1.00 so; at nominal noise the error was the same.
-    association: str = "individual"
-    loop_sigma_m: float = 0.02  # ledges at doors stand apart by a few times that
+    association: Association = "individual"
+    loop_sigma_m: Annotated[float, Within("(0, inf]")] = 0.02  # ledges at doors stand apart by a few times that

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
 from slam.graph.surfaces import BeamEnds
 from slam.grids.match_kernels import field_sum
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, search
-from slam.settings import require
+from slam.settings import Angle, Config, Count, Gap, Length, Positive, PositiveShare, Sigma, Within
 from slam.types import Array
 
 __all__ = ["Candidate", "ClosingConfig", "agreeing", "find_candidate"]
@@ -30,30 +31,24 @@ _RIVAL_APART_M, _RIVAL_STEP_M = 0.25, 0.1
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosingConfig:
+class ClosingConfig(Config):
     """When an old place is believed to be seen again."""
 
     # Patches known this well as seen from the robot need no loop closing: nothing else is as near to them.
-    sigma_m: float = 0.02
-    every_m: float = 0.8  # way between two looks back
-    farthest_m: float = 1.5  # searched at most, to either side …
-    farthest_rad: float = 0.4
-    share: float = 0.4  # of a scan's beams that must end on old patches …
-    in_sight: float = 0.75  # … and of those near one that must agree with it
-    determined_m: float = 0.04  # 1σ of the alignment, in the direction that is known least
-    rival: float = 0.85  # of the best place's score, that no place apart may reach
-    together: int = 3  # scans that must agree …
-    apart_m: float = 1.0  # … from places at least so far apart …
-    recent_m: float = 12.0  # … on the last so many metres
-    agree_m: float = 0.06  # how far two corrections may be from each other
-    agree_rad: float = 0.015
-    loss: float = 4.0  # chi-square a degree of freedom from which a closing is given up again
-
-    def __post_init__(self) -> None:
-        require(self.together >= 1, "ClosingConfig.together must be at least 1")
-        for name in ("share", "in_sight", "rival"):
-            require(0 < getattr(self, name) <= 1, f"ClosingConfig.{name} must be in (0, 1]")
-        require(self.sigma_m > 0 and self.every_m > 0, "ClosingConfig.sigma_m and every_m must be > 0")
+    sigma_m: Sigma = 0.02
+    every_m: Length = 0.8  # way between two looks back
+    farthest_m: Annotated[float, Within("[0.01, 10]")] = 1.5  # searched at most, to either side …
+    farthest_rad: Angle = 0.4
+    share: PositiveShare = 0.4  # of a scan's beams that must end on old patches …
+    in_sight: PositiveShare = 0.75  # … and of those near one that must agree with it
+    determined_m: Sigma = 0.04  # 1σ of the alignment, in the direction that is known least
+    rival: PositiveShare = 0.85  # of the best place's score, that no place apart may reach
+    together: Count = 3  # scans that must agree …
+    apart_m: Gap = 1.0  # … from places at least so far apart …
+    recent_m: Gap = 12.0  # … on the last so many metres
+    agree_m: Gap = 0.06  # how far two corrections may be from each other
+    agree_rad: Gap = 0.015
+    loss: Positive = 4.0  # chi-square a degree of freedom from which a closing is given up again
 
 
 @dataclass(frozen=True, slots=True, eq=False)

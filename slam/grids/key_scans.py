@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
+from slam.settings import Config, Count, Gap
 from slam.types import Array, Scan
 
 __all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
@@ -34,13 +35,13 @@ _NEIGHBOUR_SHIFT, _NEIGHBOUR_TURN = 0.1**-2, 0.02**-2  # what moved the key scan
 
 
 @dataclass(frozen=True, kw_only=True)
-class KeyScanConfig:
+class KeyScanConfig(Config):
     """When a scan is kept, and when the map is redrawn."""
 
-    spacing_m: float = 0.2
-    spacing_rad: float = 0.25
-    check_every: int = 20  # updates between two looks at the landmarks
-    lever_m: float = 4.0  # distance at which a turn of a key scan counts as a shift [m]
+    spacing_m: Gap = 0.2
+    spacing_rad: Gap = 0.25
+    check_every: Count = 20  # updates between two looks at the landmarks
+    lever_m: Gap = 4.0  # distance at which a turn of a key scan counts as a shift [m]
 
 
 class KeyScans:

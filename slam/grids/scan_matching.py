@@ -14,46 +14,54 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.match_kernels import BLOCK, climb, correlate, splat
-from slam.settings import require
+from slam.settings import Config, Count, Few, Length, Positive, Sigma, Within, require
 from slam.types import Array, Scan
 
 __all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search", "stamps_of"]
 
 Values = NDArray[np.float32]
 
+_MOST_PLACES = 2_000_000  # of one search: some seconds
 _MARGIN_M = 1.0  # of a field around its points
 _PHASES = 8  # sub-cell positions a side at which a surface point is drawn
 _FLAT_INFO = 1e-3  # [1/m², 1/rad²] added so that a featureless scan still has a (very wide) covariance
 
 
 @dataclass(frozen=True, kw_only=True)
-class MatchConfig:
+class MatchConfig(Config):
     """The field, the window of the search, and how much a beam is believed."""
 
-    cell_m: float = 0.05
-    smooth_m: float = 0.1  # s: reach of a surface in the field
-    window_m: float = 0.3  # the search goes as far as this to either side …
-    window_rad: float = 0.25
-    step_rad: float = 0.0125  # … in steps of one cell and of this
-    sigma_m: float = 0.03  # of a beam's end against the map: range noise and the map's own error
+    cell_m: Annotated[float, Within("[0.01, 1]")] = 0.05
+    smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.1  # s: reach of a surface in the field
+    window_m: Annotated[float, Within("[0, 10]")] = 0.3  # the search goes as far as this to either side …
+    window_rad: Annotated[float, Within("[0, 3.2]")] = 0.25
+    step_rad: Annotated[float, Within("[0.001, 3.2]")] = 0.0125  # … in steps of one cell and of this
+    sigma_m: Sigma = 0.03  # of a beam's end against the map: range noise and the map's own error
     # A scan's beams err together (edges of cells, bent walls, a moving robot): each counts as this part of one.
-    beam_weight: float = 0.2
-    beams: int = 180  # used at most, evenly thinned
-    reach_m: float = 20.0  # beams that end farther are not used
-    iterations: int = 12
+    beam_weight: Positive = 0.2
+    beams: Count = 180  # used at most, evenly thinned
+    reach_m: Length = 20.0  # beams that end farther are not used
+    iterations: Few = 12
 
     def __post_init__(self) -> None:
-        for name in ("cell_m", "smooth_m", "step_rad", "sigma_m", "beam_weight", "reach_m"):
-            require(getattr(self, name) > 0, f"MatchConfig.{name} must be > 0")
-        require(self.smooth_m >= self.cell_m, "MatchConfig.smooth_m must be at least MatchConfig.cell_m")
-        require(self.window_m >= 0 and self.window_rad >= 0, "MatchConfig.window_* must be ≥ 0")
-        require(self.beams >= 1 and self.iterations >= 1, "MatchConfig.beams and iterations must be at least 1")
+        super().__post_init__()
+        require(
+            self.smooth_m >= self.cell_m,
+            f"MatchConfig.smooth_m must be at least cell_m, {self.cell_m}, got {self.smooth_m}",
+        )
+        places = (2 * self.window_m / self.cell_m + 1) ** 2 * (2 * self.window_rad / self.step_rad + 1)
+        require(
+            places <= _MOST_PLACES,
+            f"MatchConfig.window_m, window_rad, cell_m and step_rad make {places:.0f} places to search; at most "
+            f"{_MOST_PLACES} are allowed",
+        )
 
     @property
     def gain(self) -> float:

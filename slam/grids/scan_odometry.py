@@ -15,33 +15,27 @@ import numpy as np
 from slam.geometry import transform_points
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
-from slam.settings import require
+from slam.settings import Config, Count, Few, Gap, NotNegative, Positive, Share
 from slam.types import Array, Odometry
 
 __all__ = ["ScanOdometry", "ScanOdometryConfig"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScanOdometryConfig:
+class ScanOdometryConfig(Config):
     """The local map, and when a match to it is believed."""
 
-    scans: int = 10  # key scans in the local map
-    spacing_m: float = 0.25  # a scan becomes a key scan when the robot has moved or turned so far
-    spacing_rad: float = 0.25
-    fewest_points: int = 20  # a scan with fewer ends is not matched …
-    least_score: float = 0.3  # … and a match with a lower mean field value is not believed
+    scans: Few = 10  # key scans in the local map
+    spacing_m: Gap = 0.25  # a scan becomes a key scan when the robot has moved or turned so far
+    spacing_rad: Gap = 0.25
+    fewest_points: Count = 20  # a scan with fewer ends is not matched …
+    least_score: Share = 0.3  # … and a match with a lower mean field value is not believed
     # Odometry known to less than this is searched over the window of ``MatchConfig``, else only refined.
-    search_sigma_m: float = 0.03
-    search_sigma_rad: float = 0.015
+    search_sigma_m: NotNegative = 0.03
+    search_sigma_rad: NotNegative = 0.015
     # Wheels that spin in vain are in no odometry noise. Where a motion of anything from none to twice what they
     # claim fits better by this (twice the log-likelihood; 99 % of chi-square with 3 degrees of freedom), they did.
-    spin_gate: float = 11.34
-
-    def __post_init__(self) -> None:
-        require(self.scans >= 1, "ScanOdometryConfig.scans must be at least 1")
-        require(self.fewest_points >= 1, "ScanOdometryConfig.fewest_points must be at least 1")
-        require(0 <= self.least_score <= 1, "ScanOdometryConfig.least_score must be in [0, 1]")
-        require(self.spin_gate > 0, "ScanOdometryConfig.spin_gate must be > 0")
+    spin_gate: Positive = 11.34
 
 
 class ScanOdometry:

@@ -12,15 +12,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from slam.health.evidence import Agreement
-from slam.settings import require
+from slam.settings import Config, Count, Finite, Gap, Length, Share, Within, require
 
 __all__ = ["HealthConfig", "HealthMonitor"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class HealthConfig:
+class HealthConfig(Config):
     """What evidence weighs, and when a belief is given up.
 
     Likelihoods and weights were measured on rooms of seeds below 1000 and on two floors
@@ -28,46 +29,47 @@ class HealthConfig:
     """
 
     recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
-    glance_beams: int = 36  # of a scan that are looked at, at most …
-    beams: int = 120  # … and where these do not agree
-    fewest_beams: int = 15  # that say anything, for a scan to count
+    glance_beams: Annotated[int, Within("[8, 10000]")] = 36  # of a scan that are looked at, at most …
+    beams: Annotated[int, Within("[8, 10000]")] = 120  # … and where these do not agree
+    fewest_beams: Count = 15  # that say anything, for a scan to count
     # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
     # lost, falls into each: in logarithms, since products of them are taken.
-    against_edges: tuple[float, ...] = (0.03, 0.08, 0.16, 0.3)
-    against_fine: tuple[float, ...] = (0.70, 0.20, 0.08, 0.015, 0.005)
-    against_lost: tuple[float, ...] = (0.06, 0.10, 0.15, 0.25, 0.44)
+    against_edges: Annotated[tuple[float, ...], Within("[0, 1]")] = (0.03, 0.08, 0.16, 0.3)
+    against_fine: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.70, 0.20, 0.08, 0.015, 0.005)
+    against_lost: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.06, 0.10, 0.15, 0.25, 0.44)
     # The same of the share of the beams on walls that end in the very cell of one.
-    sharp_edges: tuple[float, ...] = (0.5, 0.65, 0.8, 0.9)
-    sharp_fine: tuple[float, ...] = (0.01, 0.06, 0.20, 0.30, 0.43)
-    sharp_lost: tuple[float, ...] = (0.35, 0.30, 0.20, 0.10, 0.05)
+    sharp_edges: Annotated[tuple[float, ...], Within("[0, 1]")] = (0.5, 0.65, 0.8, 0.9)
+    sharp_fine: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.01, 0.06, 0.20, 0.30, 0.43)
+    sharp_lost: Annotated[tuple[float, ...], Within("[1e-9, 1]")] = (0.35, 0.30, 0.20, 0.10, 0.05)
     # Scans one after the other err together: each counts as this part of one.
-    scan_weight: float = 0.3
-    lost_per_scan: float = 1e-5  # how likely a robot gets lost from one scan to the next
-    blur_m: float = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
-    unsure_m: float = 0.3  # σ of the beams' ends, now or when they were drawn, at which an old drawing gives way
-    doubt_against: float = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
-    doubt_sharp: float = 0.6  # … where it agrees from the corrected pose
-    give_up: float = 0.2  # P(fine) below which the belief is lost
-    while_lost: float = 0.02  # the health then
-    found: float = 0.9  # P(fine) right after a relocalisation
+    scan_weight: Annotated[float, Within("[0, 10]")] = 0.3
+    # How likely a robot gets lost from one scan to the next.
+    lost_per_scan: Annotated[float, Within("[1e-9, 1)")] = 1e-5
+    blur_m: Length = 0.1  # σ of the beams' ends, by the pose's covariance, at which a scan says half as much
+    unsure_m: Gap = 0.3  # σ of the beams' ends, now or when they were drawn, at which an old drawing gives way
+    doubt_against: Share = 0.1  # a scan with more in the open, or fewer sharp, is doubtful: it is only drawn …
+    doubt_sharp: Share = 0.6  # … where it agrees from the corrected pose
+    give_up: Annotated[float, Within("(0, 1)")] = 0.2  # P(fine) below which the belief is lost
+    while_lost: Share = 0.02  # the health then
+    found: Annotated[float, Within("(0, 1)")] = 0.9  # P(fine) right after a relocalisation
     # P(within the region | fine) = 1 / (1 + exp(-score)), score = bias less what innovations take off it: the
     # weight, times what the mean logarithm of NIS over its degrees of freedom has above where it begins to tell.
-    bias: float = 3.5
-    nis_weight: float = 2.9
-    nis_from: float = -2.2
-    memory: float = 50.0  # updates that the mean is taken over
+    bias: Finite = 3.5
+    nis_weight: Finite = 2.9
+    nis_from: Finite = -2.2
+    memory: Annotated[float, Within("[1, 1e6]")] = 50.0  # updates that the mean is taken over
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("against", "sharp"):
             bins = len(getattr(self, f"{name}_edges")) + 1
             for state in ("fine", "lost"):
                 values = getattr(self, f"{name}_{state}")
-                require(len(values) == bins, f"HealthConfig.{name}_{state} needs {bins} values")
-                require(all(v > 0 for v in values), f"HealthConfig.{name}_{state} must be > 0")
-        require(0 < self.give_up < self.found < 1, "HealthConfig needs 0 < give_up < found < 1")
-        require(min(self.beams, self.glance_beams) >= 8, "HealthConfig.beams and glance_beams must be at least 8")
-        require(self.memory >= 1 and self.blur_m > 0, "HealthConfig.memory must be ≥ 1, blur_m > 0")
-        require(0 < self.lost_per_scan < 1, "HealthConfig.lost_per_scan must be in (0, 1)")
+                require(
+                    len(values) == bins,
+                    f"HealthConfig.{name}_{state} must hold one more than {name}_edges, got {len(values)} values",
+                )
+        require(self.give_up < self.found, f"HealthConfig.give_up {self.give_up} must be below found {self.found}")
 
 
 _LEAST_ODDS = 2e-5  # of being lost

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ from slam.geometry import wrap_scalar
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, body_points, match, refine
 from slam.health.evidence import agreement, through_walls
-from slam.settings import require
+from slam.settings import Config, Count, Gap, Share, Within, require
 from slam.types import Array, Scan
 
 __all__ = ["Place", "RelocalisationConfig", "Relocaliser"]
@@ -31,44 +32,62 @@ Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
-class RelocalisationConfig:
+class RelocalisationConfig(Config):
     """How far and how finely places are searched, and when one is believed."""
 
-    spacing_m: float = 0.2  # of the lattice of positions
-    spacing_rad: float = 0.04
-    beams: int = 60  # that score a place of the lattice
-    candidates: int = 12  # that are looked at closely
-    apart_m: float = 0.5  # candidates differ by as much …
-    apart_rad: float = 0.35  # … or by this
-    check_beams: int = 180  # that a candidate is held against the map by
-    fewest_beams: int = 25  # that must say anything of a place
-    least_known: float = 0.35  # share of the beams that must end where the map is known
-    most_against: float = 0.05  # share of those that may end in the open …
-    most_through: float = 0.1  # … and of all, that may come through a wall: some pass close by a corner
-    least_sharp: float = 0.65  # of those on walls, that end in the very cell
-    margin: float = 0.12  # by which the best place must be better than the next, in shares of the beams
-    radii_m: tuple[float, ...] = (1.5, 4.0, math.inf)  # around the last known pose, one after the other …
-    scans_each: tuple[int, ...] = (5, 15)  # … for so many scans, the last one until it is found
-    every: tuple[int, ...] = (1, 2, 10)  # scans between two searches of each radius: they take long
-    places_each: int = 60_000  # places of the lattice that take so long; of twice as many, half as often
-    standing: int = 8  # times as many scans between two searches of all of the map, where the robot has not moved
-    confirm: int = 3  # scans that a place must explain, one after the other
-    unopposed: int = 30  # scans in a row that do not speak against where the wheels have it, to go on from there
-    sharp_smooth_m: float = 0.05  # reach of a surface when a place is refined last
+    spacing_m: Annotated[float, Within("[0.05, 10]")] = 0.2  # of the lattice of positions
+    spacing_rad: Annotated[float, Within("[0.001, 3.2]")] = 0.04
+    beams: Count = 60  # that score a place of the lattice
+    candidates: Annotated[int, Within("[2, 1000]")] = 12  # that are looked at closely
+    apart_m: Gap = 0.5  # candidates differ by as much …
+    apart_rad: Gap = 0.35  # … or by this
+    check_beams: Count = 180  # that a candidate is held against the map by
+    fewest_beams: Count = 25  # that must say anything of a place
+    least_known: Share = 0.35  # share of the beams that must end where the map is known
+    most_against: Share = 0.05  # share of those that may end in the open …
+    most_through: Share = 0.1  # … and of all, that may come through a wall: some pass close by a corner
+    least_sharp: Share = 0.65  # of those on walls, that end in the very cell
+    margin: Share = 0.12  # by which the best place must be better than the next, in shares of the beams
+    radii_m: Annotated[tuple[float, ...], Within("(0, inf]")] = (
+        1.5,
+        4.0,
+        math.inf,
+    )  # around the last known pose, one after the other …
+    scans_each: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (
+        5,
+        15,
+    )  # … for so many scans, the last one until it is found
+    every: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (
+        1,
+        2,
+        10,
+    )  # scans between two searches of each radius: they take long
+    # Places of the lattice that take so long; of twice as many, half as often.
+    places_each: Annotated[int, Within("[1, 1000000]")] = 60_000
+    # Times as many scans between two searches of all of the map, where the robot has not moved.
+    standing: Annotated[int, Within("[1, 1000000]")] = 8
+    confirm: Annotated[int, Within("[1, 1000000]")] = 3  # scans that a place must explain, one after the other
+    # Scans in a row that do not speak against where the wheels have it, to go on from there.
+    unopposed: Annotated[int, Within("[1, 1000000]")] = 30
+    # Reach of a surface when a place is refined last.
+    sharp_smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     matching: MatchConfig = field(
         default_factory=lambda: MatchConfig(window_m=0.15, window_rad=0.04, step_rad=0.01)
     )
 
     def __post_init__(self) -> None:
-        require(self.spacing_m > 0 and self.spacing_rad > 0, "RelocalisationConfig.spacing_* must be > 0")
-        require(self.candidates >= 2, "RelocalisationConfig.candidates must be at least 2")
+        super().__post_init__()
         stages = len(self.radii_m)
         require(
             stages >= 1 and len(self.scans_each) == stages - 1 and len(self.every) == stages,
-            "RelocalisationConfig needs one of every and, but for the last, of scans_each for each of radii_m",
+            "RelocalisationConfig needs one of every and, but the last, of scans_each for each of radii_m, got "
+            f"{len(self.every)}, {len(self.scans_each)} and {stages}",
         )
-        for name in ("confirm", "unopposed", "places_each", "standing"):
-            require(getattr(self, name) >= 1, f"RelocalisationConfig.{name} must be at least 1")
+        require(
+            self.sharp_smooth_m >= self.matching.cell_m,
+            f"RelocalisationConfig.sharp_smooth_m must be at least matching.cell_m, {self.matching.cell_m}, got "
+            f"{self.sharp_smooth_m}",
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
-from slam.settings import require
+from slam.settings import Config, Count, Gap, NotNegative
 from slam.types import LINE, Array, Scan
 
 __all__ = ["KIND", "MARKS", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
@@ -34,23 +34,19 @@ _NO_SCAN = Scan(np.zeros(0), 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
-class LandmarkPolicy:
+class LandmarkPolicy(Config):
     """When a corner becomes a landmark, and when it ceases to be one."""
 
-    confirm_after: int = 2  # sightings …
-    edge_confirm_after: int = 8  # … of a surface's visible end, which a round table can feign, more of them …
-    edge_baseline_m: float = 0.2  # … and from two places this far apart
-    forget_after: int = 20  # updates without a sighting, while tentative
-    tentative_gate_m: float = 0.1  # two sightings farther apart are two corners
-    new_distance_m: float = 0.2  # a new corner is at least this far from a landmark of its kind
-    drop_after: int = 15  # contradictions more than sightings
-    overlook_after: int = 25  # dropped when overlooked, in plain view, more often than this …
-    overlook_ratio: float = 5.0  # … and this many times the sightings
-    clear_margin_m: float = 0.3  # a beam that goes this far beyond a landmark contradicts it
-
-    def __post_init__(self) -> None:
-        require(self.confirm_after >= 1, "LandmarkPolicy.confirm_after must be at least 1")
-        require(self.drop_after >= 1, "LandmarkPolicy.drop_after must be at least 1")
+    confirm_after: Count = 2  # sightings …
+    edge_confirm_after: Count = 8  # … of a surface's visible end, which a round table can feign, more of them …
+    edge_baseline_m: Gap = 0.2  # … and from two places this far apart
+    forget_after: Count = 20  # updates without a sighting, while tentative
+    tentative_gate_m: Gap = 0.1  # two sightings farther apart are two corners
+    new_distance_m: Gap = 0.2  # a new corner is at least this far from a landmark of its kind
+    drop_after: Count = 15  # contradictions more than sightings
+    overlook_after: Count = 25  # dropped when overlooked, in plain view, more often than this …
+    overlook_ratio: NotNegative = 5.0  # … and this many times the sightings
+    clear_margin_m: Gap = 0.3  # a beam that goes this far beyond a landmark contradicts it
 
 
 class LandmarkBook:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap
 from slam.logs.log import Event, Log
-from slam.settings import require
+from slam.settings import Config, NotNegative, Positive
 from slam.types import Observations, Odometry
 
 __all__ = ["Event", "ObservationNoise", "RecordedLog", "group_by_time", "split_holds"]
@@ -22,23 +22,16 @@ _LEAST_TOLD = 1e-3  # by a sighting, of what one on its own tells: two at the sa
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObservationNoise:
+class ObservationNoise(Config):
     """Standard deviations of a landmark observation: of its range, a + b ρ + c ρ², and of its bearing."""
 
-    range_m: float
-    range_share: float = 0.0  # of the range, added to ``range_m``
-    range_square_per_m: float = 0.0  # of the range's square, as where a range is told from an apparent size
-    bearing_deg: float
+    range_m: Positive
+    range_share: NotNegative = 0.0  # of the range, added to ``range_m``
+    range_square_per_m: NotNegative = 0.0  # of the range's square, as where a range is told from an apparent size
+    bearing_deg: Positive
     # How long the error of a landmark's sightings stays the same. A sighting right after another one of the same
     # landmark says little that is new: see ``repeated``.
-    repeat_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("range_m", "bearing_deg"):
-            value = getattr(self, name)
-            require(value > 0 and math.isfinite(value), f"ObservationNoise.{name} must be > 0 and finite")
-        for name in ("range_share", "range_square_per_m", "repeat_s"):
-            require(0 <= getattr(self, name) < math.inf, f"ObservationNoise.{name} must be ≥ 0 and finite")
+    repeat_s: NotNegative = 0.0
 
     def cov(self, range_bearing: Array) -> Array:
         """Return the covariances ``(m, 2, 2)`` of observations ``(m, 2)`` [m², m·rad, rad²], each on its own."""

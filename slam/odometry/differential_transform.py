@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
-from slam.settings import require, unknown_name
+from slam.settings import check_name, require
 from slam.types import Array
 
 __all__ = ["MODELS", "PowerModel", "fill_model", "fit_pade", "make_model"]
@@ -154,6 +154,5 @@ MODELS: dict[str, PowerModel] = {
 
 def make_model(name: str) -> PowerModel:
     """Return a named model; ``ValueError`` lists the valid names."""
-    if name not in MODELS:
-        raise unknown_name("motion model", name, MODELS)
+    check_name("motion model", name, MODELS)
     return MODELS[name]

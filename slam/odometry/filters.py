@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numba import njit
 
-from slam.odometry.differential_transform import make_model
+from slam.odometry.differential_transform import MODELS, make_model
 from slam.odometry.riccati import Rules, Tolerances, Workspace, advance
-from slam.settings import from_mapping, require, unknown_name
+from slam.settings import Config, NotNegative, OneOf, Within, argument, check_name, from_mapping
 from slam.types import Array, Odometry
 
 __all__ = ["ODOMETRY_FILTERS", "OdometryFilter", "OdometryFilterConfig", "make_odometry_filter"]
@@ -26,7 +26,7 @@ _START_S = 0.1  # since which a robot that starts has moved: models that know of
 
 
 @dataclass(frozen=True, kw_only=True)
-class OdometryFilterConfig:
+class OdometryFilterConfig(Config):
     """Of each coordinate the model, R and Q; only Q/R decides how fast the filter follows.
 
     Below either speed of rest the filters start anew where the wheels say that the robot is: the motion that the
@@ -34,27 +34,19 @@ class OdometryFilterConfig:
     velocity error on training seeds (``training.studies.paper_c.figures``).
     """
 
-    model: str = "constant_velocity"
-    measurement_m2_s: float = 2.5e-8  # R of x and y: 0.5 mm, every 0.1 s
-    measurement_rad2_s: float = 2.5e-7  # R of θ
-    process_linear: float = 0.03  # Q of x and y: m²/s³, of wiener_acceleration m²/s⁵
-    process_turn: float = 0.3  # Q of θ: rad²/s³, of wiener_acceleration rad²/s⁵
-    start_sigmas: tuple[float, float, float] = (1e-4, 0.1, 1.0)  # of a start: m, m/s, m/s²; of θ in rad
-    rest_speed_m_s: float = 0.002
-    rest_turn_rate_rad_s: float = 0.005
-
-    def __post_init__(self) -> None:
-        make_model(self.model)
-        for name in ("measurement_m2_s", "measurement_rad2_s", "process_linear", "process_turn"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value > 0, f"OdometryFilterConfig.{name} must be > 0, got {value}")
-        for name in ("rest_speed_m_s", "rest_turn_rate_rad_s"):
-            value = getattr(self, name)
-            require(math.isfinite(value) and value >= 0, f"OdometryFilterConfig.{name} must be ≥ 0, got {value}")
-        given: Any = self.start_sigmas
-        good = isinstance(given, tuple | list) and len(given) == 3
-        good = good and all(isinstance(s, int | float) and math.isfinite(s) and s >= 0 for s in given)
-        require(good, f"OdometryFilterConfig.start_sigmas takes three numbers of at least 0, got {given!r}")
+    model: Annotated[str, OneOf(tuple(MODELS))] = "constant_velocity"
+    measurement_m2_s: Annotated[float, Within("[1e-12, 1e6]")] = 2.5e-8  # R of x and y: 0.5 mm, every 0.1 s
+    measurement_rad2_s: Annotated[float, Within("[1e-12, 1e6]")] = 2.5e-7  # R of θ
+    # Q of x and y: m²/s³, of wiener_acceleration m²/s⁵
+    process_linear: Annotated[float, Within("[1e-12, 1e6]")] = 0.03
+    process_turn: Annotated[float, Within("[1e-12, 1e6]")] = 0.3  # Q of θ: rad²/s³, of wiener_acceleration rad²/s⁵
+    start_sigmas: Annotated[tuple[float, float, float], Within("[0, 1e6]")] = (
+        1e-4,
+        0.1,
+        1.0,
+    )  # of a start: m, m/s, m/s²; of θ in rad
+    rest_speed_m_s: NotNegative = 0.002
+    rest_turn_rate_rad_s: NotNegative = 0.005
 
 
 class OdometryFilter:
@@ -148,10 +140,10 @@ def make_odometry_filter(
     name: str, config: Mapping[str, Any] | OdometryFilterConfig | None = None
 ) -> OdometryFilter | None:
     """Return a filter by name, None for ``"none"``; ``ValueError`` lists the valid names or keys."""
-    if name not in ODOMETRY_FILTERS:
-        raise unknown_name("odometry filter", name, ODOMETRY_FILTERS)
+    check_name("odometry filter", name, ODOMETRY_FILTERS)
     if name == "none":
         if config:
             raise ValueError('the odometry filter "none" has no settings; name "differential-transform" with them')
         return None
-    return OdometryFilter(from_mapping(OdometryFilterConfig, config))
+    with argument("config"):
+        return OdometryFilter(from_mapping(OdometryFilterConfig, config))

@@ -9,14 +9,14 @@ Where the step would leave what the spectra can tell, it ends there and they are
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import fill_model, fit_pade
-from slam.settings import require, unknown_name
+from slam.settings import Config, OneOf, Within, require
 from slam.types import Array
 
 __all__ = ["RECOVERIES", "Rules", "Tolerances", "Workspace", "advance"]
@@ -31,24 +31,21 @@ _DENOMINATOR_LEFT = 0.2  # a Padé denominator may fall from 1 to no less than t
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tolerances:
+class Tolerances(Config):
     """How exactly the differential equations are solved, and how the original is recovered.
 
     The error of one expansion may be ``relative`` · √(ηᵢᵢ ηⱼⱼ) + ``absolute`` in ηᵢⱼ, and for x̂ᵢ as many of its σ
     (and of its own size).
     """
 
-    recovery: str = "pade"  # or "series"
-    order: int = 6  # the highest discrete used, even; Padé [order/2, order/2]
-    relative: float = 1e-9
-    absolute: float = 1e-15  # [m²], …
+    recovery: Annotated[str, OneOf(RECOVERIES)] = "pade"  # or "series"
+    order: Annotated[int, Within("[2, 30]")] = 6  # the highest discrete used, even; Padé [order/2, order/2]
+    relative: Annotated[float, Within("(0, 1)")] = 1e-9
+    absolute: Annotated[float, Within("(0, 1]")] = 1e-15  # [m²], …
 
     def __post_init__(self) -> None:
-        if self.recovery not in RECOVERIES:
-            raise unknown_name("recovery", self.recovery, RECOVERIES)
-        require(2 <= self.order <= 30 and self.order % 2 == 0, "Tolerances.order must be even, from 2 to 30")
-        require(0 < self.relative < 1, "Tolerances.relative must be in (0, 1)")
-        require(self.absolute > 0, "Tolerances.absolute must be > 0")
+        super().__post_init__()
+        require(self.order % 2 == 0, f"Tolerances.order must be even, got {self.order}")
 
     @property
     def rules(self) -> Rules:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
-from slam.settings import require, unknown_name
+from slam.settings import Config, Count, OneOf, PositiveShare
 from slam.types import Array
 
 __all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
@@ -19,18 +20,12 @@ _WHEN = ("every_step", "every_k", "n_eff")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ResamplingPolicy:
+class ResamplingPolicy(Config):
     """When particles are resampled: after every update, after every k-th, or once the weights are too uneven."""
 
-    when: str = "n_eff"  # or "every_step", "every_k"
-    every: int = 5  # k, of "every_k"
-    share: float = 0.5  # "n_eff": resampled where N_eff is below this share of the particles
-
-    def __post_init__(self) -> None:
-        if self.when not in _WHEN:
-            raise unknown_name("ResamplingPolicy.when", self.when, _WHEN)
-        require(self.every >= 1, "ResamplingPolicy.every must be at least 1")
-        require(0 < self.share <= 1, "ResamplingPolicy.share must be in (0, 1]")
+    when: Annotated[str, OneOf(("n_eff", "every_step", "every_k"))] = "n_eff"  # or "every_step", "every_k"
+    every: Count = 5  # k, of "every_k"
+    share: PositiveShare = 0.5  # "n_eff": resampled where N_eff is below this share of the particles
 
     def due(self, n_eff: float, particles: int, updates: int) -> bool:
         """Tell whether to resample now, ``updates`` (≥ 1) after the last time."""

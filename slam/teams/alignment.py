@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from slam.geometry import compose, inverse, wrap
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics.chi_square import chi2_quantile
-from slam.settings import not_negative, require
+from slam.settings import Config, Gap, NotNegative, Share, Within
 from slam.teams.account import Account
 from slam.teams.constellation import ConstellationConfig, candidates, rigid_fit, same_landmarks
 from slam.teams.contradiction import contradiction
@@ -32,40 +32,27 @@ _IDENTITY = (np.zeros(3), np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class AlignmentConfig:
+class AlignmentConfig(Config):
     """What an alignment takes to be believed."""
 
     constellation: ConstellationConfig = field(default_factory=ConstellationConfig)
     same: SameConfig = field(default_factory=SameConfig)
     # Matched corners, and corners and walls together. In apartments of the training seeds 50-249 up to 7 and 15 of
     # them agreed on a wrong place, and never without a quarter of one map's walls in the other's free space.
-    fewest: tuple[int, int] = (2, 8)
-    fewest_without_grids: tuple[int, int] = (9, 22)
-    fewest_with_prior: tuple[int, int] = (1, 4)
-    rival_share: float = 0.6  # of the best one's matches that any other may explain
-    rival_m: float = 0.5  # farther off than this, or turned by more, it is another one
-    rival_rad: float = 0.15
-    gate: float = 0.999  # probability of χ² of all matches together, and that none of them …
-    outlier_gate: float = 0.9999  # … has of being farther from what the others say
-    most_refused: float = 0.25  # share of the matches that may fail there
-    most_contradicted: float = 0.05  # share of one map's walls that may stand in the other's free space
-    sigma_m: float = 0.1  # an alignment not known to within this is none
-    sigma_rad: float = 0.03
-    prior_gate: float = 0.9999  # probability of χ² with 3 degrees of freedom
-
-    def __post_init__(self) -> None:
-        not_negative(
-            self,
-            "rival_share",
-            "rival_m",
-            "rival_rad",
-            "most_refused",
-            "most_contradicted",
-            "sigma_m",
-            "sigma_rad",
-        )
-        for name in ("gate", "outlier_gate", "prior_gate"):
-            require(0 < getattr(self, name) < 1, f"AlignmentConfig.{name} must be in (0, 1)")
+    fewest: Annotated[tuple[int, int], Within("[1, 1000]")] = (2, 8)
+    fewest_without_grids: Annotated[tuple[int, int], Within("[1, 1000]")] = (9, 22)
+    fewest_with_prior: Annotated[tuple[int, int], Within("[1, 1000]")] = (1, 4)
+    rival_share: NotNegative = 0.6  # of the best one's matches that any other may explain
+    rival_m: Gap = 0.5  # farther off than this, or turned by more, it is another one
+    rival_rad: Gap = 0.15
+    # Probability of χ² of all matches together, and that none of them …
+    gate: Annotated[float, Within("(0, 1)")] = 0.999
+    outlier_gate: Annotated[float, Within("(0, 1)")] = 0.9999  # … has of being farther from what the others say
+    most_refused: Share = 0.25  # share of the matches that may fail there
+    most_contradicted: Share = 0.05  # share of one map's walls that may stand in the other's free space
+    sigma_m: NotNegative = 0.1  # an alignment not known to within this is none
+    sigma_rad: NotNegative = 0.03
+    prior_gate: Annotated[float, Within("(0, 1)")] = 0.9999  # probability of χ² with 3 degrees of freedom
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from slam.geometry import transform_points, wrap, wrap_scalar
-from slam.settings import positive, require
+from slam.settings import Angle, Config, Count, Few, Length, Within, require
 from slam.teams.account import Account
 from slam.teams.frames import ends_into, points_into, walls_into
 from slam.types import Array
@@ -26,33 +27,27 @@ Pairs = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConstellationConfig:
+class ConstellationConfig(Config):
     """How like two landmarks must be to be the same."""
 
-    shortest_m: float = 0.8  # of a pair of corners: nearer ones say too little of the heading
-    neighbours: int = 15  # pairs of a corner with so many others, the nearest
-    length_m: float = 0.12  # by which two pairs may differ in length
-    turn_rad: float = 0.4  # between the directions of two corners that are the same
-    near_m: float = 0.25  # of corners that count for a candidate
-    places: int = 60  # different ones by the corners alone, the best …
-    count: int = 15  # … and of these, by walls too, candidates that are looked at more closely
-    tolerances_m: tuple[float, ...] = (0.25, 0.15, 0.12, 0.12)  # of matches, as the fit gets closer
-    wall_turn_rad: float = 0.06  # between two walls that are the same
-    overlap_m: float = 0.2  # by which they must overlap
+    shortest_m: Length = 0.8  # of a pair of corners: nearer ones say too little of the heading
+    neighbours: Few = 15  # pairs of a corner with so many others, the nearest
+    length_m: Length = 0.12  # by which two pairs may differ in length
+    turn_rad: Angle = 0.4  # between the directions of two corners that are the same
+    near_m: Length = 0.25  # of corners that count for a candidate
+    places: Count = 60  # different ones by the corners alone, the best …
+    count: Count = 15  # … and of these, by walls too, candidates that are looked at more closely
+    tolerances_m: Annotated[tuple[float, ...], Within("[0.001, 1000]")] = (
+        0.25,
+        0.15,
+        0.12,
+        0.12,
+    )  # of matches, as the fit gets closer
+    wall_turn_rad: Angle = 0.06  # between two walls that are the same
+    overlap_m: Length = 0.2  # by which they must overlap
 
     def __post_init__(self) -> None:
-        positive(
-            self,
-            "shortest_m",
-            "neighbours",
-            "length_m",
-            "turn_rad",
-            "near_m",
-            "places",
-            "count",
-            "wall_turn_rad",
-            "overlap_m",
-        )
+        super().__post_init__()
         require(len(self.tolerances_m) > 0, "ConstellationConfig.tolerances_m must not be empty")
 
 

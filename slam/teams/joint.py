@@ -15,13 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 
 from slam.geometry import wrap
-from slam.settings import not_negative
+from slam.settings import Config, Within
 from slam.teams.account import Account
 from slam.teams.frames import points_into, walls_into
 from slam.types import Array
@@ -40,7 +41,7 @@ _STILL = 1e-8  # [m, rad]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SameConfig:
+class SameConfig(Config):
     """How much of what two robots find of one landmark differs beyond their filters' covariances.
 
     Corners are seen from other sides, walls in other pieces; an account's landmarks are each given so much of an
@@ -48,12 +49,9 @@ class SameConfig:
     seeds 0-49 is near 1.
     """
 
-    point_sigma_m: float = 0.001
-    wall_sigma_m: float = 0.0005  # across it, in the middle of what was seen
-    wall_sigma_rad: float = 0.0003
-
-    def __post_init__(self) -> None:
-        not_negative(self)
+    point_sigma_m: Annotated[float, Within("[0, 10]")] = 0.001
+    wall_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0005  # across it, in the middle of what was seen
+    wall_sigma_rad: Annotated[float, Within("[0, 10]")] = 0.0003
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

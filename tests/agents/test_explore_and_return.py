@@ -131,7 +131,7 @@ def test_configuration():
     assert ExploreAndReturnConfig().switch_m == 0.5
     agent = agents.make("explore-and-return", config={"homing": {"arrived_m": 0.1}, "switch_m": 1})
     assert agent.config.homing.arrived_m == 0.1
-    with pytest.raises(ValueError, match="arrived_rad must be > 0"):
+    with pytest.raises(ValueError, match=r"arrived_rad must be in \[0.001, 6.3\], got 0.0"):
         HomingConfig(arrived_rad=0.0)
     with pytest.raises(ValueError, match="arrived_m"):
         agents.make("explore-and-return", config={"homing": {"arived_m": 0.1}})

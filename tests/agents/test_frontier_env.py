@@ -204,8 +204,8 @@ def test_it_says_what_is_wrong():
         ExploreFrontierEnv(discount=0.0)
     with pytest.raises(ValueError, match="valid"):
         ExploreFrontierEnv(driver={"speed": 1.0})
-    with pytest.raises(ValueError, match="SlipConfig needs firm_share < slippery_share"):
+    with pytest.raises(ValueError, match=r"slip: SlipConfig\.firm_share 0.03 must be below slippery_share 0.02"):
         ExploreFrontierEnv(driver={"slip": {"firm_share": 0.03}})
-    with pytest.raises(ValueError, match=r"SlipConfig\.lateral_m_s2 must be > 0"):
+    with pytest.raises(ValueError, match=r"slip\.lateral_m_s2 must be in \[0.001, 100\], got"):
         ExploreFrontierEnv(driver={"slip": {"lateral_m_s2": 0.0}})
     assert len(STATE) == env.observation_space["state"].shape[0]

@@ -84,8 +84,11 @@ def test_the_filtered_twist_is_what_backend_and_observation_get() -> None:
         ("kalman", "unknown odometry filter 'kalman'.*valid: differential-transform, none"),
         ("differential-transfrom", "did you mean 'differential-transform'"),
         ({"name": NAME, "modell": "x"}, "unknown key of OdometryFilterConfig 'modell'"),
-        ({"name": NAME, "model": "x"}, "unknown motion model 'x'.*valid: as_printed, constant_velocity"),
-        ({"name": NAME, "process_turn": -1}, "process_turn must be > 0"),
+        (
+            {"name": NAME, "model": "x"},
+            "odometry_filter.model must be one of .*constant_velocity, .* got 'x'",
+        ),
+        ({"name": NAME, "process_turn": -1}, r"odometry_filter.process_turn must be in \[1e-12, 1e6\], got -1"),
         ({"model": "constant_velocity"}, '"none" has no settings'),
     ],
 )

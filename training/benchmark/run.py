@@ -17,7 +17,7 @@ from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.team.config import TeamConfig
 from slam.formats import atomic_write
-from slam.settings import to_mapping, unknown_name
+from slam.settings import check_name, to_mapping
 from training.benchmark import store as benchmark_store
 from training.benchmark import suites
 from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
@@ -79,8 +79,7 @@ class BenchmarkPlan:
         with bad_input():
             names = _agent_names(agents)
             backends = tuple(backend_names(slam if slam is not None else EnvConfig().slam))
-            if split not in SPLITS:
-                raise unknown_name("split", split, SPLITS)
+            check_name("split", split, SPLITS)
             chosen = tuple(parse_seeds(seeds, most=_MOST_SEEDS)) if seeds is not None else None
             if baseline is not None and baseline not in names:
                 raise ValueError(f"--baseline {baseline} is none of --agents {','.join(names)}; add it there")

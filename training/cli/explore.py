@@ -34,7 +34,8 @@ def explore(
     config: opt.ConfigFile = None,
     max_steps: opt.MaxSteps = None,
     coverage_target: Annotated[
-        float | None, typer.Option(help="Coverage that counts as success, in (0, 1].  [default: 0.95]")
+        float | None,
+        typer.Option(min=1e-6, max=1, help="Coverage that counts as success, in (0, 1].  [default: 0.95]"),
     ] = None,
     video: Annotated[bool, typer.Option("--video", help="Also film it: episode.mp4, at true speed.")] = False,
     video_substeps: Annotated[
@@ -72,8 +73,6 @@ def explore(
       mecanum explore --robots 3 --communication range --range 8 --out out/team
     """  # noqa: D301
     pose = _parse_start(start)
-    if coverage_target is not None and not 0 < coverage_target <= 1:
-        raise BadInput(f"--coverage-target must be above 0 and at most 1, got {coverage_target}")
     asked = {"video": video or video_substeps, "mcap": mcap, "rerun": rerun}
     extras = [name for name, wanted in asked.items() if wanted]
     given: dict[str, Any] = {

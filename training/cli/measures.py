@@ -18,7 +18,7 @@ def speed(
     steps: Annotated[int, typer.Option(min=100, max=10_000_000, help="Steps to measure.")] = 10_000,
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
-    beams: Annotated[int, typer.Option(min=8, help="Beams of the lidar.")] = 360,
+    beams: Annotated[int, typer.Option(min=8, max=10_000, help="Beams of the lidar.")] = 360,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
     peer: Annotated[
         str | None, typer.Option(help="Another simulator to measure in turn, in the same rooms: navground.")
@@ -62,7 +62,7 @@ def consistency(
     steps: Annotated[
         int | None, typer.Option(min=1, max=1_000_000, help="Of a run.  [default: the world's, or at most 3000]")
     ] = None,
-    noise: Annotated[float, typer.Option(help="Times the noise, told to the backends.")] = 1.0,
+    noise: Annotated[float, typer.Option(min=0, max=100, help="Times the noise, told to the backends.")] = 1.0,
     seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
     workers: Workers = None,
     ray: Ray = None,

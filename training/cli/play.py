@@ -29,7 +29,9 @@ def play(
     floor_plan: opt.FloorPlanFile = None,
     robot: opt.Robot = None,
     noise: opt.Noise = None,
-    speed: Annotated[float, typer.Option(help="Times true speed, which is 10 steps a second.")] = 1.0,
+    speed: Annotated[
+        float, typer.Option(min=0.01, max=100, help="Times true speed, which is 10 steps a second.")
+    ] = 1.0,
     robots: Annotated[
         int, typer.Option(min=1, max=64, help="How many; the first one is yours, agents drive the others.")
     ] = 1,
@@ -38,7 +40,7 @@ def play(
     starts: opt.Starts = None,
     unknown_starts: opt.UnknownStarts = False,
     frames: Annotated[
-        int | None, typer.Option(min=1, help="End after so many steps.  [default: when you quit]")
+        int | None, typer.Option(min=1, max=1_000_000, help="End after so many steps.  [default: when you quit]")
     ] = None,
 ) -> None:
     """Drive the robot yourself in a window, and watch what it believes.

@@ -21,7 +21,7 @@ def policy(
         typer.Option(help="With a .zip for source: the .json file of the policy that it was trained on from."),
     ] = None,
     member: Annotated[
-        int | None, typer.Option(min=1, help="To a .zip: which of several networks that choose together.")
+        int | None, typer.Option(min=1, max=100, help="To a .zip: which of several networks that choose together.")
     ] = None,
 ) -> None:
     """Convert a policy: a run's best, the package's files, a zip of stable-baselines3 (ppo-frontier's only).

@@ -27,7 +27,7 @@ def replay(
     association: Annotated[
         str | None, typer.Option(help="known or unknown landmark ids.  [default: known where the log has them]")
     ] = None,
-    robot: Annotated[int | None, typer.Option(min=1, help="Which robot of a UTIAS folder.")] = None,
+    robot: Annotated[int | None, typer.Option(min=1, max=100, help="Which robot of a UTIAS folder.")] = None,
     reference: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Log of the same scans with corrected poses.  [default: none]"),
@@ -35,7 +35,9 @@ def replay(
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
     ] = None,
-    limit_s: Annotated[float | None, typer.Option(help="Stop after so many seconds of the log.")] = None,
+    limit_s: Annotated[
+        float | None, typer.Option(min=0.001, max=1e9, help="Stop after so many seconds of the log.")
+    ] = None,
     config: opt.ConfigFile = None,
     out: opt.Out = Path("out/replay"),
     as_json: opt.Json = False,

@@ -29,7 +29,9 @@ def train(
     config: Annotated[
         str, typer.Option(help="Name of a configuration that comes with the package, or a TOML file.")
     ] = "ppo-frontier",
-    seed: Annotated[int | None, typer.Option(min=0, help="Another seed than the configuration's.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Another seed than the configuration's.")
+    ] = None,
     workers: Annotated[
         int | None,
         typer.Option(

@@ -27,6 +27,7 @@ from agents.learned.policy_files import write_policy
 from agents.learned.station_network import PLANES, opening_numbers, with_walls
 from agents.learned_tour import FORMAT
 from slam.formats import replacing
+from slam.settings import Config, Few, NotNegative, PositiveShare, Seed, Share, Within
 from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork
@@ -44,20 +45,21 @@ _VALIDATION = 1000  # seed of the first plan that is validated on
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainingConfig:
+class TrainingConfig(Config):
     """What a training depends on."""
 
-    rounds: int = 2  # of lessons, each driven by what was learned in the one before
-    plans: int = 1000  # seeds 0 … of the first round
-    later_plans: int = 380  # seeds 0 … of the others: a network takes more time to drive than the tour
-    validation_plans: int = 60  # seeds 1000 …
-    epochs: int = 12
-    batch: int = 64
-    rate: float = 1.5e-3
-    weight_decay: float = 1e-2
-    untold: float = 0.125  # share of the lessons that do not tell how far the plan extends
-    free_weight: float = 0.3  # of foreseeing what is free, besides what openings cost
-    seed: int = 0
+    rounds: Few = 2  # of lessons, each driven by what was learned in the one before
+    plans: Annotated[int, Within("[1, 1000000]")] = 1000  # seeds 0 … of the first round
+    # Seeds 0 … of the others: a network takes more time to drive than the tour.
+    later_plans: Annotated[int, Within("[1, 1000000]")] = 380
+    validation_plans: Annotated[int, Within("[1, 1000000]")] = 60  # seeds 1000 …
+    epochs: Annotated[int, Within("[1, 1000000]")] = 12
+    batch: Annotated[int, Within("[1, 1000000]")] = 64
+    rate: PositiveShare = 1.5e-3
+    weight_decay: Share = 1e-2
+    untold: Share = 0.125  # share of the lessons that do not tell how far the plan extends
+    free_weight: NotNegative = 0.3  # of foreseeing what is free, besides what openings cost
+    seed: Seed = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,20 +239,22 @@ def _resume(path: Path, network: nn.Module, optimiser: torch.optim.Optimizer) ->
 
 def study(
     out: Annotated[Path, typer.Option(help="Folder of the run.")],
-    rounds: Annotated[int, typer.Option(min=1, help="Of lessons, each driven by what was learned before.")] = 2,
+    rounds: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Of lessons, each driven by what was learned before.")
+    ] = 2,
     plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the first round, seeds 0 ….")] = 1000,
     later_plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the others, seeds 0 ….")] = 380,
-    validation_plans: Annotated[int, typer.Option(min=1, help=f"Seeds {_VALIDATION} ….")] = 60,
-    epochs: Annotated[int, typer.Option(min=1)] = 12,
-    batch: Annotated[int, typer.Option(min=1)] = 64,
-    rate: Annotated[float, typer.Option(help="Of learning.")] = 1.5e-3,
-    weight_decay: Annotated[float, typer.Option()] = 1e-2,
+    validation_plans: Annotated[int, typer.Option(min=1, max=1_000_000, help=f"Seeds {_VALIDATION} ….")] = 60,
+    epochs: Annotated[int, typer.Option(min=1, max=1_000_000)] = 12,
+    batch: Annotated[int, typer.Option(min=1, max=1_000_000)] = 64,
+    rate: Annotated[float, typer.Option(min=1e-9, max=1, help="Of learning.")] = 1.5e-3,
+    weight_decay: Annotated[float, typer.Option(min=0, max=1)] = 1e-2,
     untold: Annotated[
         float, typer.Option(min=0, max=1, help="Share of lessons that do not tell how far the plan extends.")
     ] = 0.125,
-    free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that gather lessons.")] = 1,
+    free_weight: Annotated[float, typer.Option(min=0, max=1e6, help="Of foreseeing what is free.")] = 0.3,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes that gather lessons.")] = 1,
     ray: Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""

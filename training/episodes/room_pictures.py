@@ -11,7 +11,7 @@ from mecanum_env import rooms as room_registry
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig, resolve
 from mecanum_env.views.plans import contact_sheet, draw_plan
 from slam.formats import atomic_write
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.runs.errors import BadInput, bad_input, check_writable
 
 __all__ = ["draw_rooms", "parse_seeds"]
@@ -55,8 +55,7 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str = "youbot", colum
     """
     with bad_input():
         chosen = parse_seeds(seeds)
-        if kind not in room_registry.names():
-            raise unknown_name("rooms", kind, room_registry.names())
+        check_name("rooms", kind, room_registry.names())
         body = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
         sheet_name = f"{kind}-sheet.png"
         check_writable(out, [sheet_name, *(f"{kind}-{seed}.png" for seed in chosen)])

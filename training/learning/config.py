@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import not_negative, positive, require, unknown_name
+from slam.settings import (
+    Config,
+    Count,
+    Duration,
+    Few,
+    Finite,
+    NotNegative,
+    Seed,
+    Share,
+    Span,
+    Within,
+    check_name,
+    require,
+)
 
 __all__ = [
     "EvaluationConfig", "PpoConfig", "RehearsalConfig", "RoomsConfig", "TrainConfig", "WorldConfig", "check_names",
@@ -18,29 +31,26 @@ __all__ = [
 def check_names(what: str, names: Iterable[str], valid: Collection[str]) -> None:
     """Raise ``ValueError`` unless all names are valid."""
     for name in names:
-        if name not in valid:
-            raise unknown_name(what, name, valid)
+        check_name(what, name, valid)
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoomsConfig:
+class RoomsConfig(Config):
     """Where is trained, whatever is: families of rooms, drawn as often as named, and what is paid there."""
 
     rooms: tuple[str, ...] = ("apartment",)
-    seeds: tuple[int, int] = (0, 999)  # of the rooms, both included
-    repeats: int = 1  # episodes, of other noise, in a room before the next is drawn: rooms take time to price
+    seeds: Annotated[tuple[int, int], Span("[0, 999]")] = (0, 999)  # of the rooms, both included
+    repeats: Count = 1  # episodes, of other noise, in a room before the next is drawn: rooms take time to price
     slam: str = "invariant-ekf"
-    time_limit_s: float = 300.0
-    time_1_s: float = -1.0 / 30.0  # reward per second
-    area_1_m2: float = 0.0  # … per square metre newly mapped
-    collision: float = -1.0
+    time_limit_s: Duration = 300.0
+    time_1_s: Finite = -1.0 / 30.0  # reward per second
+    area_1_m2: Finite = 0.0  # … per square metre newly mapped
+    collision: Finite = -1.0
 
     def __post_init__(self) -> None:
-        require(len(self.rooms) > 0, "[world] needs rooms")
-        check_names("rooms", self.rooms, room_registry.names())
-        low, high = self.seeds
-        require(0 <= low <= high < 1000, "[world] seeds must lie within the training seeds, 0 … 999")
-        require(self.repeats >= 1, f"[world] repeats must be at least 1, got {self.repeats}")
+        super().__post_init__()
+        require(len(self.rooms) > 0, f"{type(self).__name__}.rooms must name some")
+        check_names(f"{type(self).__name__}.rooms", self.rooms, room_registry.names())
 
     @property
     def reward(self) -> dict[str, float]:
@@ -60,30 +70,26 @@ class WorldConfig(RoomsConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(len(self.noises) > 0, "[world] needs noises")
-        check_names("noise preset", self.noises, NOISE_PRESETS)
+        require(len(self.noises) > 0, f"{type(self).__name__}.noises must name some")
+        check_names(f"{type(self).__name__}.noises", self.noises, NOISE_PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class PpoConfig:
+class PpoConfig(Config):
     """Of stable-baselines3, but ``gamma``, which is per second."""
 
-    steps: int = 200_000  # decisions
-    environments: int = 8
-    n_steps: int = 128  # decisions an environment, in one rollout
-    batch_size: int = 256
-    n_epochs: int = 4
-    learning_rate: float = 3e-4  # falls to nothing
-    gamma: float = 0.998
-    gae_lambda: float = 0.97
-    ent_coef: float = 0.003
-    clip_range: float = 0.2
-    target_kl: float = 0.03
-    chunk: int = 16  # rollouts between two checkpoints
-
-    def __post_init__(self) -> None:
-        not_negative(self, *(f.name for f in fields(PpoConfig)))
-        positive(self, "environments", "n_steps", "batch_size", "n_epochs", "chunk")
+    steps: Annotated[int, Within("[0, 1000000000]")] = 200_000  # decisions
+    environments: Annotated[int, Within("[1, 1024]")] = 8
+    n_steps: Annotated[int, Within("[1, 100000]")] = 128  # decisions an environment, in one rollout
+    batch_size: Annotated[int, Within("[1, 1000000]")] = 256
+    n_epochs: Few = 4
+    learning_rate: Share = 3e-4  # falls to nothing
+    gamma: Share = 0.998
+    gae_lambda: Share = 0.97
+    ent_coef: Annotated[float, Within("[0, 1000]")] = 0.003
+    clip_range: Annotated[float, Within("[0, 1000]")] = 0.2
+    target_kl: Annotated[float, Within("[0, 1000]")] = 0.03
+    chunk: Count = 16  # rollouts between two checkpoints
 
     @property
     def size(self) -> int:
@@ -109,51 +115,41 @@ class PpoConfig:
 class RehearsalConfig(PpoConfig):
     """PPO in ``training/learning/jump_world.py``, before that in the whole environment."""
 
-    steps: int = 0  # 0: no rehearsal
-    environments: int = 16
-    n_steps: int = 256
-    batch_size: int = 512
-    n_epochs: int = 3
-    learning_rate: float = 5e-4
-    gamma: float = 1.0
-    gae_lambda: float = 0.9
-    chunk: int = 4
-    shaping_s_m: float = 0.0  # seconds that a metre less still to go, by hindsight, counts for; 0: no such reward
-    replan_s: float = 3.0  # that a choice lasts at most: the longer, the more it is felt
-    every: int = 8  # chunks, between two trials on validation seeds …
-    episodes: int = 30  # … of each family
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(self.every >= 1 and 1 <= self.episodes <= 50, "[rehearsal] needs every ≥ 1, episodes 1 … 50")
-        not_negative(self, "shaping_s_m")
-        positive(self, "replan_s")
+    steps: Annotated[int, Within("[0, 1000000000]")] = 0  # 0: no rehearsal
+    environments: Annotated[int, Within("[1, 1024]")] = 16
+    n_steps: Annotated[int, Within("[1, 100000]")] = 256
+    batch_size: Annotated[int, Within("[1, 1000000]")] = 512
+    n_epochs: Few = 3
+    learning_rate: Share = 5e-4
+    gamma: Share = 1.0
+    gae_lambda: Share = 0.9
+    chunk: Count = 4
+    # Seconds that a metre less still to go, by hindsight, counts for; 0: no such reward.
+    shaping_s_m: NotNegative = 0.0
+    replan_s: Duration = 3.0  # that a choice lasts at most: the longer, the more it is felt
+    every: Count = 8  # chunks, between two trials on validation seeds …
+    episodes: Annotated[int, Within("[1, 50]")] = 30  # … of each family
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluationConfig:
+class EvaluationConfig(Config):
     """How often it is tried on validation seeds, and on how many."""
 
-    every: int = 2  # chunks
-    episodes: int = 20  # of each family
-
-    def __post_init__(self) -> None:
-        require(self.every >= 1 and 1 <= self.episodes <= 50, "[evaluation] needs every ≥ 1, episodes 1 … 50")
+    every: Count = 2  # chunks
+    episodes: Annotated[int, Within("[1, 50]")] = 20  # of each family
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
+class TrainConfig(Config):
     """A training run of ``ppo-frontier``."""
 
-    seed: int = 1
-    members: int = 1  # networks that are trained apart, each as all that follows says, and choose together
-    width: int = 64
-    heads: int = 4
-    layers: int = 2
+    seed: Seed = 1
+    # Networks that are trained apart, each as all that follows says, and choose together.
+    members: Annotated[int, Within("[1, 100]")] = 1
+    width: Annotated[int, Within("[1, 4096]")] = 64
+    heads: Annotated[int, Within("[1, 64]")] = 4
+    layers: Annotated[int, Within("[1, 64]")] = 2
     world: WorldConfig = field(default_factory=WorldConfig)
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-
-    def __post_init__(self) -> None:
-        require(self.members >= 1, f"members must be at least 1, got {self.members}")

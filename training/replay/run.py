@@ -17,7 +17,7 @@ from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_referenc
 from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.registry import config_type, make
-from slam.settings import from_mapping, require, to_mapping, unknown_name
+from slam.settings import Config, check_name, from_mapping, require, to_mapping
 from slam.types import Array
 from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
@@ -53,15 +53,12 @@ _RUN_KINDS: dict[str, tuple[type, ...]] = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayConfig:
+class ReplayConfig(Config):
     """A replay's configuration file; the log's own values stand where it says nothing."""
 
     observation: ObservationNoise | None = None  # of a log of scans there is none
     slam: str = "ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        require(isinstance(self.slam_config, Mapping), "ReplayConfig.slam_config must be a table")
 
 
 @dataclass(eq=False)
@@ -128,8 +125,7 @@ def prepare(
             log = with_reference(log, run["reference"])
             run["reference"] = str(Path(run["reference"]).absolute())
         known = run.setdefault("association", "unknown" if log.ids is None else "known")
-        if known not in ASSOCIATIONS:
-            raise unknown_name("association", known, ASSOCIATIONS)
+        check_name("association", known, ASSOCIATIONS)
         if known == "known" and log.ids is None:
             raise ValueError(f"log {log.name} does not tell landmarks apart; give --association unknown")
         limit = run.get("limit_s")

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import slam
 from slam.formats import atomic_write
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.runs.cluster import Cluster, RayPool, ray_pool
 from training.runs.errors import BadInput, Interrupted, check_writable
 from training.runs.processes import ProcessPool, process_pool
@@ -65,8 +65,7 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
     for name in chosen:
         if name in without:
             raise ValueError(f"--slam {name} {without[name]}; valid: {', '.join(sorted(valid))}")
-        if name not in valid:
-            raise unknown_name("SLAM backend", name, valid)
+        check_name("SLAM backend", name, valid)
     return chosen
 
 

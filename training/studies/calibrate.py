@@ -17,7 +17,7 @@ from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
 from mecanum_env.sensing.calibration import odometry_noise
 from mecanum_env.sensing.odometry_calibration import Drives, drift_ratios, drive, fit
 from slam.motion import OdometryNoise
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
 from training.runs.options import Json, Seed
@@ -75,8 +75,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def study(
     noise: Annotated[str, typer.Option(help="Noise presets, separated by commas.")] = "nominal,slippery,cavity",
-    episodes: Annotated[int, typer.Option(min=1, help="Drives of a preset.")] = 60,
-    steps: Annotated[int, typer.Option(min=10, help="Of a drive.")] = 400,
+    episodes: Annotated[int, typer.Option(min=1, max=1_000_000, help="Drives of a preset.")] = 60,
+    steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Of a drive.")] = 400,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -84,8 +84,7 @@ def study(
     presets = list(dict.fromkeys(noise.split(",")))
     with bad_input():
         for preset in presets:
-            if preset not in NOISE_PRESETS:
-                raise unknown_name("noise preset", preset, NOISE_PRESETS)
+            check_name("noise preset", preset, NOISE_PRESETS)
     results = {}
     for preset in presets:
         print(f"driving {preset} …", file=sys.stderr)

@@ -113,8 +113,8 @@ def study(
     particles: Annotated[str, typer.Option(help="Numbers, separated by commas.")] = "50,100,200,500,1000",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     seed: Seed = 0,
-    steps: Annotated[int, typer.Option(min=1, help="Of the drive.")] = 120,
-    limit_mb: Annotated[float, typer.Option(help="Copies that need more are left out.")] = 1000.0,
+    steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Of the drive.")] = 120,
+    limit_mb: Annotated[float, typer.Option(min=1, max=1e9, help="Copies that need more are left out.")] = 1000.0,
 ) -> None:
     """Measure what the maps of DP-SLAM's particles cost: one shared grid, or a copy each."""
     numbers = whole_numbers("--particles", particles, low=1, high=100_000)

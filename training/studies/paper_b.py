@@ -206,7 +206,7 @@ def _draw_particles(axes: Axes, particles: dict[str, dict[str, Array]]) -> None:
 def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_b"),
     seed: Seed = 0,
-    steps: Annotated[int | None, typer.Option(min=1, help="Of the run.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, max=1_000_000, help="Of the run.")] = None,
 ) -> None:
     """Repeat paper B's claims as plots, in the circle world."""
     print(json.dumps(paper_b(out, seed=seed, steps=steps), indent=1, ensure_ascii=False))

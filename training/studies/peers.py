@@ -23,7 +23,7 @@ from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.runs.errors import one_line
 from training.runs.processes import start_worker
 
@@ -57,8 +57,7 @@ class Drive:
 
 def require(peer: str) -> dict[str, str]:
     """Return the versions of a peer's distributions; ``ValueError`` tells how to install what is missing."""
-    if peer not in PEERS:
-        raise unknown_name("peer", peer, PEERS)
+    check_name("peer", peer, PEERS)
     try:
         return {name: version(name) for name in PEERS[peer]}
     except PackageNotFoundError as error:

@@ -129,7 +129,7 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/scale"),
     agent: Annotated[str, typer.Option(help="Agents, separated by commas.")] = "brisk-tour,ppo-frontier",
     seed: Seed = 10000,
-    minutes: Annotated[float, typer.Option(min=0.0, help="Most that one exploration may take.")] = 15.0,
+    minutes: Annotated[float, typer.Option(min=0.0, max=1e6, help="Most that one exploration may take.")] = 15.0,
 ) -> None:
     """Explore buildings, and measure what steps and decisions take as the map grows."""
     names = list(dict.fromkeys(agent.split(",")))

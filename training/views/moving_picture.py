@@ -60,10 +60,10 @@ class _Enough(Exception):
 def study(
     agent: Annotated[str, typer.Option(help="Who explores.")] = "brisk-tour",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    seed: Annotated[int, typer.Option(min=0)] = 4,
-    speed: Annotated[int, typer.Option(min=1, help="Times as fast as true.")] = 4,
-    width: Annotated[int, typer.Option(min=16, help="Of the picture [pixels].")] = 800,
-    until: Annotated[float, typer.Option(help="Coverage at which it ends.")] = 0.97,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 4,
+    speed: Annotated[int, typer.Option(min=1, max=100, help="Times as fast as true.")] = 4,
+    width: Annotated[int, typer.Option(min=16, max=4096, help="Of the picture [pixels].")] = 800,
+    until: Annotated[float, typer.Option(min=0, max=1, help="Coverage at which it ends.")] = 0.97,
     out: Annotated[Path, typer.Option(metavar="FILE.gif")] = Path("out/explore.gif"),
 ) -> None:
     """Make the README's moving picture of one episode."""

@@ -8,41 +8,41 @@ is turned and mirrored at random.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields
+from functools import cache
+from typing import Annotated
 
 import numpy as np
 
 from mecanum_env.rooms.layout.furniture import Box, cells
-from mecanum_env.rooms.layout.limits import interval
-from slam.settings import shares
+from slam.settings import Config, Share, Span
 
 __all__ = ["ApartmentConfig", "Door", "Layout", "draw_layout"]
 
 _MARGIN = 4  # solid cells around the flat
 _MIN_ROOM = 44  # 2.2 m: a room's least width
+_FLATS = 10  # in 500 attempts: fewer, and one seed in ten thousand finds none
 _DOOR_EDGE = 4  # 0.2 m: least wall between a door and the room's corner
 
 
 @dataclass(frozen=True, kw_only=True)
-class ApartmentConfig:
+class ApartmentConfig(Config):
     """Limits between which a flat is drawn, by seed."""
 
-    area_m2: tuple[float, float] = (70.0, 130.0)  # floor between the walls, furniture included
-    rooms: tuple[int, int] = (5, 8)
-    corridor_m: tuple[float, float] = (1.2, 1.8)
-    door_m: tuple[float, float] = (0.9, 1.2)
-    wall_m: tuple[float, float] = (0.1, 0.2)
-    links: float = 0.35  # probability of a door between two neighbouring rooms; there is always one
-    furniture: float = 0.75  # 0 empty rooms, 1 as full as can be driven through
+    # Floor between the walls, furniture included.
+    area_m2: Annotated[tuple[float, float], Span("[60, 200]")] = (70.0, 130.0)
+    rooms: Annotated[tuple[int, int], Span("[4, 12]")] = (5, 8)
+    corridor_m: Annotated[tuple[float, float], Span("[1.1, 3]")] = (1.2, 1.8)
+    door_m: Annotated[tuple[float, float], Span("[0.9, 1.6]")] = (0.9, 1.2)
+    wall_m: Annotated[tuple[float, float], Span("[0.1, 0.5]")] = (0.1, 0.2)
+    links: Share = 0.35  # probability of a door between two neighbouring rooms; there is always one
+    furniture: Share = 0.75  # 0 empty rooms, 1 as full as can be driven through
 
     def __post_init__(self) -> None:
-        interval(self, "area_m2", low=60.0, high=200.0)
-        interval(self, "rooms", low=4, high=12, whole=True)
-        interval(self, "corridor_m", low=1.1, high=3.0)
-        # Below 0.9 m the disc that must get everywhere does not pass on the lattice.
-        interval(self, "door_m", low=0.9, high=1.6)
-        interval(self, "wall_m", low=0.1, high=0.5)
-        shares(self, "links", "furniture")
+        super().__post_init__()
+        if any(getattr(self, f.name) != f.default for f in fields(self)):
+            _check_found(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +85,30 @@ def draw_layout(config: ApartmentConfig, rng: np.random.Generator) -> tuple[Layo
     ValueError
         If 500 attempts give no flat within the limits of the config.
     """
+    layout = next(_layouts(config, rng), None)
+    if layout is None:
+        raise _none_found(config)
+    return _turn(layout, rng)
+
+
+def _layouts(config: ApartmentConfig, rng: np.random.Generator) -> Iterator[Layout]:
+    """Yield those of 500 attempts that are within the limits of the config."""
     low, high = (v / 0.05**2 for v in config.area_m2)
     for _ in range(500):
         layout = _attempt(config, rng)
         if layout is not None and low <= layout.area <= high:
-            return _turn(layout, rng)
-    raise ValueError(
+            yield layout
+
+
+@cache
+def _check_found(config: ApartmentConfig) -> None:
+    """Raise ``ValueError`` where so few attempts give a flat that some seed would give none."""
+    if len(list(itertools.islice(_layouts(config, np.random.default_rng(0)), _FLATS))) < _FLATS:
+        raise _none_found(config)
+
+
+def _none_found(config: ApartmentConfig) -> ValueError:
+    return ValueError(
         f"no flat of {config.area_m2} m² with {config.rooms} rooms found; widen area_m2 or change rooms"
     )
 

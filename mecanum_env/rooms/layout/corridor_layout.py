@@ -12,11 +12,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Annotated
 
 import numpy as np
 
 from mecanum_env.rooms.layout.furniture import CELL_M, Box
-from slam.settings import require
+from slam.settings import Config, Share, Within, require
 
 __all__ = ["PAPER_D", "Corridor", "CorridorsConfig", "Sizes", "draw_layout", "sizes_of"]
 
@@ -37,33 +38,18 @@ _AT_END = 0.3  # share of the new corridors that meet the old one at its end: a 
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorridorsConfig:
+class CorridorsConfig(Config):
     """Lengths to lay out. What is left out is that of ``map``, or else fits a youBot: 60 m, 12 m, 1.4 m wide."""
 
-    map: int | None = None  # 1, 2 or 3: one of paper D's, of its lengths, 0.6 m wide
-    total_length_m: float | None = None  # of all corridors together
-    longest_m: float | None = None  # length of the longest one
-    width_m: float | None = None
-    wall_m: float = 0.2  # least thickness between two corridors
-    loops: float = 0.7  # probability that a new corridor may end on further old ones; 0 gives a tree
+    map: Annotated[int | None, Within("[1, 3]")] = None  # 1, 2 or 3: one of paper D's, of its lengths, 0.6 m wide
+    total_length_m: Annotated[float | None, Within("[0.5, 300]")] = None  # of all corridors together
+    longest_m: Annotated[float | None, Within("[0.5, 50]")] = None  # length of the longest one
+    width_m: Annotated[float | None, Within("[0.2, 5]")] = None
+    wall_m: Annotated[float, Within("[0.05, 2]")] = 0.2  # least thickness between two corridors
+    loops: Share = 0.7  # probability that a new corridor may end on further old ones; 0 gives a tree
 
     def __post_init__(self) -> None:
-        require(
-            self.map is None or self.map in PAPER_D,
-            f"CorridorsConfig.map must be 1, 2 or 3, or left out for lengths of one's own, got {self.map}",
-        )
-        for name, low, high in (
-            ("total_length_m", 0.5, 300.0),
-            ("longest_m", 0.5, 50.0),
-            ("width_m", 0.2, 5.0),
-            ("wall_m", 0.05, 2.0),
-            ("loops", 0.0, 1.0),
-        ):
-            value = getattr(self, name)
-            require(
-                value is None or low <= value <= high,
-                f"CorridorsConfig.{name} must be in [{low:g}, {high:g}], got {value}",
-            )
+        super().__post_init__()
         if self.map is not None:
             for name in ("total_length_m", "longest_m"):
                 value = getattr(self, name)

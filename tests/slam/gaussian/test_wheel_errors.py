@@ -309,7 +309,7 @@ def test_errors_that_cannot_be_are_no_states() -> None:
 
 @pytest.mark.parametrize("field", ["radius_sigma", "lever_sigma", "white_speed_share", "white_turn_share_rad_m"])
 def test_shares_below_zero_are_refused(field: str) -> None:
-    with pytest.raises(ValueError, match=f"LastingErrors.{field} must be"):
+    with pytest.raises(ValueError, match=f"config.odometry.lasting.{field} must be"):
         slam.make("invariant-ekf", config={"odometry": {"lasting": {field: -0.1}}})
 
 

@@ -159,7 +159,7 @@ def test_unknown_models_are_named() -> None:
         make_model("uniform")
     with pytest.raises(ValueError, match="no meaning at t = 0"):
         KalmanBucyFilter("uniform_acceleration", measurement=R, process=Q).reset(time=0.0)
-    with pytest.raises(ValueError, match=r"unknown recovery 'pad'.*did you mean 'pade'"):
+    with pytest.raises(ValueError, match=r"recovery must be one of pade, series, got 'pad'.*did you mean 'pade'"):
         Tolerances(recovery="pad")
     with pytest.raises(ValueError, match="takes a state of 2 numbers"):
         KalmanBucyFilter("constant_velocity", measurement=R, process=Q).reset(state=np.zeros(3))

@@ -127,5 +127,5 @@ def test_it_is_three_filters_of_one_coordinate_each(model: str) -> None:
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(name: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"OdometryFilterConfig.{name} "):
+    with pytest.raises(ValueError, match=f"config.{name} must be"):
         make_odometry_filter("differential-transform", {name: value})

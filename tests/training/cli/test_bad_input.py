@@ -70,8 +70,8 @@ def test_bad_usage(argv: list[str], words: list[str], capsys: pytest.CaptureFixt
         (["--start", "nan,0,0"], ["--start", "finite"]),
         (["--start", "1,2"], ["--start", "X,Y,THETA"]),
         (["--start", "a,b,c"], ["--start", "X,Y,THETA"]),
-        (["--coverage-target", "0"], ["--coverage-target", "above 0"]),
-        (["--coverage-target", "nan"], ["--coverage-target", "above 0"]),
+        (["--coverage-target", "0"], ["--coverage-target", "greater", "got '0'"]),
+        (["--coverage-target", "nan"], ["--coverage-target", "got 'nan'"]),
         (["--rooms", "rectangular", "--start", "999,0,0"], ["start", "free"]),
     ],
 )
@@ -131,10 +131,10 @@ def test_a_start_inside_a_wall_or_too_near_to_one(tmp_path: Path, capsys: pytest
         ("slmm = 'ekf'", ["unknown key of EnvConfig 'slmm'", "did you mean 'slam'?"]),
         ("[robot]\nlength = 1.0", ["unknown key of RobotConfig 'length'", "length_m"]),
         ("[robot]\nmass_kg = -1.0", ["mass_kg must be"]),
-        ("[lidar]\nbeams = 'many'", ["LidarConfig.beams"]),
+        ("[lidar]\nbeams = 'many'", ["EnvConfig.lidar.beams", "got 'many'"]),
         ("slam = 'efk'", ["unknown SLAM backend 'efk'"]),
         ("[slam_config]\ngrid = 1", ["grid"]),
-        ("slam_config = 3", ["slam_config must be a table of settings"]),
+        ("slam_config = 3", ["slam_config must be a mapping, got 3"]),
         ("[rooms_config]\nwalls = 1", ["walls"]),
         *(
             (f"odometry_filter = 'differential-transform'\n[odometry_filter_config]\n{line}", [line.split()[0]])

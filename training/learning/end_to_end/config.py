@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from agents.learned.drive_network import PlanSettings
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import positive, require
+from slam.settings import Config, Duration, Finite, Gap, Length, OneOf, PositiveShare, Seed, Within
 from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
 
 __all__ = ["DriveConfig", "DriveLearningConfig", "DriveLessonsConfig", "DriveWorldConfig"]
@@ -18,65 +19,54 @@ class DriveWorldConfig(RoomsConfig):
 
     rooms: tuple[str, ...] = ("apartment", "rectangular")
     noise: str = "nominal"
-    area_1_m2: float = 0.05
-    time_1_s: float = -0.02
+    area_1_m2: Finite = 0.05
+    time_1_s: Finite = -0.02
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_names("noise preset", [self.noise], NOISE_PRESETS)
+        check_names(f"{type(self).__name__}.noise", [self.noise], NOISE_PRESETS)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveLessonsConfig:
+class DriveLessonsConfig(Config):
     """Lessons: a round of them for each share of the time that the teacher drives."""
 
-    teacher: str = "nearest-frontier"  # whose frontiers are goals
-    teacher_shares: tuple[float, ...] = (1.0, 0.5, 0.2, 0.0)
-    guided_episodes: int = 400  # driven by the teacher on its own map, before the first round
-    episodes: int = 60  # a round, of each family
-    time_limit_s: float = 120.0
-    shaken: float = 0.1  # share of the time that whoever drives is disturbed
-
-    def __post_init__(self) -> None:
-        require(self.teacher in ("nearest-frontier", "tour"), "[lessons] teacher: nearest-frontier or tour")
-        require(self.guided_episodes >= 1 and self.episodes >= 1, "[lessons] needs episodes")
-        require(all(0 <= share <= 1 for share in self.teacher_shares), "[lessons] shares must be in [0, 1]")
-        require(0 <= self.shaken < 1, "[lessons] shaken must be in [0, 1)")
+    teacher: Annotated[str, OneOf(("nearest-frontier", "tour"))] = "nearest-frontier"  # whose frontiers are goals
+    teacher_shares: Annotated[tuple[float, ...], Within("[0, 1]")] = (1.0, 0.5, 0.2, 0.0)
+    # Driven by the teacher on its own map, before the first round.
+    guided_episodes: Annotated[int, Within("[1, 1000000]")] = 400
+    episodes: Annotated[int, Within("[1, 1000000]")] = 60  # a round, of each family
+    time_limit_s: Duration = 120.0
+    shaken: Annotated[float, Within("[0, 1)")] = 0.1  # share of the time that whoever drives is disturbed
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveLearningConfig:
+class DriveLearningConfig(Config):
     """Steps of gradient descent, and their size."""
 
-    map_steps: int = 2000  # before the first round
-    map_steps_a_round: int = 300
-    map_batch: int = 64
-    map_rate: float = 5e-3
-    control_steps: int = 6000  # a round
-    control_batch: int = 256
-    control_rate: float = 2e-3
-
-    def __post_init__(self) -> None:
-        positive(self)
+    map_steps: Annotated[int, Within("[1, 10000000]")] = 2000  # before the first round
+    map_steps_a_round: Annotated[int, Within("[1, 10000000]")] = 300
+    map_batch: Annotated[int, Within("[1, 10000000]")] = 64
+    map_rate: PositiveShare = 5e-3
+    control_steps: Annotated[int, Within("[1, 10000000]")] = 6000  # a round
+    control_batch: Annotated[int, Within("[1, 10000000]")] = 256
+    control_rate: PositiveShare = 2e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveConfig:
+class DriveConfig(Config):
     """A training run of ``ppo``."""
 
-    policy: str = "drive"  # what tells these files from those of ppo-frontier
-    seed: int = 1
+    policy: Annotated[str, OneOf(("drive",))] = "drive"  # what tells these files from those of ppo-frontier
+    seed: Seed = 1
     uncertainty: bool = True  # whether the covariance and the landmarks are looked at
-    goal_m: float = 3.0  # of PlanSettings
-    turn_m: float = 0.4
+    goal_m: Length = 3.0  # of PlanSettings
+    turn_m: Gap = 0.4
     world: DriveWorldConfig = field(default_factory=DriveWorldConfig)
     lessons: DriveLessonsConfig = field(default_factory=DriveLessonsConfig)
     learning: DriveLearningConfig = field(default_factory=DriveLearningConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-
-    def __post_init__(self) -> None:
-        require(self.policy == "drive", "policy must be drive")
 
     @property
     def planning(self) -> PlanSettings:

@@ -238,11 +238,15 @@ def _odometry_chart(rows: list[dict[str, Any]]) -> Figure:
 def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
     seed: Seed = 0,
-    runs: Annotated[int, typer.Option(min=1, help="Of the filter, for its errors.")] = 200,
-    episodes: Annotated[int, typer.Option(min=1, help="Drives of a noise preset and a set of seeds.")] = 20,
-    explorations: Annotated[int, typer.Option(min=0, help="Explored apartments, with and without.")] = 20,
-    steps: Annotated[int, typer.Option(min=1, help="Of an exploration, at most.")] = 1000,
-    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Of the filter, for its errors.")] = 200,
+    episodes: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Drives of a noise preset and a set of seeds.")
+    ] = 20,
+    explorations: Annotated[
+        int, typer.Option(min=0, max=1_000_000, help="Explored apartments, with and without.")
+    ] = 20,
+    steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Of an exploration, at most.")] = 1000,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes.")] = 1,
     ray: Ray = None,
 ) -> None:
     """Repeat paper C's figures: a filter by differential transforms, its cost, its use on board."""

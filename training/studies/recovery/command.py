@@ -15,7 +15,7 @@ import typer
 import agents
 from mecanum_env.arguments import make_config
 from slam.formats import atomic_write
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.episodes.room_pictures import parse_seeds
 from training.figures.charts import png
 from training.figures.tables import number, text_table
@@ -54,8 +54,7 @@ def study(
         names = backend_names(slam)
         chosen = list(dict.fromkeys(name.strip() for name in faults.split(",")))
         for name in chosen:
-            if name not in FAULTS:
-                raise unknown_name("fault", name, FAULTS)
+            check_name("fault", name, FAULTS)
         places = [place.strip() for place in rooms.split(",")]
         for place in places:
             where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}

@@ -50,7 +50,7 @@ def study(
     seeds: Seeds = "0:3",
     robots: Annotated[str, typer.Option(help="How many robots, separated by commas.")] = "1,2,3,5,8",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    steps: Annotated[int, typer.Option(min=_WARM_UP + 1, help="Of each episode.")] = 250,
+    steps: Annotated[int, typer.Option(min=_WARM_UP + 1, max=1_000_000, help="Of each episode.")] = 250,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, nothing else.")] = False,
 ) -> None:
     """Measure a step of a team that explores, resets and decisions left out."""

@@ -198,9 +198,11 @@ def study(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/team_filters"),
     seeds: Seeds = "10000:10015",
     robots: Annotated[int, typer.Option(min=1, max=8, help="How many explore together.")] = 2,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of a robot.")] = 3000,
-    start_sigma_m: Annotated[float, typer.Option(min=1e-6, help="Of where the others start [m].")] = 0.02,
-    start_sigma_deg: Annotated[float, typer.Option(min=1e-6, help="Of their headings there [degrees].")] = 0.5,
+    steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Most steps of a robot.")] = 3000,
+    start_sigma_m: Annotated[float, typer.Option(min=1e-6, max=10, help="Of where the others start [m].")] = 0.02,
+    start_sigma_deg: Annotated[
+        float, typer.Option(min=1e-6, max=180, help="Of their headings there [degrees].")
+    ] = 0.5,
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     workers: Workers = None,
     ray: Ray = None,

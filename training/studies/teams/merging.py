@@ -208,7 +208,7 @@ def study(
     seeds: Seeds = "10000:10049",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     coverage: Annotated[float, typer.Option(min=0.0, max=1.0, help="At which each robot stops …")] = 0.7,
-    time_s: Annotated[float, typer.Option(min=0.1, help="… or after so long [s].")] = 100.0,
+    time_s: Annotated[float, typer.Option(min=0.1, max=1e6, help="… or after so long [s].")] = 100.0,
     workers: Workers = None,
     ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/merging"),
