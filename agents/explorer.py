@@ -19,40 +19,20 @@ from agents.driving.control import ControlConfig, PathFollower
 from agents.view_points.frontiers import FrontierConfig, Frontiers, find, frontier_cells
 from agents.view_points.gain import expected_area
 from agents.view_points.sight import Track, Watch, view_points
-from agents.view_points.troubles import Troubles
+from agents.view_points.troubles import PatienceConfig, Troubles
 from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig, belief_classes
 from agents.ways.giving_way import GivingWay, GivingWayConfig
 from agents.ways.planning import TravelCosts, shortest_path, travel_costs
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import Config, Count, Duration, Length, NotNegative, Rate
+from slam.settings import Config
 from slam.types import Array
 
-__all__ = ["Candidates", "Explorer", "ExplorerConfig", "PatienceConfig"]
+__all__ = ["Candidates", "Explorer", "ExplorerConfig"]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
 _REMOTE_RAYS = 60
 _LOST = 0.1  # health of a belief below which it is no good for driving
-
-
-@dataclass(frozen=True, kw_only=True)
-class PatienceConfig(Config):
-    """When to choose anew, when to give up, and for how long."""
-
-    replan_s: Duration = 1.0
-    min_replan_s: Duration = 0.3  # between two choices, whatever happens
-    far_m: Length = 15.0  # to a goal farther off, where less than …
-    news_m2: NotNegative = 0.1  # … has come to light since it was chosen, the robot drives on for …
-    stale_s: Duration = 5.0  # … so long before it chooses anew
-    settle_s: Duration = 0.2  # how long to look from a view point before it counts as looked from
-    looks: Count = 1  # at one piece of frontier before it is let be
-    stuck_s: Duration = 4.0  # without moving or turning: recover
-    recover_s: Duration = 1.5
-    lost_s: Duration = 2.0  # how long to stand still when the belief is lost, before creeping on
-    avoid_s: Duration = 20.0  # how long a goal that did not work out is put last; doubled each time
-    attempts: Count = 3  # at one goal that does not work out
-    slowest_m_s: Rate = 0.15  # a goal gets 10 s and the time its path takes at this speed
-    same_m: Length = 0.6  # frontier pieces nearer than this to one dealt with before are the same
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,9 +6,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from slam.settings import Config, Count, Duration, Length, NotNegative, Rate
 from slam.types import Array
 
-__all__ = ["Trouble", "Troubles"]
+__all__ = ["PatienceConfig", "Trouble", "Troubles"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatienceConfig(Config):
+    """When to choose anew, when to give up, and for how long."""
+
+    replan_s: Duration = 1.0
+    min_replan_s: Duration = 0.3  # between two choices, whatever happens
+    far_m: Length = 15.0  # to a goal farther off, where less than …
+    news_m2: NotNegative = 0.1  # … has come to light since it was chosen, the robot drives on for …
+    stale_s: Duration = 5.0  # … so long before it chooses anew
+    settle_s: Duration = 0.2  # how long to look from a view point before it counts as looked from
+    looks: Count = 1  # at one piece of frontier before it is let be
+    stuck_s: Duration = 4.0  # without moving or turning: recover
+    recover_s: Duration = 1.5
+    lost_s: Duration = 2.0  # how long to stand still when the belief is lost, before creeping on
+    avoid_s: Duration = 20.0  # how long a goal that did not work out is put last; doubled each time
+    attempts: Count = 3  # at one goal that does not work out
+    slowest_m_s: Rate = 0.15  # a goal gets 10 s and the time its path takes at this speed
+    same_m: Length = 0.6  # frontier pieces nearer than this to one dealt with before are the same
 
 
 @dataclass(slots=True)
