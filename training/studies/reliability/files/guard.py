@@ -1,0 +1,81 @@
+"""The child process seen from outside: what takes too long is ended, and what it died of is noted."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from training.runs.processes import ONE_THREAD
+
+__all__ = ["BOUND_S", "results"]
+
+BOUND_S = 60.0
+"""Wall-clock time that a file may take; what it took of the processor is in its row."""
+
+_START_S = 600.0  # until the first answer: kernels may have to be compiled
+
+_MODULE = "training.studies.reliability.files.child"
+
+
+class _Child:
+    """A process that answers, started anew where it is gone."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[bytes] | None = None
+        atexit.register(self.end)
+
+    def end(self) -> None:
+        """End it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def ask(self, *job: Any) -> None:
+        """Hand it a job."""
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", _MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL, env=os.environ | ONE_THREAD,
+            )  # fmt: skip
+            self._patience_s = _START_S
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps(job).encode() + b"\n")
+        self._process.stdin.flush()
+
+    def answer(self) -> dict[str, Any] | str:
+        """Return the next row, or what the process died of."""
+        assert self._process is not None and self._process.stdout is not None
+        ready, _, _ = select.select([self._process.stdout], [], [], self._patience_s)
+        self._patience_s = BOUND_S
+        line = self._process.stdout.readline() if ready else b""
+        if line:
+            row: dict[str, Any] = json.loads(line)
+            return row
+        code = self._process.poll() if not ready else self._process.wait()
+        self.end()
+        return "time" if not ready else f"died of {code}"
+
+
+_CHILD = _Child()
+
+
+def results(reader: str, seed: int, first: int, count: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of so many files of a reader, from one on."""
+    index, last = first, first + count
+    while index < last:
+        _CHILD.ask(reader, seed, index, last - index)
+        while index < last:
+            row = _CHILD.answer()
+            if isinstance(row, str):
+                yield {"index": index, "case": "?", "end": row, "seconds": BOUND_S, "mb": 0.0}
+                index += 1
+                break
+            yield row
+            index += 1
