@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from slam.files import quoted
 from slam.settings import unknown_name
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def _reader(policy: str) -> str:
 
     found = policy_format(Path(policy))
     if found not in _POLICIES:
-        raise ValueError(f"policy {policy}: its format {found!r} is none of {', '.join(_POLICIES)}")
+        raise ValueError(f"policy {policy}: its format {quoted(found)} is none of {', '.join(_POLICIES)}")
     return _POLICIES[found]
 
 

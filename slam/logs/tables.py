@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slam.files import open_bounded
 
 __all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
 
@@ -19,7 +17,6 @@ Array = NDArray[np.float64]
 
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
 _LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
-_GZIP = b"\x1f\x8b"
 
 
 def find(folder: Path, name: str) -> Path:
@@ -97,12 +94,12 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     ValueError
         One line: that the file cannot be read, is damaged, or is too large for any log.
     """
-    with _opened(path) as file:
+    with open_bounded(path) as (file, most):
         size = number = 0
         while line := file.readline(_LONGEST_LINE + 1):
             number, size = number + 1, size + len(line)
-            if size > _LARGEST or len(line) > _LONGEST_LINE:
-                limit = "" if size > _LARGEST else f", line {number}"
+            if size > min(most, _LARGEST) or len(line) > _LONGEST_LINE:
+                limit = f", line {number}" if len(line) > _LONGEST_LINE else ""
                 raise ValueError(f"{path}{limit} is larger than any log's: it is no such log")
             yield number, line.decode("utf-8", "replace")
 
@@ -123,18 +120,3 @@ def numbers_of(words: Sequence[str], *, path: Path, line: int, what: str) -> Arr
         word = words[int(np.flatnonzero(~np.isfinite(values))[0])]
         raise ValueError(f"{path}, line {line}: {word[:40]!r} is not a finite number ({what}); correct the line")
     return values
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file, plain or gzip, and turn what goes wrong while it is read into one line."""
-    try:
-        with open(path, "rb") as raw:
-            packed = raw.read(2) == _GZIP
-        # By its first bytes: a browser may have unpacked a file and left its name.
-        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
-            yield cast(BinaryIO, file)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise ValueError(f"{path} is a damaged gzip file ({error}); fetch it again") from error
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error

@@ -153,7 +153,7 @@ STORES: Hostile = {
         f"CREATE VIEW team_episodes AS {_ENDLESS} SELECT {_KEPT}, i AS robots, 'x' AS communication FROM episodes, n"
     ),
     "an index that computes": _store("CREATE INDEX i ON episodes (length(hex(metrics)))"),
-    "a row more than there should be": _store("INSERT INTO episodes SELECT 'x', 'y', 3, 'z', 'w', 'v', '{}', '', '', '', '' "),
+    "a row more than there should be": _store("INSERT INTO episodes SELECT 'x', 'y', 3, 'z', 'w', 'v', '{}', x'', x'', x'', x''"),
     "another table of teams": _store("CREATE TABLE team_episodes (a)"),
     "a column less": _store("ALTER TABLE episodes DROP COLUMN thumbnail"),
     "another application": _store("PRAGMA application_id = 1"),
