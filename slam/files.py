@@ -21,8 +21,8 @@ from typing import Any, BinaryIO, NoReturn, cast
 import yaml
 
 __all__ = [
-    "check_file", "check_tables", "open_bounded", "open_database", "parse_json", "parse_toml", "parse_yaml",
-    "quoted", "read_bytes", "read_json", "read_toml", "shown_path", "trust",
+    "check_file", "check_tables", "open_bounded", "open_database", "parse_json", "parse_toml",
+    "parse_yaml", "plain_name", "quoted", "read_bytes", "read_json", "read_toml", "shown_path", "trust",
 ]  # fmt: skip
 
 MIB = 2**20
@@ -47,8 +47,21 @@ def quoted(value: object, longest: int = 60) -> str:
     return text if len(text) <= longest else f"{text[: longest - 1]}…"
 
 
+def plain_name(text: str, longest: int = 120) -> str:
+    """Return a name from outside as it is shown: on one line, cut where it is long, and nothing in it acts.
+
+    Control characters, marks that turn the direction of what follows, and bytes that are no text are written out.
+    """
+    out = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return out if len(out) <= longest else f"{out[: longest - 1]}…"
+
+
 def check_file(path: Path, *, what: str = "file") -> None:
     """Raise ``ValueError`` unless a path leads to a regular file: nothing else is opened."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise ValueError(f"the name of {what} {shown_path(path)} is no UTF-8; rename it") from None
     try:
         if path.is_file():
             return
@@ -102,9 +115,8 @@ def open_bounded(path: Path) -> Iterator[tuple[BinaryIO, int]]:
 
 
 def shown_path(path: Path) -> str:
-    """Return a path as it is typed; one with control characters, or a long one, as Python writes it."""
-    text = str(path)
-    return text if text.isprintable() and len(text) < 300 else quoted(text, 300)
+    """Return a path as an error tells it."""
+    return plain_name(str(path), 400)
 
 
 def _reason(error: Exception) -> str:

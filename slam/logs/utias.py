@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.files import plain_name
 from slam.geometry import wrap
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time, split_holds
 from slam.logs.tables import find, read_table, read_timed
@@ -102,7 +103,7 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     odometry_times, twists = split_holds(odometry[:, 0] - begin, twists, longest_s=_LONGEST_HOLD_S)
     note = "reference: Vicon pose of the robot's centre; the start pose is the reference's"
     return RecordedLog(
-        name=f"{folder.absolute().name} robot {robot}", clock_start_s=begin,
+        name=f"{plain_name(folder.absolute().name)} robot {robot}", clock_start_s=begin,
         odometry_times=odometry_times, twists=twists,
         observation_times=times, observation_ends=ends, range_bearing=measured[kept, 2:4], ids=subjects[kept],
         reference_times=truth[within, 0] - begin,

@@ -17,6 +17,7 @@ from slam.files import quoted, read_bytes, read_json
 from slam.formats import atomic_write
 from training.benchmark.tables import figures_table, markdown, overview, ranked
 from training.figures.statistics import Interval
+from training.figures.tables import markdown_name
 from training.runs.errors import BadInput, bad_input
 
 __all__ = ["BEGIN", "END", "study", "tables", "update"]
@@ -50,7 +51,7 @@ def tables(summary: Summary) -> str:
         parts.append(markdown(figures_table(ranked(found), _COLUMNS, limits=_WITH_LIMITS)))
         ends = {agent: words for agent, words in summary["ends"][suite].items() if set(words) != {"covered"}}
         if ends:
-            told = "; ".join(f"`{agent}` {_counted(words)}" for agent, words in ends.items())
+            told = "; ".join(f"{markdown_name(agent)} {_counted(words)}" for agent, words in ends.items())
             parts.append(f"Ended otherwise than covered: {told}.\n")
     versions = ", ".join(
         f"{name} {value}" for name, value in config.items() if isinstance(value, str) and name not in _OWN

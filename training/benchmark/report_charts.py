@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from slam.files import plain_name
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
 from training.figures.statistics import Interval
@@ -84,7 +85,7 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
     names = ", ".join(b.name for b in bands)
     parts = [
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
-        f'aria-label="Coverage against {escape(_LABELS[along])}: {escape(names)}">'
+        f'aria-label="Coverage against {escape(_LABELS[along])}: {_name(names)}">'
     ]
     ticks = np.asarray(MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(0.0, last))
     for tick in ticks[ticks <= last].tolist():
@@ -103,7 +104,7 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         dashed = " dashed" if colour >= COLOURS else ""
         path = _polyline(b.x, b.middle, last)
         parts.append(
-            f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{escape(b.name)}</title></path>'
+            f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{_name(b.name)}</title></path>'
         )
     parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">coverage [%]</text>')
     middle = 0.5 * (_LEFT + right)
@@ -111,6 +112,10 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         f'<text class="label" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{_LABELS[along]}</text>'
     )
     return "".join([*parts, "</svg>"])
+
+
+def _name(text: str) -> str:
+    return escape(plain_name(text, 400))
 
 
 def _to_x(value: float, last: float) -> float:
@@ -173,7 +178,7 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
     names = ", ".join(name for name, _ in lines)
     parts = [
         f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" '
-        f'aria-label="{escape(label)} against the number of robots: {escape(names)}">'
+        f'aria-label="{_name(label)} against the number of robots: {_name(names)}">'
     ]
     for tick in ticks.tolist():
         _, y = at(1, tick, 0)
@@ -187,17 +192,17 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
         if line and line[0][0] == 1:
             shares = [(n, ideal(line[0][1].value, n)) for n in range(1, counts[-1] + 1)]
             points = [at(n, share, k) for n, share in shares if share <= top]
-            parts.append(f'<path class="{kind} dashed" style="stroke-width: 1; opacity: .6" d="{path(points)}"/>')
+            parts.append(f'<path class="{kind} dashed ideal" d="{path(points)}"/>')
         if line:
             points = [at(n, f.value, k) for n, f in line]
-            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{escape(name)}</title></path>')
+            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{_name(name)}</title></path>')
         for n, f in line:
             if math.isfinite(f.low) and math.isfinite(f.high):
                 limits = path([at(n, f.low, k), at(n, f.high, k)])
-                parts.append(f'<path class="{kind}" style="stroke-width: 1.2" d="{limits}"/>')
+                parts.append(f'<path class="{kind} thin" d="{limits}"/>')
             x, y = at(n, f.value, k)
-            parts.append(f'<circle class="{kind}" style="fill: var(--c)" cx="{x}" cy="{y}" r="2.5"/>')
-    parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{escape(label)}</text>')
+            parts.append(f'<circle class="{kind} dot" cx="{x}" cy="{y}" r="2.5"/>')
+    parts.append(f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{_name(label)}</text>')
     centre = 0.5 * (_LEFT + right)
     parts.append(f'<text class="label" x="{centre}" y="{_HEIGHT - 6}" text-anchor="middle">robots</text>')
     return "".join([*parts, "</svg>"])

@@ -156,6 +156,8 @@ def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: s
         value = metrics[key]
         return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
 
+    from slam.files import plain_name
+
     where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
     verdict = "success" if metrics["success"] else "target not reached"
     corners = shown("corner_mean_m", "cm", 1, 100.0)
@@ -169,4 +171,4 @@ def _summary(metrics: dict[str, Any], out: Path, files: Sequence[str], ending: s
         ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
         ("files", f"{out}/: {', '.join(files)}"),
     )
-    return "\n".join(f"{name:<12} {text}" for name, text in rows)
+    return "\n".join(f"{name:<12} {plain_name(text, 1000)}" for name, text in rows)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mecanum_env.team.config import TeamConfig
+from slam.files import plain_name
 from training.episodes import team as task
 from training.episodes.explore import ENDINGS, EXTRAS
 from training.episodes.team_recording import TeamRecorder
@@ -66,7 +67,7 @@ def _summary(metrics: dict[str, Any], files: str) -> str:
         *((f"robot {robot['robot']}", _of_robot(robot)) for robot in metrics["per_robot"]),
         ("files", files),
     ]  # fmt: skip
-    return "\n".join(f"{name:<12} {text}" for name, text in rows)
+    return "\n".join(f"{name:<12} {plain_name(text, 1000)}" for name, text in rows)
 
 
 def _of_robot(robot: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Pages of ours: the frame of a plain one, and the policy that keeps every page from loading or running anything."""
+"""Pages of ours: the frame of a plain one, and the policy by which a page loads nothing and runs what is ours."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def team_page(
         "COMMAND": escape(command),
         "CONFIG": escape(config),
         "SCRIPT": assets(_SCRIPTS),
-    })  # fmt: skip
+    }, style="".join(f".robot-{k} {{ --c: {colour(k)} }}\n" for k in range(n)))  # fmt: skip
 
 
 def colour(robot: int) -> str:
@@ -87,7 +87,7 @@ def _robots_table(robots: Sequence[Mapping[str, Any]]) -> str:
     """Return a row a robot, with its colour before its name."""
     head = "".join(f"<th>{escape(heading)}</th>" for heading in ("", *(heading for heading, *_ in _COLUMNS)))
     rows = "".join(
-        f'<tr><th><span class="key" style="--c: {colour(k)}"></span>robot {k}</th>'
+        f'<tr><th><span class="key robot-{k}"></span>robot {k}</th>'
         + "".join(f"<td>{number(robot[name], factor, digits)}</td>" for _, name, factor, digits in _COLUMNS)
         + "</tr>"
         for k, robot in enumerate(robots)

@@ -40,8 +40,13 @@ def read_bytes(path: Path, *, what: str, limit: int = _MAX_BYTES) -> bytes:
     except (OSError, ValueError) as error:
         if isinstance(error, FloorPlanError):
             raise
-        text = str(error) if type(error) is ValueError else f"cannot read {what} {shown_path(path)}: {error}"
-        raise FloorPlanError(text) from error
+        if type(error) is ValueError:
+            raise FloorPlanError(str(error)) from error
+        raise FloorPlanError(f"cannot read {what} {shown_path(path)}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
 
 
 def read_grey(path: Path) -> NDArray[np.float32]:

@@ -31,6 +31,8 @@ _START_CLEARANCE_M = 0.6
 _RADII_M = (DRIVE_RADIUS_M, 0.35, 0.3, 0.2, 0.1, 0.0)
 _MODES = ("trinary", "scale", "raw")
 _MAX_RESOLUTION_M = 10.0
+_FARTHEST_M = 1e7  # of the origin: farther away, floats tell too little apart
+_MOST_WALLS = 100_000  # the time that their corners take goes by the square
 
 
 def load(
@@ -145,6 +147,10 @@ def from_raster(
         )
     rng = generator(seed)
     walls = outline_segments(free) * resolution
+    if len(walls) > _MOST_WALLS:
+        raise FloorPlanError(
+            f"{what} has {len(walls)} walls, more than {_MOST_WALLS}: it is no plan, or noisy; smooth the image"
+        )
     walls += np.tile(np.asarray(origin, np.float64), 2)
     return FloorPlan(
         name=name,
@@ -212,8 +218,10 @@ def _resolution(value: object, what: str) -> float:
 
 def _origin(value: object, what: str) -> tuple[float, float]:
     numbers = [_number(v) for v in value] if isinstance(value, (list, tuple)) else []
-    if len(numbers) not in (2, 3) or any(math.isnan(v) for v in numbers):
-        raise FloorPlanError(f"{what}: origin must be [x, y, yaw] in m and rad, got {quoted(value)}")
+    if len(numbers) not in (2, 3) or not all(abs(v) <= _FARTHEST_M for v in numbers):
+        raise FloorPlanError(
+            f"{what}: origin must be [x, y, yaw] in m and rad, up to {_FARTHEST_M:g} m away, got {quoted(value)}"
+        )
     if len(numbers) == 3 and abs(numbers[2]) > 1e-9:
         raise FloorPlanError(f"{what}: origin's yaw must be 0, got {numbers[2]:g}; turn the image instead")
     return numbers[0], numbers[1]

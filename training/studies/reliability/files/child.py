@@ -24,7 +24,7 @@ from training.studies.reliability.files.readers import READERS, Reader
 
 __all__ = ["BOUND_MB", "main", "one_file"]
 
-BOUND_MB = 1024
+BOUND_MB = 3072
 """Memory that reading a file may take beyond what the process had before."""
 
 _LONGEST = 600  # characters of an error
@@ -62,7 +62,7 @@ def _judged(error: Exception, path: Path) -> str:
         return "traceback"
     if not text or "\n" in text or len(text) > _LONGEST or re.search(r"[\x00-\x1f\x7f]", text):
         return "no one line"
-    return "refused" if path.name in text or path.parent.name in text else "no name"
+    return "refused" if path.stem in text or path.parent.name in text else "no name"
 
 
 _OURS = ("slam", "mecanum_env", "agents", "training")
@@ -94,12 +94,14 @@ def main() -> None:
     """Answer the lines on standard input until there are no more."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what a reader prints is no answer
-    sys.stdout = open(os.devnull, "w", encoding="utf-8")
+    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for reader in READERS.values():
         reader.warm_up()
     soft = int((_memory_mb("VmSize") + BOUND_MB) * 2**20)
     resource.setrlimit(resource.RLIMIT_AS, (soft, resource.RLIM_INFINITY))
+    answers.write("ready\n")
+    answers.flush()
     for line in sys.stdin:
         name, seed, first, count = json.loads(line)
         for index in range(first, first + count):

@@ -15,10 +15,10 @@ from training.runs.processes import ONE_THREAD
 
 __all__ = ["BOUND_S", "results"]
 
-BOUND_S = 60.0
+BOUND_S = 30.0
 """Wall-clock time that a file may take; what it took of the processor is in its row."""
 
-_START_S = 600.0  # until the first answer: kernels may have to be compiled
+_START_S = 600.0  # until it is ready: kernels may have to be compiled
 
 _MODULE = "training.studies.reliability.files.child"
 
@@ -44,23 +44,27 @@ class _Child:
                 [sys.executable, "-m", _MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL, env=os.environ | ONE_THREAD,
             )  # fmt: skip
-            self._patience_s = _START_S
+            self._line(_START_S)  # it is ready
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(job).encode() + b"\n")
         self._process.stdin.flush()
 
     def answer(self) -> dict[str, Any] | str:
         """Return the next row, or what the process died of."""
-        assert self._process is not None and self._process.stdout is not None
-        ready, _, _ = select.select([self._process.stdout], [], [], self._patience_s)
-        self._patience_s = BOUND_S
-        line = self._process.stdout.readline() if ready else b""
+        line = self._line(BOUND_S)
         if line:
             row: dict[str, Any] = json.loads(line)
             return row
-        code = self._process.poll() if not ready else self._process.wait()
+        assert self._process is not None
+        code = None if line is None else self._process.wait()
         self.end()
-        return "time" if not ready else f"died of {code}"
+        return "time" if line is None else f"died of {code}"
+
+    def _line(self, patience_s: float) -> bytes | None:
+        """Return the next line; empty where the process is gone, None where none comes in time."""
+        assert self._process is not None and self._process.stdout is not None
+        ready, _, _ = select.select([self._process.stdout], [], [], patience_s)
+        return self._process.stdout.readline() if ready else None
 
 
 _CHILD = _Child()
@@ -74,7 +78,7 @@ def results(reader: str, seed: int, first: int, count: int) -> Iterator[dict[str
         while index < last:
             row = _CHILD.answer()
             if isinstance(row, str):
-                yield {"index": index, "case": "?", "end": row, "seconds": BOUND_S, "mb": 0.0}
+                yield {"index": index, "end": row, "seconds": BOUND_S, "mb": 0.0}
                 index += 1
                 break
             yield row

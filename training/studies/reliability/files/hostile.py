@@ -101,7 +101,9 @@ MAPS: Hostile = {
     **{f"a threshold of {value}": _map(free_thresh=value) for value in (".nan", "2", "-1", "[]", "1", "0")},
     **{f"negate {value}": _map(negate=value) for value in ("2", "[]", "yes", "1.0")},
     **{f"mode {value}": _map(mode=value) for value in ("raw", "[]", "scale", "1")},
-    **{f"{text!r}": _yaml(text) for text in ("", "[]", "abc", "1", "---\n---\n", "%YAML 9.9\n---\na: 1", "\ufeff", "*a")},
+    **{f"{text!r}": _yaml(text) for text in (
+        "", "[]", "abc", "1", "---\n---\n", "%YAML 9.9\n---\na: 1", "\ufeff", "*a",
+    )},
 }  # fmt: skip
 
 
@@ -150,6 +152,11 @@ def _one(name: str, data: bytes) -> Callable[[], Files]:
 
 _JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08" + struct.pack(">HH", 65535, 65535) + b"\x01\x01\x11\x00\xff\xd9"
 
+
+def _bmp(width: int, height: int, bits: int) -> bytes:
+    return b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, width, height, 1, bits, 0)
+
+
 IMAGES: Hostile = {
     "10⁹ pixels in PNG": lambda: {"hostile.png": _png(40_000, 25_000)},
     "4·10¹⁸ pixels in PNG": lambda: {"hostile.png": _png(2**31 - 1, 2**31 - 1)},
@@ -173,8 +180,8 @@ IMAGES: Hostile = {
     "all walls": _encoded(np.zeros((50, 50), np.uint8), "png"),
     "JPEG of 65535²": _one("hostile.jpg", _JPEG),
     "a cut JPEG": lambda: {"hostile.jpg": _encoded(_noise(300, 300), "jpeg")()["hostile.jpeg"][:900]},
-    "BMP of 10⁹ pixels": _one("hostile.bmp", b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, 40_000, 25_000, 1, 8, 0)),
-    "BMP of a negative height": _one("hostile.bmp", b"BM" + bytes(12) + struct.pack("<IiiHHI", 40, 40, -2**31, 1, 24, 0)),
+    "BMP of 10⁹ pixels": _one("hostile.bmp", _bmp(40_000, 25_000, 8)),
+    "BMP of a negative height": _one("hostile.bmp", _bmp(40, -2**31, 24)),
     "PGM with a white of 0": _one("hostile.pgm", b"P5\n10 10\n0\n" + bytes(100)),
     "PGM with a white of 65536": _one("hostile.pgm", b"P5\n10 10\n65536\n" + bytes(200)),
     "PFM of nan": _one("hostile.pgm", b"Pf\n10 10\n-1.0\n" + b"\xff" * 400),
@@ -224,7 +231,8 @@ CONFIGS: Hostile = {
     "an endless device": lambda: {"config.toml": Link("/dev/zero")},
     "a link to itself": lambda: {"config.toml": Link("config.toml")},
     **{f"{text}": _toml(text) for text in (
-        "run = 3", "run = [1]", "[[run]]\nseed = 1", "[run]\nagent = 'a\\nb'", "[run]\nagent = '/dev/zero.safetensors'",
+        "run = 3", "run = [1]", "[[run]]\nseed = 1", "[run]\nagent = 'a\\nb'",
+        "[run]\nagent = '/dev/zero.safetensors'",
         "[run]\nseed = true", "[run]\nseed = -1", "[run]\nseed = 340282366920938463463374607431768211456",
         "[run]\nmax_steps = 1e9", "[run]\nmax_steps = 0", "[run]\nmax_steps = 99999999999999999999",
         "[run]\nstart = [1e308, 0.0, 0.0]", "[run]\nstart = [[1], 2, 3]", "[run]\nstart = [nan, 0.0, 0.0]",
@@ -233,10 +241,12 @@ CONFIGS: Hostile = {
         "max_landmarks_observed = 99999999999999999999", "rooms = 3", "rooms = []", "slam = 3", "floor_plan = 3",
         "floor_plan = ''", "robot = 3", "robot = 'youbot'", "lidar = []", "[robot]\nlength_m = nan",
         "[robot]\nlength_m = 1e308", "[robot]\nmass_kg = '1'", "[lidar]\nbeams = 1.5", "[lidar]\nbeams = nan",
-        "[noise]\npatch_friction = 3", "[noise]\npatch_friction = [nan, nan]", "[noise]\npatch_friction = ['a', 'b']",
+        "[noise]\npatch_friction = 3", "[noise]\npatch_friction = [nan, nan]",
+        "[noise]\npatch_friction = ['a', 'b']",
         "[noise]\nencoder = nan", "[reward]\narea = inf", "[rooms_config]\nwidth_m = 1e9", "[slam_config]\na = {}",
         "rooms = 'rectangular'\n[rooms_config]\nwidth_m = [1e5, 1e5]", "odometry_filter = 'x'",
-        "[slam_config.landmarks]\nnew_distance_m = nan", "slam = 'fastslam1'\n[slam_config]\nparticles = 1000000000",
+        "[slam_config.landmarks]\nnew_distance_m = nan",
+        "slam = 'fastslam1'\n[slam_config]\nparticles = 1000000000",
     )},
 }  # fmt: skip
 

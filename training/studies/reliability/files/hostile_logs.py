@@ -95,7 +95,7 @@ def _any(name: str, line: bytes) -> dict[str, Callable[[], Files]]:
 
 
 def _scan(name: str, sound: Callable[[], Files], scan: int, odometry: int, words: Mapping[str, int]) -> Hostile:
-    """Return what harms a reader of scans: numbers in the words of a scan's line, and in those of an odometry's."""
+    """Return what harms a reader of scans: numbers in a scan's line and in an odometry's."""
     counts = ("1000000000", "-1", "0", "1", "2", "١٨٠", "1e3", "0x10", "9" * 5000, "180.0")
     return {
         **{f"{value[:20]} beams": _with(name, sound, scan, 1, value) for value in counts},

@@ -66,7 +66,7 @@ def _any(name: str, sound: Callable[[], Files]) -> dict[str, Callable[[], Files]
         "a write-ahead log that is not there": _bytes(name, sound, lambda data: _put(data, 18, b"\2\2")),
         "a format of the future": _bytes(name, sound, lambda data: _put(data, 18, b"\7\7")),
         "text in UTF-16": lambda: {name: _empty("PRAGMA encoding = 'UTF-16'; CREATE TABLE a (b)")},
-        "a hot journal beside it": lambda: {f"{name}-journal": b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + b"\xff" * 504},
+        "a hot journal beside it": lambda: {f"{name}-journal": bytes.fromhex("d9d505f920a163d7") + b"\xff" * 504},
         "a write-ahead log beside it": lambda: {f"{name}-wal": b"\x37\x7f\x06\x82" + b"\xff" * 500},
         "a pipe": lambda: {name: Pipe()},
         "a folder": lambda: {"other.sqlite/": b""},
@@ -89,7 +89,10 @@ def _view(table: str, columns: str) -> str:
     return f"DROP TABLE {table}; CREATE VIEW {table} AS {_ENDLESS} SELECT {columns} FROM n"
 
 
-_LANDMARK = "i AS id, 'convex' AS kind, 1.0 AS x, 1.0 AS y, 1.0 AS var_x, 1.0 AS var_y, 0.0 AS cov_xy, 0.0 AS angle, 1 AS times_seen"
+_LANDMARK = (
+    "i AS id, 'convex' AS kind, 1.0 AS x, 1.0 AS y, 1.0 AS var_x, 1.0 AS var_y, 0.0 AS cov_xy, 0.0 AS angle, "
+    "1 AS times_seen"
+)
 
 
 def _landmark(script: str) -> Callable[[], Files]:
@@ -113,15 +116,20 @@ LANDMARKS: Hostile = {
     )),
     **{f"{column} = {value[:30]}": _landmark(f"UPDATE landmarks SET {column} = {value} WHERE id = 3")
        for column in ("x", "var_x", "angle", "times_seen", "kind")
-       for value in ("'text'", "9e999", "1e308", "-1", "x'00ff'", "9223372036854775807", "zeroblob(5000000)", "''")},
+       for value in ("'text'", "9e999", "1e308", "-1", "x'00ff'", "9223372036854775807", "zeroblob(5000000)",
+                     "''")},
     "a relation of none": _landmark("INSERT INTO relations VALUES (100, 200, 1, 1, 1)"),
     "ids below 0": _landmark("UPDATE landmarks SET id = -id"),
     "a version of the future": _landmark("UPDATE meta SET value = '99' WHERE key = 'schema_version'"),
-    "a version that is long": _landmark("UPDATE meta SET value = hex(zeroblob(1000000)) WHERE key = 'schema_version'"),
+    "a version that is long": _landmark(
+        "UPDATE meta SET value = hex(zeroblob(1000000)) WHERE key = 'schema_version'"
+    ),
     "no version": _landmark("DELETE FROM meta"),
     "a frame of bytes": _landmark("UPDATE meta SET value = x'ff00' WHERE key = 'frame'"),
     "a key of numbers": _landmark("INSERT INTO meta VALUES (1, 2)"),
-    "a name with a line break": _landmark("UPDATE meta SET value = 'a' || char(10) || 'b' WHERE key = 'schema_version'"),
+    "a name with a line break": _landmark(
+        "UPDATE meta SET value = 'a' || char(10) || 'b' WHERE key = 'schema_version'"
+    ),
 }  # fmt: skip
 
 
@@ -139,7 +147,8 @@ _KEPT = "suite, place, seed, agent, slam, made_by, metrics, coverage_by_time, co
 STORES: Hostile = {
     **_any("results.sqlite", results.store),
     "a trigger that takes rows away": _store(
-        "DELETE FROM episodes WHERE seed = 1; CREATE TRIGGER t AFTER INSERT ON episodes BEGIN DELETE FROM episodes; END"
+        "DELETE FROM episodes WHERE seed = 1; CREATE TRIGGER t AFTER INSERT ON episodes "
+        "BEGIN DELETE FROM episodes; END"
     ),
     "a trigger that never ends": _store(
         "DELETE FROM episodes WHERE seed = 1; CREATE TRIGGER t AFTER INSERT ON episodes BEGIN "
@@ -150,19 +159,28 @@ STORES: Hostile = {
         f"ALTER TABLE episodes RENAME TO e; CREATE VIEW episodes AS {_ENDLESS} SELECT {_KEPT} FROM e, n"
     ),
     "a view of teams without end": _store(
-        f"CREATE VIEW team_episodes AS {_ENDLESS} SELECT {_KEPT}, i AS robots, 'x' AS communication FROM episodes, n"
+        f"CREATE VIEW team_episodes AS {_ENDLESS} SELECT {_KEPT}, i AS robots, 'x' AS communication "
+        "FROM episodes, n"
     ),
     "an index that computes": _store("CREATE INDEX i ON episodes (length(hex(metrics)))"),
-    "a row more than there should be": _store("INSERT INTO episodes SELECT 'x', 'y', 3, 'z', 'w', 'v', '{}', x'', x'', x'', x''"),
+    "a row more than there should be": _store(
+        "INSERT INTO episodes SELECT 'x', 'y', 3, 'z', 'w', 'v', '{}', x'', x'', x'', x''"
+    ),
     "another table of teams": _store("CREATE TABLE team_episodes (a)"),
     "a column less": _store("ALTER TABLE episodes DROP COLUMN thumbnail"),
     "another application": _store("PRAGMA application_id = 1"),
     "a version of the future": _store("PRAGMA user_version = 9"),
     "curves of 3 bytes": _store("UPDATE episodes SET nees = x'010203' WHERE seed = 1"),
-    "curves of nothing": _store("UPDATE episodes SET coverage_by_time = x'', coverage_by_path = x'' WHERE seed = 1"),
-    "curves of nan": _store("UPDATE episodes SET coverage_by_time = x'0000c07f', nees = x'0000c07f' WHERE seed = 1"),
+    "curves of nothing": _store(
+        "UPDATE episodes SET coverage_by_time = x'', coverage_by_path = x'' WHERE seed = 1"
+    ),
+    "curves of nan": _store(
+        "UPDATE episodes SET coverage_by_time = x'0000c07f', nees = x'0000c07f' WHERE seed = 1"
+    ),
     "curves of 100 MB": _store("UPDATE episodes SET nees = zeroblob(100000000) WHERE seed = 1"),
-    "metrics of 50 MB": _store("UPDATE episodes SET metrics = '\"' || hex(zeroblob(25000000)) || '\"' WHERE seed = 1"),
+    "metrics of 50 MB": _store(
+        "UPDATE episodes SET metrics = '\"' || hex(zeroblob(25000000)) || '\"' WHERE seed = 1"
+    ),
     "another digest": _store("UPDATE episodes SET made_by = 'x' WHERE seed = 1"),
     **{f"metrics {text[:40]}": _metrics(text) for text in (
         "", "{}", "[]", "null", "1", '{"coverage": NaN}', "[" * 100_000, '{"a":' * 100_000, "9" * 5000,
@@ -213,7 +231,8 @@ RUN_FILES: Hostile = {
     for name in ("settings.json", "summary.json", "page.md")
     for what, data in {
         "empty": b"", "deep": b"[" * 100_000, "deep mappings": b'{"a":' * 100_000, "digits": b"9" * 5000,
-        "a list": b"[]", "null": b"null", "a number": b"1", "no text": b"\xff", "100 MB": b'"' + b"a" * 10**8 + b'"',
+        "a list": b"[]", "null": b"null", "a number": b"1", "no text": b"\xff",
+        "100 MB": b'"' + b"a" * 10**8 + b'"',
         "a pipe": Pipe(), "an endless device": Link("/dev/zero"), "a link to itself": Link(name),
         "mappings": b'{"a": {"b": 1}}', "a suite that is a number": b'{"a": 1, "config": {}}',
     }.items()

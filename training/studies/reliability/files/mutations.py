@@ -14,9 +14,9 @@ __all__ = ["MUTATIONS", "NUMBERS", "mutated", "mutated_cells"]
 Rng = np.random.Generator
 
 NUMBERS = (
-    b"nan", b"NaN", b"inf", b"-inf", b"Infinity", b"1e308", b"-1e308", b"1e999", b"5e-324", b"-1", b"0", b"-0.0", b"1",
-    b"255", b"65536", b"2147483648", b"9223372036854775807", b"18446744073709551616", b"1" + b"0" * 40, b"9" * 5000,
-    b"0x10", b"1_000", b"1e5", b"1e10", b"1e15", b"true", b"null", b'""', b"[]", b"{}", b"[1, 2]",
+    b"nan", b"NaN", b"inf", b"-inf", b"Infinity", b"1e308", b"-1e308", b"1e999", b"5e-324", b"-1", b"0", b"-0.0",
+    b"1", b"255", b"65536", b"2147483648", b"9223372036854775807", b"18446744073709551616", b"1" + b"0" * 40,
+    b"9" * 5000, b"0x10", b"1_000", b"1e5", b"1e10", b"1e15", b"true", b"null", b'""', b"[]", b"{}", b"[1, 2]",
 )  # fmt: skip
 """What stands in a number's place."""
 

@@ -22,14 +22,16 @@ from training.runs.campaign import keep_settings
 from training.runs.rows import resume
 from training.studies.reliability.files.samples import Files
 
-__all__ = ["benchmark", "leaderboard", "metrics_of", "row_of", "rows", "run_files", "store", "use_rows", "use_run_files",
-           "use_store"]  # fmt: skip
+__all__ = [
+    "benchmark", "leaderboard", "metrics_of", "row_of", "rows", "run_files", "store", "use_rows", "use_run_files",
+    "use_store",
+]  # fmt: skip
 
 _ASKED = {"suite": "rooms", "agents": "random", "slam": "odometry", "seeds": "0:2"}
 _NUMBERS = (
-    "coverage", "time_to_50_s", "time_to_90_s", "time_to_95_s", "time_to_99_s", "time_s", "path_length_m", "collisions",
-    "map_iou", "corner_mean_m", "ate_rmse_m", "ate_aligned_rmse_m", "final_position_error_m", "final_heading_error_rad",
-    "anees", "decision_ms_median", "decision_ms_p95", "limit_s",
+    "coverage", "time_to_50_s", "time_to_90_s", "time_to_95_s", "time_to_99_s", "time_s", "path_length_m",
+    "collisions", "map_iou", "corner_mean_m", "ate_rmse_m", "ate_aligned_rmse_m", "final_position_error_m",
+    "final_heading_error_rad",     "anees", "decision_ms_median", "decision_ms_p95", "limit_s",
 )  # fmt: skip
 
 

@@ -20,8 +20,10 @@ from slam.formats import write_map_server
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.landmarks.database import write_landmark_map
 
-__all__ = ["Files", "Link", "Pipe", "carmen", "configs", "dpslam", "images", "landmarks", "park", "policies", "put", "ros_map",
-           "utias"]  # fmt: skip
+__all__ = [
+    "Files", "Link", "Pipe", "as_json", "carmen", "configs", "dpslam", "images", "landmarks", "park", "policies",
+    "put", "ros_map", "utias",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
