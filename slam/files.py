@@ -30,7 +30,7 @@ _MOST_TEXT = 64 * MIB  # of a file of settings or results
 _MOST_TOML = 4 * MIB
 _GZIP = b"\x1f\x8b"
 # A log of numbers packs to a fifth or a tenth: what unpacks to many times more is no log, but a bomb.
-_MOST_PACKED, _FREE_UNPACKED = 30, 32 * MIB
+_MOST_PACKED, _FREE_UNPACKED = 30, 8 * MIB
 _LONGEST_QUERY_S = 30.0
 _CHECKED_EVERY = 100_000  # instructions of SQLite's machine
 
@@ -171,8 +171,9 @@ def parse_yaml(text: bytes, *, what: str) -> Any:
 class _NoAliases(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
-            raise yaml.composer.ComposerError(None, None, "aliases are not read", self.peek_event().start_mark)
-        return super().compose_node(parent, index)  # type: ignore[no-untyped-call]
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, "aliases are not read", mark)
+        return super().compose_node(parent, index)
 
 
 def _parsed(parse: Callable[[], Any], what: str, kind: str) -> Any:

@@ -16,6 +16,8 @@ __all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
 Array = NDArray[np.float64]
 
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
+_LONGEST_S = 2 * 86_400.0
+_LARGEST_NUMBER = 1e16  # of any column: a clock in microseconds since 1970 is at 2e15
 _LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
 
 
@@ -63,15 +65,35 @@ def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, NDArray[n
             raise ValueError(f"{path}, line {number}: expected {columns} columns ({meaning}), got {len(words)}")
         rows.append(numbers_of(words, path=path, line=number, what=meaning))
         numbers.append(number)
+    if rows and (far := np.argwhere(np.abs(np.stack(rows)) > _LARGEST_NUMBER)).size:
+        i, j = far[0].tolist()
+        raise ValueError(
+            f"{path}, line {numbers[i]}: {rows[i][j]:.3g} is more than any log has ({meaning}); correct the line"
+        )
     if not rows:
         raise ValueError(f"{path} holds no data: expected lines of {meaning}")
     return np.stack(rows), np.array(numbers, np.int64)
 
 
-def read_timed(path: Path, columns: int, meaning: str) -> Array:
-    """Read a table like :func:`read_table` whose first column is a time, which must not go back."""
+def read_timed(path: Path, columns: int, meaning: str, *, second: float = 1.0, most: float = math.inf) -> Array:
+    """Read a table like :func:`read_table` whose first column is a time, which must not go back.
+
+    Parameters
+    ----------
+    second
+        How much of that time is a second: no log is longer than two days.
+    most
+        Of what the other columns may hold; damage leaves numbers that are finite and yet no robot's.
+    """
     values, lines = read_table(path, columns, meaning)
     times = values[:, 0]
+    far = np.flatnonzero((times - times[0] > _LONGEST_S * second) | (np.abs(values[:, 1:]) > most).any(axis=1))
+    if len(far):
+        i = int(far[0])
+        raise ValueError(
+            f"{path}, line {lines[i]}: {', '.join(f'{v:.6g}' for v in values[i])} is more than any log has "
+            f"({meaning}); correct the line"
+        )
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0]) + 1

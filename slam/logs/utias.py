@@ -73,9 +73,13 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     ValueError
         One line: the file (and line) that is missing or damaged.
     """
-    odometry = read_timed(find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, speed, angular velocity")
-    measured = read_timed(find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing")
-    truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation")
+    odometry = read_timed(
+        find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, speed, angular velocity", most=100.0
+    )
+    measured = read_timed(
+        find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing", most=1e9
+    )
+    truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation", most=1e7)
     landmark_ids, landmarks = _landmarks(find(folder, "Landmark_Groundtruth.dat"))
     subject_of_code = _codes(find(folder, "Barcodes.dat"))
 

@@ -38,11 +38,11 @@ def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, A
     """
     case = reader.case(seed, index)
     path = case.put(folder)
-    row: dict[str, Any] = {"index": index, "case": case.name}
+    row: dict[str, Any] = {"index": index, "case": case.name, "by_command": reader.by_command(index)}
     _forget_peak()
     before, began = _memory_mb("VmRSS"), time.process_time()
     try:
-        row |= reader.read(path, index)
+        reader.read(path, index)
         row["end"] = "read"
     except (BadInput, ValueError) as error:
         row["end"], row["said"] = _judged(error, path), str(error)[:_LONGEST]

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from training.studies.reliability.files import samples
@@ -121,13 +122,14 @@ def _chunk(name: bytes, data: bytes) -> bytes:
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
-def _encoded(array: np.ndarray, suffix: str) -> Callable[[], Files]:
-    def made() -> Files:
-        out = io.BytesIO()
-        Image.fromarray(array).save(out, suffix)
-        return {f"hostile.{suffix}": out.getvalue()}
+def _encoded(array: NDArray[np.uint8], suffix: str) -> Callable[[], Files]:
+    return lambda: {f"hostile.{suffix}": _bytes_of(array, suffix)}
 
-    return made
+
+def _bytes_of(array: NDArray[np.uint8], kind: str) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(array).save(out, kind)
+    return out.getvalue()
 
 
 def _text_bomb() -> Files:
@@ -138,12 +140,12 @@ def _text_bomb() -> Files:
     return {"hostile.png": out.getvalue()}
 
 
-def _noise(rows: int, cols: int) -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 2, (rows, cols)).astype(np.uint8) * 255
+def _noise(rows: int, cols: int) -> NDArray[np.uint8]:
+    return np.asarray(np.random.default_rng(0).integers(0, 2, (rows, cols)) * 255, np.uint8)
 
 
-def _checks(rows: int, cols: int) -> np.ndarray:
-    return (np.indices((rows, cols)).sum(axis=0) % 2 * 255).astype(np.uint8)
+def _checks(rows: int, cols: int) -> NDArray[np.uint8]:
+    return np.asarray(np.indices((rows, cols)).sum(axis=0) % 2 * 255, np.uint8)
 
 
 def _one(name: str, data: bytes) -> Callable[[], Files]:
@@ -179,7 +181,7 @@ IMAGES: Hostile = {
     "one pixel": _encoded(np.full((1, 1), 255, np.uint8), "png"),
     "all walls": _encoded(np.zeros((50, 50), np.uint8), "png"),
     "JPEG of 65535²": _one("hostile.jpg", _JPEG),
-    "a cut JPEG": lambda: {"hostile.jpg": _encoded(_noise(300, 300), "jpeg")()["hostile.jpeg"][:900]},
+    "a cut JPEG": lambda: {"hostile.jpg": _bytes_of(_noise(300, 300), "jpeg")[:900]},
     "BMP of 10⁹ pixels": _one("hostile.bmp", _bmp(40_000, 25_000, 8)),
     "BMP of a negative height": _one("hostile.bmp", _bmp(40, -2**31, 24)),
     "PGM with a white of 0": _one("hostile.pgm", b"P5\n10 10\n0\n" + bytes(100)),

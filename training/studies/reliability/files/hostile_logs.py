@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 
 from training.studies.reliability.files import samples
 from training.studies.reliability.files.samples import Files, Link, Pipe
@@ -128,6 +128,10 @@ DPSLAM: Hostile = {
 }
 
 
+def _file(name: str, content: bytes | Pipe | Link) -> Files:
+    return {name: content}
+
+
 def _tables(sound: Callable[[], Files]) -> Hostile:
     """Return what harms a reader of several tables: in each of them, and each of them missing."""
     found: dict[str, Callable[[], Files]] = {}
@@ -136,12 +140,12 @@ def _tables(sound: Callable[[], Files]) -> Hostile:
             f"{name}: {value[:20]} in line {row}, word {word}": _with(name, sound, row, word, value)
             for value in _NUMBERS for row, word in ((1, 0), (1, -1), (-1, 0))
         }  # fmt: skip
-        found[f"{name}: empty"] = lambda name=name: {name: b""}
-        found[f"{name}: a line"] = lambda name=name: {name: _lines(name, sound)[1]}
-        found[f"{name}: a pipe"] = lambda name=name: {name: Pipe()}
-        found[f"{name}: gzip of 600 MB"] = lambda name=name: {name: _bomb(_lines(name, sound)[1] + b"\n", 600)}
-        found[f"{name}: all alike"] = lambda name=name: {name: (_lines(name, sound)[1] + b"\n") * 200}
-        found[f"{name}: an endless device"] = lambda name=name: {name: Link("/dev/zero")}
+        line = _lines(name, sound)[1]
+        contents: dict[str, bytes | Pipe | Link] = {
+            "empty": b"", "a line": line, "a pipe": Pipe(), "all alike": (line + b"\n") * 200,
+            "an endless device": Link("/dev/zero"), "gzip of 600 MB": _bomb(line + b"\n", 600),
+        }  # fmt: skip
+        found |= {f"{name}: {what}": partial(_file, name, content) for what, content in contents.items()}
     return found
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections.abc import Callable, Mapping
 from contextlib import closing
+from typing import Any
 
 from training.studies.reliability.files import results, samples
 from training.studies.reliability.files.samples import Files, Link, Pipe
@@ -144,6 +146,10 @@ def _metrics(text: str) -> Callable[[], Files]:
 
 _KEPT = "suite, place, seed, agent, slam, made_by, metrics, coverage_by_time, coverage_by_path, nees, thumbnail"
 
+_VALUES: tuple[Any, ...] = (
+    None, True, 0, -1, 1.5, "x", [1], {}, 10**400, 1e308, -1e308, math.inf, math.nan, "\n|<b>",
+)  # fmt: skip
+
 STORES: Hostile = {
     **_any("results.sqlite", results.store),
     "a trigger that takes rows away": _store(
@@ -184,13 +190,11 @@ STORES: Hostile = {
     "another digest": _store("UPDATE episodes SET made_by = 'x' WHERE seed = 1"),
     **{f"metrics {text[:40]}": _metrics(text) for text in (
         "", "{}", "[]", "null", "1", '{"coverage": NaN}', "[" * 100_000, '{"a":' * 100_000, "9" * 5000,
-        *(json.dumps(results.metrics_of(1) | {"coverage": value})
-          for value in ("x", [1], {}, True, 1e308, -1e308, 10**400)),
-        *(json.dumps(results.metrics_of(1) | {"time_s": value, "path_length_m": value, "limit_s": value})
-          for value in (None, 0, -1, 1e308, float("inf"), float("nan"))),
-        *(json.dumps(results.metrics_of(1) | {"collisions": value, "end": value})
-          for value in (None, "x", -1, [], 1.5)),
     )},
+    **{f"{' and '.join(names)} of {str(value)[:20]}":
+       _metrics(json.dumps(results.metrics_of(1) | dict.fromkeys(names, value)))
+       for names in (("coverage",), ("time_s", "path_length_m", "limit_s"), ("collisions",), ("end",), ("anees",))
+       for value in _VALUES},
 }  # fmt: skip
 
 
@@ -226,14 +230,15 @@ def _file(name: str, data: bytes | Pipe | Link) -> Callable[[], Files]:
     return lambda: {name: data}
 
 
-RUN_FILES: Hostile = {
-    f"{name}: {what[:40]}": _file(name, data)
-    for name in ("settings.json", "summary.json", "page.md")
-    for what, data in {
-        "empty": b"", "deep": b"[" * 100_000, "deep mappings": b'{"a":' * 100_000, "digits": b"9" * 5000,
-        "a list": b"[]", "null": b"null", "a number": b"1", "no text": b"\xff",
-        "100 MB": b'"' + b"a" * 10**8 + b'"',
-        "a pipe": Pipe(), "an endless device": Link("/dev/zero"), "a link to itself": Link(name),
-        "mappings": b'{"a": {"b": 1}}', "a suite that is a number": b'{"a": 1, "config": {}}',
-    }.items()
+_CONTENTS: dict[str, bytes | Pipe | Link] = {
+    "empty": b"", "deep": b"[" * 100_000, "deep mappings": b'{"a":' * 100_000, "digits": b"9" * 5000,
+    "a list": b"[]", "null": b"null", "a number": b"1", "no text": b"\xff", "a pipe": Pipe(),
+    "100 MB": b'"' + b"a" * 10**8 + b'"', "an endless device": Link("/dev/zero"), "mappings": b'{"a": {"b": 1}}',
+    "a suite that is a number": b'{"a": 1, "config": {}}',
 }  # fmt: skip
+
+RUN_FILES: Hostile = {
+    f"{name}: {what}": _file(name, data)
+    for name in ("settings.json", "summary.json", "page.md")
+    for what, data in (_CONTENTS | {"a link to itself": Link(name)}).items()
+}

@@ -28,11 +28,13 @@ def _work(job: Job) -> Row:
     rows = list(results(*job))
     name, seed, _, _ = job
     for row in rows:
+        if row["seconds"] > BOUND_S:
+            row["end"] = "time"
         if "case" not in row:  # its process is gone
             row["case"] = READERS[name].case(seed, row["index"]).name
     return {
         "ends": dict(Counter(row["end"] for row in rows)),
-        "cli": sum("code" in row for row in rows),
+        "cli": sum(row.get("by_command", False) for row in rows),
         "seconds": max(row["seconds"] for row in rows),
         "mb": max(row["mb"] for row in rows),
         "failed": [row for row in rows if row["end"] not in _GOOD],

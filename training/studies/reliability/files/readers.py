@@ -61,6 +61,11 @@ class Reader:
 
     def warm_up(self) -> None:
         """Load what only a first call loads, before memory is bounded."""
+        self.sound()
+
+    def by_command(self, index: int) -> bool:
+        """Tell whether a file is read by the command."""
+        return self.command is not None and index % self.every == self.every - 1
 
     def case(self, seed: int, index: int) -> Case:
         """Return a file by its number: the hostile ones first, then damaged ones."""
@@ -81,17 +86,17 @@ class Reader:
         entry = f"{entry}.gz" if entry != "." and name == f"{entry}.gz" else entry
         return Case(f"{name}: {', '.join(what)}", files | {name: damaged}, entry)
 
-    def read(self, path: Path, index: int) -> dict[str, Any]:
-        """Have a file read; each :attr:`every`-th by the command, whose exit code is returned.
+    def read(self, path: Path, index: int) -> None:
+        """Have a file read; each :attr:`every`-th by the command.
 
         Raises
         ------
         ValueError
             As the reader does, or as the command said in one line before it ended with 2.
         """
-        if self.command is None or index % self.every != self.every - 1:
+        if self.command is None or not self.by_command(index):
             self.use(path)
-            return {}
+            return
         from training.cli import main
 
         with redirect_stderr(io.StringIO()) as said:
@@ -101,7 +106,6 @@ class Reader:
             raise BadInput(lines[0])
         if code:
             raise RuntimeError(f"exit code {code}: {said.getvalue()[-300:]}")
-        return {"code": code}
 
 
 def _damaged(name: str, data: bytes, rng: np.random.Generator) -> tuple[str, bytes, list[str]]:

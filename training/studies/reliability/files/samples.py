@@ -97,7 +97,7 @@ def _line(*values: float) -> str:
 
 
 def _ranges(k: int) -> NDArray[np.float64]:
-    return 3.0 + np.sin(0.1 * np.arange(180) + 0.1 * k)
+    return np.asarray(3.0 + np.sin(0.1 * np.arange(180) + 0.1 * k))
 
 
 @cache
