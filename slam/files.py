@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import re
 import sqlite3
 import time
 import tomllib
@@ -28,6 +29,7 @@ __all__ = [
 MIB = 2**20
 _MOST_TEXT = 64 * MIB  # of a file of settings or results
 _MOST_TOML = 4 * MIB
+_LONG_KEY = re.compile(rb"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){64}""")
 _GZIP = b"\x1f\x8b"
 # A log of numbers packs to a fifth or a tenth: what unpacks to many times more is no log, but a bomb.
 _MOST_PACKED, _FREE_UNPACKED = 30, 8 * MIB
@@ -146,6 +148,8 @@ def read_json(path: Path, *, what: str = "file", nan: bool = False) -> Any:
 
 def parse_toml(text: bytes, *, what: str) -> dict[str, Any]:
     """Return what TOML says; ``ValueError`` in one line where it is none, or nested too deep."""
+    if _LONG_KEY.search(text):  # what tomllib's time and memory go by the square of
+        raise ValueError(f"{what} is damaged: TOML nested too deep")
     found: dict[str, Any] = _parsed(lambda: tomllib.loads(text.decode("utf-8")), what, "TOML")
     return found
 

@@ -9,17 +9,21 @@ from collections.abc import Callable, Iterable, Mapping
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from slam.files import quoted
+
 __all__ = ["from_mapping", "not_negative", "positive", "require", "shares", "to_mapping", "unknown_name"]
 
 T = TypeVar("T")
+
+_LONGEST = 80  # characters of a name in an error
 
 
 def unknown_name(what: str, name: object, valid: Iterable[str]) -> ValueError:
     """Return the error for a name that is not registered: one line that lists the valid ones."""
     names = sorted(valid)
-    close = difflib.get_close_matches(str(name), names, n=1)
+    close = difflib.get_close_matches(str(name)[:_LONGEST], names, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
-    return ValueError(f"unknown {what} {name!r}{hint}; valid: {', '.join(names)}")
+    return ValueError(f"unknown {what} {quoted(name, _LONGEST)}{hint}; valid: {', '.join(names)}")
 
 
 def require(condition: bool, message: str) -> None:
@@ -101,15 +105,18 @@ def _coerce(cls: type[Any], key: str, hint: Any, value: Any, base: Any) -> Any:
     if get_origin(hint) is tuple:
         parts = get_args(hint)
         if not isinstance(value, tuple):
-            raise ValueError(f"{cls.__name__}.{key} takes a list, got {value!r}")
+            raise ValueError(f"{cls.__name__}.{key} takes a list, got {quoted(value)}")
         if Ellipsis not in parts and len(value) != len(parts):
-            raise ValueError(f"{cls.__name__}.{key} takes a list of {len(parts)}, got {value!r}")
+            raise ValueError(f"{cls.__name__}.{key} takes a list of {len(parts)}, got {quoted(value)}")
     kinds = [o for o in options if isinstance(o, type)]
     if isinstance(value, bool) and bool not in kinds and kinds:
         raise ValueError(f"{cls.__name__}.{key} is a {kinds[0].__name__}, not a boolean")
     if float in kinds and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError(f"{cls.__name__}.{key} is too large") from None
     simple = {bool, int, float, str}
     if kinds and set(kinds) <= simple | {type(None)} and not isinstance(value, tuple(kinds)):
-        raise ValueError(f"{cls.__name__}.{key} takes {kinds[0].__name__}, got {value!r}")
+        raise ValueError(f"{cls.__name__}.{key} takes {kinds[0].__name__}, got {quoted(value)}")
     return value

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
 _LONGEST_S = 2 * 86_400.0
 _LARGEST_NUMBER = 1e16  # of any column: a clock in microseconds since 1970 is at 2e15
+_LEAST_LINE = 24  # bytes that a line of a packed file counts for: ever so many short ones take their time, too
 _LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
 
 
@@ -118,8 +119,9 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     """
     with open_bounded(path) as (file, most):
         size = number = 0
+        plain = most == path.stat().st_size
         while line := file.readline(_LONGEST_LINE + 1):
-            number, size = number + 1, size + len(line)
+            number, size = number + 1, size + (len(line) if plain else max(len(line), _LEAST_LINE))
             if size > min(most, _LARGEST) or len(line) > _LONGEST_LINE:
                 limit = f", line {number}" if len(line) > _LONGEST_LINE else ""
                 raise ValueError(f"{path}{limit} is larger than any log's: it is no such log")

@@ -96,6 +96,8 @@ def study(
         summary, before = read_json(results / "summary.json"), read_bytes(page, what="page")
     try:
         text = update(before.decode("utf-8"), tables(summary))
+    except BadInput as error:
+        raise BadInput(f"{page}: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise BadInput(f"cannot put {results} into {page}: {quoted(error, 200)}; is it a benchmark's?") from error
     atomic_write(page, text)

@@ -46,9 +46,9 @@ _TEAM_SCHEMA = (
 )
 _TABLES = {5: "episodes", 7: "team_episodes"}  # by the length of their keys
 _KEYS = {5: "suite, place, seed, agent, slam", 7: "suite, place, seed, agent, slam, robots, communication"}
-_NEEDED = ("time_s", "path_length_m", "collisions", "limit_s")  # never null
+_NEEDED = ("coverage", "time_s", "path_length_m", "collisions", "limit_s")  # never null
 _LARGEST = 1e15  # of any metric
-_TOLD = ("coverage", "time_to_95_s", "ate_rmse_m", "final_position_error_m")  # null where not reached
+_TOLD = ("time_to_95_s", "ate_rmse_m", "final_position_error_m")  # null where not reached
 _CURVES = ("coverage_by_time", "coverage_by_path", "nees")
 
 

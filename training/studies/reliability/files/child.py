@@ -45,7 +45,7 @@ def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, A
         reader.read(path, index)
         row["end"] = "read"
     except (BadInput, ValueError) as error:
-        row["end"], row["said"] = _judged(error, path), str(error)[:_LONGEST]
+        row["end"], row["said"] = _judged(error, path, named=reader.named), str(error)[:_LONGEST]
     except MemoryError:
         row["end"], row["said"] = "memory", _where(sys.exc_info()[1])
     except Exception as error:
@@ -55,14 +55,14 @@ def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, A
     return row
 
 
-def _judged(error: Exception, path: Path) -> str:
+def _judged(error: Exception, path: Path, *, named: bool) -> str:
     """Return ``refused`` where an error is one of the project's own, in one line that names what it is about."""
     text = str(error)
     if type(error) not in (BadInput, ValueError) and type(error).__module__.split(".")[0] not in _OURS:
         return "traceback"
     if not text or "\n" in text or len(text) > _LONGEST or re.search(r"[\x00-\x1f\x7f]", text):
         return "no one line"
-    return "refused" if path.stem in text or path.parent.name in text else "no name"
+    return "refused" if not named or path.stem in text or path.parent.name in text else "no name"
 
 
 _OURS = ("slam", "mecanum_env", "agents", "training")

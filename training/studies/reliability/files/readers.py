@@ -58,6 +58,7 @@ class Reader:
     hostile: Mapping[str, Callable[[], Files]] = field(default_factory=dict)
     command: Callable[[Path, Path], Sequence[str]] | None = None  # of the path, and a folder for results
     every: int = 100  # file is read by the command
+    named: bool = True  # every error names the file; of a configuration it may name the setting instead
 
     def warm_up(self) -> None:
         """Load what only a first call loads, before memory is bounded."""
@@ -215,7 +216,7 @@ READERS: dict[str, Reader] = {
     "configs": Reader(
         about="TOML configurations", sound=samples.configs, use=_config,
         command=_explore("--config", "PATH"), variants=(("config.toml", ("config.toml",)),),
-        hostile=hostile.CONFIGS,
+        hostile=hostile.CONFIGS, named=False,
     ),
     "policies": Reader(
         about="policies, safetensors and JSON", sound=samples.policies, use=_policy,
