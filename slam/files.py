@@ -32,7 +32,7 @@ _MOST_TOML = 4 * MIB
 _LONG_KEY = re.compile(rb"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){64}""")
 _GZIP = b"\x1f\x8b"
 # A log of numbers packs to a fifth or a tenth: what unpacks to many times more is no log, but a bomb.
-_MOST_PACKED, _FREE_UNPACKED = 30, 8 * MIB
+_MOST_PACKED, _FREE_UNPACKED = 20, 8 * MIB
 _LONGEST_QUERY_S = 30.0
 _CHECKED_EVERY = 100_000  # instructions of SQLite's machine
 

@@ -19,7 +19,7 @@ from training.benchmark.report_charts import COLOURS, Along, band, coverage_char
 from training.benchmark.team_figures import scaling_table
 from training.episodes.explore import ENDINGS
 from training.episodes.known_map import NAME as KNOWN_MAP
-from training.figures.page import html_page
+from training.figures.page import html_page, text_html
 from training.figures.statistics import Comparison
 
 __all__ = ["FILE", "page", "worst_first", "write_report"]
@@ -241,8 +241,8 @@ def _made(config: dict[str, Any], config_text: str) -> str:
         '<h2 id="made">Configuration and versions</h2>'
         '<p class="soft">Beside this page: episodes.csv (a row an episode), summary.csv, comparison.csv, '
         "tables.md, results.sqlite, config.toml.</p>"
-        f"<details><summary>What was asked for, and versions</summary><pre>{escape(lines)}</pre></details>"
-        f"<details><summary>config.toml</summary><pre>{escape(config_text)}</pre></details>"
+        f"<details><summary>What was asked for, and versions</summary><pre>{text_html(lines)}</pre></details>"
+        f"<details><summary>config.toml</summary><pre>{text_html(config_text)}</pre></details>"
     )
 
 

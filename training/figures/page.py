@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import sys
 from collections.abc import Sequence
 from html import escape
 
+from slam.files import plain_name
 from training.figures.page_style import STYLE
 
-__all__ = ["HEAD", "html_page", "security_policy"]
+__all__ = ["HEAD", "html_page", "security_policy", "text_html"]
 
 HEAD = (
     '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -40,6 +42,11 @@ def security_policy(*, styles: Sequence[str], scripts: Sequence[str] = ()) -> st
 
 def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def text_html(text: str) -> str:
+    """Return lines of text as HTML, in which nothing acts: control characters and marks are written out."""
+    return escape("\n".join(plain_name(line, sys.maxsize) for line in text.split("\n")))
 
 
 def html_page(title: str, body: str) -> str:

@@ -28,7 +28,7 @@ from slam.files import plain_name
 from slam.geometry import inverse
 from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
-from training.figures.page import HEAD, security_policy
+from training.figures.page import HEAD, security_policy, text_html
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
@@ -77,12 +77,12 @@ def episode_page(
     view = episode_view(env.truth.ground, env.belief, longest_px=TRUTH_PX)
     header |= about_plan(env.config, env.truth.ground, view)
     return filled("episode.html", header, arrays, {
-        "TITLE": escape(title),
-        "ENDING": escape(ending),
+        "TITLE": text_html(title),
+        "ENDING": text_html(ending),
         "TILES": tiles(first_asked(metrics)),
         "METRICS": metrics_table(metrics),
-        "COMMAND": escape(command),
-        "CONFIG": escape(config),
+        "COMMAND": text_html(command),
+        "CONFIG": text_html(config),
         "SCRIPT": assets(_SCRIPTS),
     })  # fmt: skip
 

@@ -19,7 +19,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.assembly import DRIVE_RADIUS_M, generator
 from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
-from slam.files import parse_yaml, quoted
+from slam.files import parse_yaml, quoted, shown_path
 
 __all__ = ["from_raster", "load"]
 
@@ -57,15 +57,17 @@ def load(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES:
-        what = f"image {path}"
+        what = f"image {shown_path(path)}"
         raster = _read_image(path, 0.05 if resolution is None else resolution, what)
     elif suffix not in (".yaml", ".yml"):
         valid = ", ".join((".yaml", ".yml", *IMAGE_SUFFIXES))
-        raise FloorPlanError(f"floor plan {path} has the unknown suffix {suffix!r}; valid: {valid}")
+        raise FloorPlanError(f"floor plan {shown_path(path)} has the unknown suffix {suffix!r}; valid: {valid}")
     elif resolution is not None:
-        raise FloorPlanError(f"map {path} says its own resolution; leave resolution out or give the image")
+        raise FloorPlanError(
+            f"map {shown_path(path)} says its own resolution; leave resolution out or give the image"
+        )
     else:
-        what = f"map {path}"
+        what = f"map {shown_path(path)}"
         raster = _read_ros_map(path, what)
     free, cell_m, origin = raster
     return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)

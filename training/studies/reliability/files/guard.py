@@ -8,7 +8,9 @@ import os
 import select
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from training.runs.processes import ONE_THREAD
@@ -18,9 +20,10 @@ __all__ = ["BOUND_S", "results"]
 BOUND_S = 30.0
 """Time of the processor that a file may take."""
 
-_PATIENCE_S = 4.0 * BOUND_S  # of the clock on the wall: others work on the machine, too
+_PATIENCE_S = 20.0 * BOUND_S  # of the clock on the wall: others work on the machine, too
+_LOOKS_S = 1.0
 
-_START_S = 600.0  # until it is ready: kernels may have to be compiled
+_START_S = 6000.0  # until it is ready: kernels may have to be compiled
 
 _MODULE = "training.studies.reliability.files.child"
 
@@ -65,8 +68,21 @@ class _Child:
     def _line(self, patience_s: float) -> bytes | None:
         """Return the next line; empty where the process is gone, None where none comes in time."""
         assert self._process is not None and self._process.stdout is not None
-        ready, _, _ = select.select([self._process.stdout], [], [], patience_s)
-        return self._process.stdout.readline() if ready else None
+        began, used = time.monotonic(), self._used_s()
+        while time.monotonic() - began < patience_s and self._used_s() - used < patience_s * BOUND_S / _PATIENCE_S:
+            if select.select([self._process.stdout], [], [], _LOOKS_S)[0]:
+                return self._process.stdout.readline()
+        return None
+
+    def _used_s(self) -> float:
+        """Return the processor's time that the process has used; 0 where the system does not tell."""
+        assert self._process is not None
+        stat = Path(f"/proc/{self._process.pid}/stat")
+        try:
+            words = stat.read_text().rpartition(")")[2].split()
+            return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+        except (OSError, IndexError, ValueError):
+            return 0.0
 
 
 _CHILD = _Child()
