@@ -46,7 +46,7 @@ class _Child:
         """Hand it a job."""
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _MODULE], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                [sys.executable, "-m", _MODULE], bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL, env=os.environ | ONE_THREAD,
             )  # fmt: skip
             self._line(_START_S)  # it is ready

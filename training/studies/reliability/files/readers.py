@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import gzip
-import io
+import subprocess
+import sys
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -98,15 +98,13 @@ class Reader:
         if self.command is None or not self.by_command(index):
             self.use(path)
             return
-        from training.cli import main
-
-        with redirect_stderr(io.StringIO()) as said:
-            code = main(list(self.command(path, path.parent / "out")))
-        lines = [line for line in said.getvalue().splitlines() if line.startswith("mecanum")]
-        if code == 2 and len(lines) == 1:
+        argv = [sys.executable, "-m", "training.cli", *self.command(path, path.parent / "out")]
+        done = subprocess.run(argv, capture_output=True, text=True, errors="replace", check=False)
+        lines = [line for line in done.stderr.splitlines() if line.startswith("mecanum")]
+        if done.returncode == 2 and len(lines) == 1:
             raise BadInput(lines[0])
-        if code:
-            raise RuntimeError(f"exit code {code}: {said.getvalue()[-300:]}")
+        if done.returncode:
+            raise RuntimeError(f"exit code {done.returncode}: {done.stderr[-300:]}")
 
 
 def _damaged(name: str, data: bytes, rng: np.random.Generator) -> tuple[str, bytes, list[str]]:

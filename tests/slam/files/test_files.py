@@ -13,8 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slam import files
-from slam.files import check_tables, open_database, parse_json, parse_toml, parse_yaml, plain_name, read_bytes
+from slam.files import (
+    check_tables,
+    databases,
+    open_database,
+    parse_json,
+    parse_toml,
+    parse_yaml,
+    plain_name,
+    read_bytes,
+)
 from slam.landmarks.database import read_landmark_map, write_landmark_map
 from slam.logs import open_log
 from slam.logs.tables import read_lines
@@ -176,7 +184,7 @@ def test_a_pipe_or_device_is_no_database(tmp_path: Path) -> None:
 
 def test_what_takes_too_long_in_a_database_is_broken_off(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = database_of(tmp_path / "landmarks.db", "")
-    monkeypatch.setattr(files, "_LONGEST_QUERY_S", 0.05)
+    monkeypatch.setattr(databases, "_LONGEST_QUERY_S", 0.05)
     with open_database(path) as database, pytest.raises(sqlite3.OperationalError, match="interrupted"):
         database.execute(f"{ENDLESS} SELECT count(*) FROM n").fetchone()
 

@@ -1,7 +1,6 @@
-"""Files of unknown origin, read with distrust: bounded in size, depth and time, and every fault in one line.
+"""Bytes, JSON, TOML and YAML, read with distrust: bounded in size and depth, and every fault in one line.
 
-Whatever the project reads goes through here: plain or packed bytes, JSON, TOML, YAML, SQLite. No pipe or device is
-opened, for reading one may never end.
+No pipe or device is opened, for reading one may never end.
 """
 
 from __future__ import annotations
@@ -10,52 +9,32 @@ import gzip
 import json
 import math
 import re
-import sqlite3
-import time
 import tomllib
 import zlib
-from collections.abc import Callable, Collection, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
 import yaml
 
+from slam.files.names import quoted, shown_path
+
 __all__ = [
-    "check_file", "check_tables", "open_bounded", "open_database", "parse_json", "parse_toml",
-    "parse_yaml", "plain_name", "quoted", "read_bytes", "read_json", "read_toml", "shown_path", "trust",
+    "MOST_TEXT", "check_file", "open_bounded", "parse_json", "parse_toml", "parse_yaml", "read_bytes", "read_json",
+    "read_toml",
 ]  # fmt: skip
 
 MIB = 2**20
-_MOST_TEXT = 64 * MIB  # of a file of settings or results
+MOST_TEXT = 64 * MIB  # of a file of settings or results
 _MOST_TOML = 4 * MIB
 _LONG_KEY = re.compile(rb"""(?<![\w."'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){64}""")
 _GZIP = b"\x1f\x8b"
 # A log of numbers packs to a fifth or a tenth: what unpacks to many times more is no log, but a bomb.
 _MOST_PACKED, _FREE_UNPACKED = 20, 8 * MIB
-_LONGEST_QUERY_S = 30.0
-_CHECKED_EVERY = 100_000  # instructions of SQLite's machine
 
 
 # ---- bytes -----------------------------------------------------------------------------------------------------
-
-
-def quoted(value: object, longest: int = 60) -> str:
-    """Return a value as an error tells it: on one line, without control characters, cut where it is long."""
-    try:
-        text = repr(value)
-    except ValueError:  # an integer of more digits than Python writes
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= longest else f"{text[: longest - 1]}…"
-
-
-def plain_name(text: str, longest: int = 120) -> str:
-    """Return a name from outside as it is shown: on one line, cut where it is long, and nothing in it acts.
-
-    Control characters, marks that turn the direction of what follows, and bytes that are no text are written out.
-    """
-    out = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return out if len(out) <= longest else f"{out[: longest - 1]}…"
 
 
 def check_file(path: Path, *, what: str = "file") -> None:
@@ -75,7 +54,7 @@ def check_file(path: Path, *, what: str = "file") -> None:
     raise ValueError(f"{what} {shown_path(path)} is not a file; give the path of one")
 
 
-def read_bytes(path: Path, *, what: str = "file", limit: int = _MOST_TEXT) -> bytes:
+def read_bytes(path: Path, *, what: str = "file", limit: int = MOST_TEXT) -> bytes:
     """Return a file's contents.
 
     Raises
@@ -114,11 +93,6 @@ def open_bounded(path: Path) -> Iterator[tuple[BinaryIO, int]]:
         raise ValueError(f"{shown_path(path)} is a damaged gzip file ({error}); fetch it again") from error
     except OSError as error:
         raise ValueError(f"cannot read {shown_path(path)}: {_reason(error)}") from error
-
-
-def shown_path(path: Path) -> str:
-    """Return a path as an error tells it."""
-    return plain_name(str(path), 400)
 
 
 def _reason(error: Exception) -> str:
@@ -201,58 +175,3 @@ def _finite(word: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{word[:40]} is too large")
     return value
-
-
-# ---- databases -------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def open_database(path: Path, *, mode: str = "ro") -> Iterator[sqlite3.Connection]:
-    """Open an SQLite file; what takes longer than half a minute is broken off until :func:`trust` is called.
-
-    Parameters
-    ----------
-    mode
-        ``ro``: nothing is changed or made; ``rwc``: it is made where it is not there.
-
-    Raises
-    ------
-    ValueError, sqlite3.Error
-        For what is no regular file; for a file that is damaged or takes too long.
-    """
-    if mode == "ro" or path.exists() or path.is_symlink():
-        check_file(path, what="database")
-    until = time.monotonic() + _LONGEST_QUERY_S
-    uri = f"{path.absolute().as_uri()}?mode={mode}"
-    # Two runs of the same command wait for each other's rows.
-    with closing(sqlite3.connect(uri, uri=True, timeout=60.0, isolation_level=None)) as database:
-        database.set_progress_handler(lambda: time.monotonic() > until, _CHECKED_EVERY)
-        database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_TEXT)
-        database.execute("PRAGMA trusted_schema = OFF")
-        yield database
-
-
-def check_tables(database: sqlite3.Connection, names: Collection[str], *, alone: bool = False) -> None:
-    """Raise ``sqlite3.DatabaseError`` where a table is a view, virtual, computed or damaged; it may be missing.
-
-    ``alone``: also where there is anything else, such as a trigger, which would run when rows are added.
-    """
-    for kind, name, sql in database.execute("SELECT type, name, sql FROM sqlite_schema").fetchall():
-        ours = name in names
-        if kind == "index" and sql is None:  # of a primary key
-            continue
-        if (ours and kind != "table") or (alone and not (ours or str(name).startswith("sqlite_"))):
-            raise sqlite3.DatabaseError(f"it holds the {quoted(kind)} {quoted(name)}, which is not its writer's")
-        if ours and (
-            str(sql).upper().startswith("CREATE VIRTUAL")
-            or any(column[-1] for column in database.execute(f"PRAGMA table_xinfo({name})"))
-        ):
-            raise sqlite3.DatabaseError(f"its table {name} is computed")
-    problem = database.execute("PRAGMA quick_check(1)").fetchone()[0]
-    if problem != "ok":
-        raise sqlite3.DatabaseError(" ".join(str(problem).split())[:200])
-
-
-def trust(database: sqlite3.Connection) -> None:
-    """Let statements take their time: what runs was checked."""
-    database.set_progress_handler(None, 0)
