@@ -8,9 +8,9 @@ import signal
 import sys
 
 if __name__ == "__main__":
-    print("ready", flush=True)
     for line in sys.stdin:
         _, _, first, count = json.loads(line)
+        print("ready", flush=True)
         for index in range(first, first + count):
             if index == 1:
                 os.kill(os.getpid(), signal.SIGKILL)

@@ -96,14 +96,16 @@ def main() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what a reader prints is no answer
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    for reader in READERS.values():
-        reader.warm_up()
     soft = int((_memory_mb("VmSize") + BOUND_MB) * 2**20)
     resource.setrlimit(resource.RLIMIT_AS, (soft, resource.RLIM_INFINITY))
-    answers.write("ready\n")
-    answers.flush()
+    warm: set[str] = set()
     for line in sys.stdin:
         name, seed, first, count = json.loads(line)
+        if name not in warm:
+            READERS[name].warm_up()
+            warm.add(name)
+        answers.write("ready\n")
+        answers.flush()
         for index in range(first, first + count):
             folder = Path(tempfile.mkdtemp(prefix="files-"))
             try:

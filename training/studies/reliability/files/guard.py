@@ -49,10 +49,10 @@ class _Child:
                 [sys.executable, "-m", _MODULE], bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL, env=os.environ | ONE_THREAD,
             )  # fmt: skip
-            self._line(_START_S)  # it is ready
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(job).encode() + b"\n")
         self._process.stdin.flush()
+        self._line(_START_S)  # it is ready
 
     def answer(self) -> dict[str, Any] | str:
         """Return the next row, or what the process died of."""
