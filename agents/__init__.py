@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents.base import Agent, Goal
+from slam.files import quoted
 from slam.settings import check_name, shown
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def _reader(policy: str) -> str:
 
     found = policy_format(Path(policy))
     if found not in _POLICIES:
-        raise ValueError(f"policy {policy}: its format {found!r} is none of {', '.join(_POLICIES)}")
+        raise ValueError(f"policy {policy}: its format {quoted(found)} is none of {', '.join(_POLICIES)}")
     return _POLICIES[found]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -12,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 
 import tomli_w
 
+from slam.files import read_toml
 from slam.settings import (
     Config,
     Count,
@@ -266,14 +266,11 @@ def from_toml(path: str | Path) -> EnvConfig:
 
     A [run] table is left to whoever wrote it: who explored, with which seed and versions.
     """
+    values = read_toml(Path(path))
+    values.pop("run", None)
     try:
-        with open(path, "rb") as file:
-            values = tomllib.load(file)
-        values.pop("run", None)
         return from_mapping(EnvConfig, values)
-    except OSError as error:
-        raise ValueError(f"cannot read config {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, ValueError, TypeError) as error:
+    except (ValueError, TypeError) as error:
         raise ValueError(f"config {path}: {error}") from error
 
 

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
-from mecanum_env.rooms.floor_plan import FloorPlan
+from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
 from mecanum_env.sensing.sensors import Lidar
 from slam.geometry import compose, inverse, transform_points, wrap_scalar
 from slam.grids.occupancy import FREE, OccupancyGrid
@@ -20,6 +20,7 @@ __all__ = ["Coverage", "GroundTruth"]
 
 _VIEW_SPACING_M = 0.8  # between the places that visibility is computed from: a quarter of it finds 0.5 % more
 _VIEW_BEAMS = 360
+_MOST_CELLS = 30_000_000  # of the rasters: some 70 bytes each while they are made
 
 
 class GroundTruth:
@@ -47,6 +48,7 @@ class GroundTruth:
     def __init__(
         self, plan: FloorPlan, start: Array, *, robot: RobotConfig, lidar: LidarConfig, resolution: float
     ) -> None:
+        _check_size(plan, resolution)
         self.plan = plan
         self.start = np.asarray(start, dtype=np.float64)
         heading = float(self.start[2])
@@ -155,6 +157,15 @@ def on_lattice(
     if r0 < r1 and c0 < c1:
         out[r0:r1, c0:c1] = raster[r0 - r : r1 - r, c0 - c : c1 - c]
     return out
+
+
+def _check_size(plan: FloorPlan, resolution: float) -> None:
+    rows, cols = (side * plan.resolution for side in plan.free.shape)
+    if not rows * cols <= _MOST_CELLS * resolution**2:
+        raise FloorPlanError(
+            f"plan {plan.name!r} is {cols:.0f} m by {rows:.0f} m, more than {_MOST_CELLS // 10**6} million cells "
+            f"of {resolution:g} m; give a coarser grid_resolution_m, or correct the plan's resolution"
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -41,7 +41,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot write {path}: no folder {path.parent}; create it first")
     # Not tempfile.mkstemp: its files are readable by their owner alone, and stay so when renamed.
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}{path.suffix}")
+    # A name may be 255 bytes long; of a long one the temporary one has but the beginning.
+    beginning, suffix = path.stem[:40], path.suffix[-20:]
+    temporary = path.with_name(f".{beginning}.{os.getpid()}-{secrets.token_hex(4)}{suffix}")
     try:
         yield temporary
         os.replace(temporary, path)

@@ -10,13 +10,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
+from slam.files import quoted, read_bytes, read_json
 from slam.formats import atomic_write
 
 __all__ = ["policy_format", "read_policy", "write_policy"]
 
 Made = TypeVar("Made")
+
+_MOST_BYTES = 256 * 2**20
 
 
 def policy_format(path: Path) -> str:
@@ -43,16 +46,13 @@ def read_policy(
         For a missing or damaged file, or one of another format than ``wanted``; the message names it.
     """
     described = _described(path)
-    try:
-        weights = load_file(path)
-    except (OSError, SafetensorError) as error:
-        raise ValueError(f"policy {path} cannot be read: {error}") from error
+    weights = _weights(path)
     if described.get("format") != wanted:
         raise ValueError(f"policy {path.with_suffix('.json')}: format is not {wanted!r}")
     try:
         return make(weights, described), described
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"policy {path}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path} does not fit together: {quoted(_words(error), 300)[1:-1]}") from error
 
 
 def write_policy(path: Path, weights: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> None:
@@ -69,7 +69,22 @@ def _described(path: Path) -> dict[str, Any]:
         if not file.is_file():
             raise ValueError(f"policy {path}: {file} is missing; both files are needed")
     try:
-        described = json.loads(about.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        described = read_json(about, what="policy's file", nan=True)
+    except ValueError as error:
         raise ValueError(f"policy {path} cannot be read: {error}") from error
     return described if isinstance(described, dict) else {}
+
+
+def _weights(path: Path) -> dict[str, NDArray[np.float32]]:
+    try:
+        weights = load(read_bytes(path, what="policy", limit=_MOST_BYTES))
+    except (SafetensorError, LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"policy {path} cannot be read: {quoted(_words(error), 200)[1:-1]}") from error
+    for name, value in weights.items():
+        if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value).all():
+            raise ValueError(f"policy {path} cannot be read: {quoted(name)} holds what is no finite number")
+    return weights
+
+
+def _words(error: Exception) -> str:
+    return f"{error.args[0]!r} is missing" if isinstance(error, KeyError) and error.args else str(error)

@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam.files import check_tables, open_database, quoted
 from slam.formats import replacing
 from slam.types import CONCAVE, CONVEX, Array
 
@@ -220,28 +221,44 @@ def read_landmark_map(path: str | Path) -> LandmarkMap:
         One line, where the file is missing, is not such a database, or has another schema version.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise ValueError(f"cannot read landmark map {path}: no such file")
     try:
         # Read-only, so that reading never changes or creates a file.
-        with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as database:
-            meta = dict(database.execute("SELECT key, value FROM meta"))
+        with open_database(path) as database:
+            check_tables(database, ("meta", "landmarks", "relations", "sightings"))
+            meta = {str(key): str(value) for key, value in database.execute("SELECT key, value FROM meta")}
             version = meta.get("schema_version")
             if version not in ("1", str(SCHEMA_VERSION)):
-                raise ValueError(f"schema version {version!r}, this program reads 1 and {SCHEMA_VERSION}")
+                raise ValueError(f"schema version {quoted(version)}, this program reads 1 and {SCHEMA_VERSION}")
+            names = ", ".join(f"'{name}'" for name in _KIND_NAMES.values())
+            if database.execute(f"SELECT 1 FROM landmarks WHERE kind NOT IN ({names}) LIMIT 1").fetchone():
+                raise ValueError(f"a landmark's kind is none of {names}")
             landmarks = _read(database, "landmarks", _LANDMARKS)
             relations = _read(database, "relations", _RELATIONS)
             sightings = np.zeros(0, _SIGHTINGS)
             if version != "1":
                 sightings = _read(database, "sightings", _SIGHTINGS)
+        _check_values(landmarks, relations, sightings)
         return LandmarkMap(landmarks, relations, meta, sightings)
     except (sqlite3.Error, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise ValueError(f"{path} is not a landmark map: {error}") from error
+        raise ValueError(f"{path} is not a landmark map: {' '.join(str(error).split())[:300]}") from error
 
 
 def _read(database: sqlite3.Connection, table: str, columns: list[tuple[str, str]]) -> NDArray[np.void]:
     names = ", ".join(name for name, _ in columns)
     return np.array(database.execute(f"SELECT {names} FROM {table} ORDER BY 1, 2").fetchall(), columns)
+
+
+def _check_values(landmarks: NDArray[np.void], relations: NDArray[np.void], sightings: NDArray[np.void]) -> None:
+    """Raise ``ValueError`` for values that :func:`write_landmark_map` does not write."""
+    for name in ("x", "y", "var_x", "var_y", "cov_xy"):
+        if not np.isfinite(landmarks[name]).all():
+            raise ValueError(f"a landmark's {name} is no finite number")
+    for table, names in ((relations, ("a", "b")), (sightings, ("landmark",))):
+        for name in names:
+            if not np.isin(table[name], landmarks["id"]).all():
+                raise ValueError(f"there is no landmark that a row names as its {name}")
 
 
 def _column(name: str, values: ArrayLike | None, default: NDArray[Any]) -> NDArray[Any]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.files import plain_name
 from slam.geometry import compose, inverse, wrap
 from slam.logs.log import Event, Log
 from slam.logs.recorded import ObservationNoise
@@ -128,7 +129,8 @@ def scan_log(
     measured, reach = without_returns(ranges)
     angle_min, increment = beam_angles(ranges.shape[1])
     return ScanLog(
-        name=path.name.split(".")[0], clock_start_s=float(times[0]), times=times - times[0], stamps=stamps,
+        name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]),
+        times=times - times[0], stamps=stamps,
         ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach,
         odometry_poses=odometry_poses, start_pose=odometry_poses[0].copy(), reference_times=np.zeros(0),
         reference_poses=np.zeros((0, 3)), reference_gap_s=30.0, settings=_SETTINGS, note=note,

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import gzip
 import math
-import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slam.files import open_bounded
 
 __all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
 
 Array = NDArray[np.float64]
 
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
+_LONGEST_S = 2 * 86_400.0
+_LARGEST_NUMBER = 1e16  # of any column: a clock in microseconds since 1970 is at 2e15
+_LEAST_LINE = 24  # bytes that a line of a packed file counts for: ever so many short ones take their time, too
 _LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
-_GZIP = b"\x1f\x8b"
 
 
 def find(folder: Path, name: str) -> Path:
@@ -66,15 +66,35 @@ def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, NDArray[n
             raise ValueError(f"{path}, line {number}: expected {columns} columns ({meaning}), got {len(words)}")
         rows.append(numbers_of(words, path=path, line=number, what=meaning))
         numbers.append(number)
+    if rows and (far := np.argwhere(np.abs(np.stack(rows)) > _LARGEST_NUMBER)).size:
+        i, j = far[0].tolist()
+        raise ValueError(
+            f"{path}, line {numbers[i]}: {rows[i][j]:.3g} is more than any log has ({meaning}); correct the line"
+        )
     if not rows:
         raise ValueError(f"{path} holds no data: expected lines of {meaning}")
     return np.stack(rows), np.array(numbers, np.int64)
 
 
-def read_timed(path: Path, columns: int, meaning: str) -> Array:
-    """Read a table like :func:`read_table` whose first column is a time, which must not go back."""
+def read_timed(path: Path, columns: int, meaning: str, *, second: float = 1.0, most: float = math.inf) -> Array:
+    """Read a table like :func:`read_table` whose first column is a time, which must not go back.
+
+    Parameters
+    ----------
+    second
+        How much of that time is a second: no log is longer than two days.
+    most
+        Of what the other columns may hold; damage leaves numbers that are finite and yet no robot's.
+    """
     values, lines = read_table(path, columns, meaning)
     times = values[:, 0]
+    far = np.flatnonzero((times - times[0] > _LONGEST_S * second) | (np.abs(values[:, 1:]) > most).any(axis=1))
+    if len(far):
+        i = int(far[0])
+        raise ValueError(
+            f"{path}, line {lines[i]}: {', '.join(f'{v:.6g}' for v in values[i])} is more than any log has "
+            f"({meaning}); correct the line"
+        )
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         i = int(back[0]) + 1
@@ -97,12 +117,13 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
     ValueError
         One line: that the file cannot be read, is damaged, or is too large for any log.
     """
-    with _opened(path) as file:
+    with open_bounded(path) as (file, most):
         size = number = 0
+        plain = most == path.stat().st_size
         while line := file.readline(_LONGEST_LINE + 1):
-            number, size = number + 1, size + len(line)
-            if size > _LARGEST or len(line) > _LONGEST_LINE:
-                limit = "" if size > _LARGEST else f", line {number}"
+            number, size = number + 1, size + (len(line) if plain else max(len(line), _LEAST_LINE))
+            if size > min(most, _LARGEST) or len(line) > _LONGEST_LINE:
+                limit = f", line {number}" if len(line) > _LONGEST_LINE else ""
                 raise ValueError(f"{path}{limit} is larger than any log's: it is no such log")
             yield number, line.decode("utf-8", "replace")
 
@@ -123,18 +144,3 @@ def numbers_of(words: Sequence[str], *, path: Path, line: int, what: str) -> Arr
         word = words[int(np.flatnonzero(~np.isfinite(values))[0])]
         raise ValueError(f"{path}, line {line}: {word[:40]!r} is not a finite number ({what}); correct the line")
     return values
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a file, plain or gzip, and turn what goes wrong while it is read into one line."""
-    try:
-        with open(path, "rb") as raw:
-            packed = raw.read(2) == _GZIP
-        # By its first bytes: a browser may have unpacked a file and left its name.
-        with gzip.open(path, "rb") if packed else open(path, "rb") as file:
-            yield cast(BinaryIO, file)
-    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-        raise ValueError(f"{path} is a damaged gzip file ({error}); fetch it again") from error
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror or error}") from error

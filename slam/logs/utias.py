@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.files import plain_name
 from slam.geometry import wrap
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time, split_holds
 from slam.logs.tables import find, read_table, read_timed
@@ -72,9 +73,13 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     ValueError
         One line: the file (and line) that is missing or damaged.
     """
-    odometry = read_timed(find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, speed, angular velocity")
-    measured = read_timed(find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing")
-    truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation")
+    odometry = read_timed(
+        find(folder, f"Robot{robot}_Odometry.dat"), 3, "time, speed, angular velocity", most=100.0
+    )
+    measured = read_timed(
+        find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing", most=1e9
+    )
+    truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation", most=1e7)
     landmark_ids, landmarks = _landmarks(find(folder, "Landmark_Groundtruth.dat"))
     subject_of_code = _codes(find(folder, "Barcodes.dat"))
 
@@ -102,7 +107,7 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     odometry_times, twists = split_holds(odometry[:, 0] - begin, twists, longest_s=_LONGEST_HOLD_S)
     note = "reference: Vicon pose of the robot's centre; the start pose is the reference's"
     return RecordedLog(
-        name=f"{folder.absolute().name} robot {robot}", clock_start_s=begin,
+        name=f"{plain_name(folder.absolute().name)} robot {robot}", clock_start_s=begin,
         odometry_times=odometry_times, twists=twists,
         observation_times=times, observation_ends=ends, range_bearing=measured[kept, 2:4], ids=subjects[kept],
         reference_times=truth[within, 0] - begin,

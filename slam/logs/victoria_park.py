@@ -115,7 +115,7 @@ def read(folder: Path) -> RecordedLog:
     begin, end = float(times[0]), float(times[-1])
     if not begin < end:
         raise ValueError(f"log {folder} has odometry of a single instant; it is cut short")
-    gps = read_timed(find(folder, "gps.txt"), 3, "time in ms, east, north")
+    gps = read_timed(find(folder, "gps.txt"), 3, "time in ms, east, north", second=1e3, most=1e8)
     gps[:, 0] *= 1e-3
     _, first = np.unique(gps[:, 0], return_index=True)
     gps = gps[first]
@@ -155,7 +155,7 @@ def _trees(folder: Path, begin: float, end: float) -> tuple[Array, Array, NDArra
 
 
 def _times(folder: Path, name: str) -> Array:
-    return 1e-3 * read_timed(find(folder, name), 1, "time in ms")[:, 0]
+    return 1e-3 * read_timed(find(folder, name), 1, "time in ms", second=1e3)[:, 0]
 
 
 def _beside(

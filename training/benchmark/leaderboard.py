@@ -6,7 +6,6 @@ of the marks stays as it is.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,10 +13,12 @@ from typing import Annotated, Any
 
 import typer
 
+from slam.files import quoted, read_bytes, read_json
 from slam.formats import atomic_write
 from training.benchmark.tables import figures_table, markdown, overview, ranked
 from training.figures.statistics import Interval
-from training.runs.errors import BadInput
+from training.figures.tables import markdown_name
+from training.runs.errors import BadInput, bad_input
 
 __all__ = ["BEGIN", "END", "study", "tables", "update"]
 
@@ -50,7 +51,7 @@ def tables(summary: Summary) -> str:
         parts.append(markdown(figures_table(ranked(found), _COLUMNS, limits=_WITH_LIMITS)))
         ends = {agent: words for agent, words in summary["ends"][suite].items() if set(words) != {"covered"}}
         if ends:
-            told = "; ".join(f"`{agent}` {_counted(words)}" for agent, words in ends.items())
+            told = "; ".join(f"{markdown_name(agent)} {_counted(words)}" for agent, words in ends.items())
             parts.append(f"Ended otherwise than covered: {told}.\n")
     versions = ", ".join(
         f"{name} {value}" for name, value in config.items() if isinstance(value, str) and name not in _OWN
@@ -91,9 +92,12 @@ def study(
     page: Annotated[Path, typer.Argument(help="Markdown page with the two marks.")],
 ) -> None:
     """Put a benchmark's figures into a page, between its two marks."""
+    with bad_input():
+        summary, before = read_json(results / "summary.json"), read_bytes(page, what="page")
     try:
-        summary = json.loads((results / "summary.json").read_text("utf-8"))
-        text = update(page.read_text("utf-8"), tables(summary))
-        atomic_write(page, text)
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInput(f"cannot read {results} or {page}: {error!r}") from error
+        text = update(before.decode("utf-8"), tables(summary))
+    except BadInput as error:
+        raise BadInput(f"{page}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise BadInput(f"cannot put {results} into {page}: {quoted(error, 200)}; is it a benchmark's?") from error
+    atomic_write(page, text)

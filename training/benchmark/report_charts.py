@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
+from slam.files import plain_name
 from slam.types import Array
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
@@ -99,7 +100,7 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         dashed = " dashed" if colour >= COLOURS else ""
         path = _polyline(b.x, b.middle, last)
         parts.append(
-            f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{escape(b.name)}</title></path>'
+            f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{_name(b.name)}</title></path>'
         )
     return _chart(f"Coverage against {_LABELS[along]}: {names}", parts, up="coverage [%]", along=_LABELS[along])
 
@@ -108,10 +109,14 @@ def _chart(told: str, parts: Sequence[str], *, up: str, along: str) -> str:
     """Return the chart of these parts, what it tells in words, and the labels of its axes."""
     middle = 0.5 * (_LEFT + _WIDTH - _RIGHT)
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(told)}">{"".join(parts)}'
-        f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{escape(up)}</text>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{_name(told)}">{"".join(parts)}'
+        f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{_name(up)}</text>'
         f'<text class="label" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{along}</text></svg>'
     )
+
+
+def _name(text: str) -> str:
+    return escape(plain_name(text, 400))
 
 
 def _to_x(value: float, last: float) -> float:
@@ -185,14 +190,14 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
         if line and line[0][0] == 1:
             shares = [(n, ideal(line[0][1].value, n)) for n in range(1, counts[-1] + 1)]
             points = [at(n, share, k) for n, share in shares if share <= top]
-            parts.append(f'<path class="{kind} dashed" style="stroke-width: 1; opacity: .6" d="{path(points)}"/>')
+            parts.append(f'<path class="{kind} dashed ideal" d="{path(points)}"/>')
         if line:
             points = [at(n, f.value, k) for n, f in line]
-            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{escape(name)}</title></path>')
+            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{_name(name)}</title></path>')
         for n, f in line:
             if math.isfinite(f.low) and math.isfinite(f.high):
                 limits = path([at(n, f.low, k), at(n, f.high, k)])
-                parts.append(f'<path class="{kind}" style="stroke-width: 1.2" d="{limits}"/>')
+                parts.append(f'<path class="{kind} thin" d="{limits}"/>')
             x, y = at(n, f.value, k)
-            parts.append(f'<circle class="{kind}" style="fill: var(--c)" cx="{x}" cy="{y}" r="2.5"/>')
+            parts.append(f'<circle class="{kind} dot" cx="{x}" cy="{y}" r="2.5"/>')
     return _chart(f"{label} against the number of robots: {names}", parts, up=label, along="robots")

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from slam.files import check_tables, open_database, parse_json, quoted, trust
 from training.benchmark.episode import EpisodeJob, EpisodeRow, Key
+from training.benchmark.figures import METRICS
 from training.runs.errors import BadInput
 
 __all__ = ["FILE", "Store"]
@@ -44,6 +46,9 @@ _TEAM_SCHEMA = (
 )
 _TABLES = {5: "episodes", 7: "team_episodes"}  # by the length of their keys
 _KEYS = {5: "suite, place, seed, agent, slam", 7: "suite, place, seed, agent, slam, robots, communication"}
+_NEEDED = ("coverage", "time_s", "path_length_m", "collisions", "limit_s")  # never null
+_LARGEST = 1e15  # of any metric
+_TOLD = ("time_to_95_s", "ate_rmse_m", "final_position_error_m")  # null where not reached
 _CURVES = ("coverage_by_time", "coverage_by_path", "nees")
 
 
@@ -63,16 +68,17 @@ class Store:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with self._blaming_the_file():
-            # Two runs of the same command wait for each other's rows.
-            self._connection = sqlite3.connect(path, timeout=60.0, isolation_level=None)
+        with self._blaming_the_file(), ExitStack() as opened:
+            self._connection = opened.enter_context(open_database(path, mode="rwc"))
             self._check()
+            trust(self._connection)
+            self._opened = opened.pop_all()
 
     def __enter__(self) -> Store:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._connection.close()
+        self._opened.close()
 
     def add(self, job: EpisodeJob, row: EpisodeRow, *, made_by: str) -> None:
         """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same."""
@@ -133,19 +139,36 @@ class Store:
             raise BadInput(f"{self._path} is no store of a benchmark; choose another --out")
         if version != _VERSION:
             raise BadInput(f"{self._path} is a store of version {version}, not {_VERSION}; choose another --out")
-        problem = self._connection.execute("PRAGMA quick_check(1)").fetchone()[0]
-        if problem != "ok":
-            raise sqlite3.DatabaseError(problem)
+        # Nothing else: a trigger in it would run when rows are added.
+        check_tables(self._connection, _TABLES.values(), alone=True)
 
     @contextmanager
     def _blaming_the_file(self) -> Iterator[None]:
         try:
             yield
         except (sqlite3.Error, ValueError) as error:
-            problem = " ".join(str(error).split())
+            problem = " ".join(str(error).split())[:300]
             raise BadInput(f"cannot use {self._path} ({problem}); choose another --out, or remove it") from error
 
 
 def _decode(columns: dict[str, Any]) -> EpisodeRow:
     curves = {name: np.frombuffer(columns[name], "<f4").astype(np.float32) for name in _CURVES}
-    return EpisodeRow(metrics=json.loads(columns["metrics"]), thumbnail=columns["thumbnail"], **curves)
+    metrics = parse_json(columns["metrics"], what="a row's metrics")
+    _check_metrics(metrics)
+    if not curves["coverage_by_time"].size or not curves["coverage_by_path"].size:
+        raise ValueError("a row's curve is empty")
+    return EpisodeRow(metrics=metrics, thumbnail=columns["thumbnail"], **curves)
+
+
+def _check_metrics(metrics: Any) -> None:
+    """Raise ``ValueError`` for metrics that the tables cannot be made of."""
+    if not isinstance(metrics, dict):
+        raise ValueError("a row's metrics are no table of numbers and words")
+    for key in (*_NEEDED, *_TOLD, *(metric.key for metric in METRICS if metric.of is None)):
+        value = metrics.get(key)
+        if (key in _TOLD and key not in metrics) or (key in _NEEDED and value is None):
+            raise ValueError(f"a row's metrics lack {key}")
+        if not (value is None or (type(value) in (int, float) and abs(value) < _LARGEST)):
+            raise ValueError(f"a row's {key} is {quoted(value)}, which is no such number")
+    if not isinstance(metrics.get("end"), str):
+        raise ValueError("a row's metrics lack end, a word")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
+from slam.files import plain_name
 from training.benchmark.figures import METRICS, Metric
 from training.benchmark.suites import SLIPPERY
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.figures.statistics import NONE, Comparison, Interval
-from training.figures.tables import markdown_table, text_table
+from training.figures.tables import markdown_name, markdown_table, text_table
 
 __all__ = [
     "AGAINST", "BY_KEY", "HEADLINE", "Cell", "Table", "against_table", "change", "figure", "figures_table", "html",
@@ -220,9 +222,17 @@ def text(table: Table) -> str:
 
 def markdown(table: Table) -> str:
     """Return a table in Markdown."""
-    names = [f"*{name}* (knows the plan, no agent)" if _is_bound(name) else f"`{name}`" for name, _ in table.rows]
+    names = [
+        f"*{name}* (knows the plan, no agent)" if _is_bound(name) else markdown_name(name)
+        for name, _ in table.rows
+    ]
     rows = [[name, *map(_plain, cells)] for name, (_, cells) in zip(names, table.rows, strict=True)]
-    return markdown_table(table.head, rows) + "\n"
+    return markdown_table([_in_words(heading) for heading in table.head], rows) + "\n"
+
+
+def _in_words(heading: str) -> str:
+    """Return a heading, in which a name may stand, so that nothing in it acts in Markdown."""
+    return re.sub(r"([\\`<>|])", r"\\\1", plain_name(heading))
 
 
 def _plain(cell: Cell) -> str:
@@ -233,7 +243,8 @@ def html(table: Table, keys: Mapping[str, str] | None = None) -> str:
     """Return a table that scrolls sideways; ``keys`` are what stands before an agent's name, as HTML."""
     head = "".join(f"<th>{_unbroken(heading)}</th>" for heading in ("", *table.head[1:]))
     rows = [
-        f"<tr><th>{keys[name] if keys else ''}{escape(name)}</th>{''.join(map(_html_cell, cells))}</tr>"
+        f"<tr><th>{keys[name] if keys else ''}{escape(plain_name(name))}</th>"
+        f"{''.join(map(_html_cell, cells))}</tr>"
         for name, cells in table.rows
     ]
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
@@ -247,4 +258,4 @@ def _html_cell(cell: Cell) -> str:
 
 
 def _unbroken(heading: str) -> str:
-    return escape(heading).replace(" %", "\u00a0%").replace(" [", "<br>[")
+    return escape(plain_name(heading)).replace(" %", "\u00a0%").replace(" [", "<br>[")

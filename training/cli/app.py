@@ -29,6 +29,8 @@ __all__ = ["app", "main"]
 
 TRACEBACK_VARIABLE = "MECANUM_TRACEBACK"
 
+_LONGEST = 2000  # characters of an error, whatever a file has for a name or a value
+
 # typer brings its own copy of click, or uses click's, by version; either way this is the root of usage errors.
 _ClickException: type[Exception] = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 
@@ -119,7 +121,9 @@ def _run(arguments: list[str]) -> int:
 
 
 def _fail(name: str, message: str, code: int) -> int:
-    print(f"{name}: {message}", file=sys.stderr)
+    from slam.files import plain_name  # not before something is wrong: --help is quick
+
+    print(f"{name}: {plain_name(message, _LONGEST)}", file=sys.stderr)
     return code
 
 

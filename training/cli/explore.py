@@ -150,6 +150,8 @@ def _summary(metrics: dict[str, Any], files: str, ending: str) -> str:
         value = metrics[key]
         return "-" if value is None else f"{factor * value:.{digits}f} {unit}".rstrip()
 
+    from slam.files import plain_name
+
     robots = metrics.get("per_robot")
     where = metrics["floor_plan"] or f"{metrics['rooms']}, seed {metrics['seed']}"
     who = metrics["agent"] if robots is None else f"{len(robots)} × {metrics['agent']}"
@@ -175,7 +177,7 @@ def _summary(metrics: dict[str, Any], files: str, ending: str) -> str:
             ("map", f"wall IoU {iou}; ATE {shown('ate_rmse_m', 'cm', 1, 100.0)}"),
             *((f"robot {robot['robot']}", _of_robot(robot)) for robot in robots),
         ]
-    return "\n".join(f"{name:<12} {text}" for name, text in [*rows, ("files", files)])
+    return "\n".join(f"{name:<12} {plain_name(text, 1000)}" for name, text in [*rows, ("files", files)])
 
 
 def _of_robot(robot: dict[str, Any]) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from slam.files import read_json
 from training.runs.errors import BadInput, bad_input, check_writable, needs_extra
 
 __all__ = ["policy"]
@@ -65,11 +65,9 @@ def _kind(path: Path) -> str:
 
 
 def _read(path: Path) -> dict[str, object]:
-    try:
-        described = json.loads(path.read_text(encoding="utf-8"))
+    with bad_input():
+        described = read_json(path, nan=True)
         if not isinstance(described, dict) or "config" not in described:
-            raise ValueError("it does not say with which config the policy was trained")
-    except (OSError, ValueError) as error:
-        raise BadInput(f"cannot read {path}: {error}") from error
+            raise ValueError(f"cannot read {path}: it does not say with which config the policy was trained")
     # What is of the format is written anew.
     return {k: v for k, v in described.items() if k not in ("format", "heads", "candidate", "state", "driver")}

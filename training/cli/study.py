@@ -39,6 +39,10 @@ STUDIES = {
         "training.studies.recovery.command",
         "faults made mid-episode: is the belief lost, does it know, is it found again?",
     ),
+    "reliability": (
+        "training.studies.reliability.command",
+        "a campaign against what takes input: mutated and hostile files for every reader",
+    ),
     "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
     "team-cost": ("training.studies.teams.cost", "what a step takes against the number of robots"),
     "team-filters": (

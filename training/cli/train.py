@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -91,19 +90,18 @@ def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., FolderRun]:
 
 def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
     """Read a configuration by its name in the package, or from a file."""
+    from slam.files import read_toml
     from slam.settings import from_mapping
     from training.learning.config import TrainConfig
     from training.learning.end_to_end.config import DriveConfig
 
     shipped = sorted(path.stem for path in CONFIGS.glob("*.toml"))
     path = CONFIGS / f"{config}.toml" if config in shipped else Path(config)
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
+    if not path.exists():
         hint = suggestion(config, shipped)
-        raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BadInput(f"cannot read {path}: {error}") from error
+        raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}")
+    with bad_input():
+        values = read_toml(path)
     kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
     with bad_input():
         return from_mapping(kind, values if seed is None else values | {"seed": seed})

@@ -28,13 +28,16 @@ th, td { padding: .35rem .5rem; text-align: right; border-bottom: 1px solid var(
   vertical-align: top }
 thead th { color: var(--soft); font-weight: 600; vertical-align: bottom; white-space: normal; min-width: 4.6rem }
 th:first-child { text-align: left; position: sticky; left: 0; background: var(--page) }
-tbody th { font-weight: 600 } td small { display: block; color: var(--soft); font-size: .78rem }
+tbody th { font-weight: 600; max-width: 24rem; overflow: hidden; text-overflow: ellipsis }
+h1, h2, h3, p, nav, summary, figcaption { overflow-wrap: anywhere }
+td small { display: block; color: var(--soft); font-size: .78rem }
 .better { color: var(--good); font-weight: 600 } .worse { color: var(--bad); font-weight: 600 }
 .best { font-weight: 700 }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 24rem), 1fr)); gap: 1rem }
 svg { width: 100%; height: auto; background: var(--panel); border-radius: 6px }
 svg text { fill: var(--soft); font-size: 13px } .grid { stroke: var(--rule) } .goal { stroke-dasharray: 4 4 }
 .line { fill: none; stroke: var(--c); stroke-width: 2.2 } .dashed { stroke-dasharray: 7 4 }
+.ideal { stroke-width: 1; opacity: .6 } .thin { stroke-width: 1.2 } .dot { fill: var(--c) }
 .band { fill: var(--c); fill-opacity: .13 }
 .key { display: inline-block; width: 1.1rem; border-top: 3px solid var(--c); vertical-align: middle;
   margin-right: .4rem } .key.dashed { border-top-style: dashed }

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-__all__ = ["csv_table", "markdown_table", "number", "text_table"]
+from slam.files import plain_name
+
+__all__ = ["csv_table", "markdown_name", "markdown_table", "number", "text_table"]
 
 
 def number(value: float | None, digits: int, missing: str = "–") -> str:
@@ -15,9 +18,16 @@ def number(value: float | None, digits: int, missing: str = "–") -> str:
     return missing if value is None else f"{value:.{digits}f}"
 
 
+def markdown_name(name: str) -> str:
+    """Return a name from outside as Markdown shows it, in a table or elsewhere: as code, in which nothing acts."""
+    text = plain_name(name).replace("|", "\\|")
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    return f"{fence} {text} {fence}" if "`" in text else f"{fence}{text}{fence}"
+
+
 def text_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return columns of one width each, the first to the left, the others to the right."""
-    cells = [head, *rows]
+    cells = [[plain_name(text) for text in row] for row in (head, *rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
         "  ".join([row[0].ljust(widths[0]), *(text.rjust(w) for text, w in zip(row[1:], widths[1:], strict=True))])

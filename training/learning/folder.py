@@ -20,6 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from slam.files import read_json
 from slam.formats import atomic_write, replacing
 from slam.settings import to_mapping
 from training.learning.config import PpoConfig
@@ -56,7 +57,7 @@ class FolderRun:
         }  # fmt: skip
         path = out / "progress.json"
         if path.exists():
-            self._progress |= json.loads(path.read_text(encoding="utf-8"))
+            self._progress |= read_json(path, nan=True)
         if self._progress["config"] != settings:
             raise ValueError(f"{out} holds a run with another configuration; choose another --out")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -18,6 +17,7 @@ from agents.learned.choice import CANDIDATE, STATE
 from agents.learned.choice_network import apart
 from agents.learned.chooser import ChooserConfig
 from agents.learned.policy_files import write_policy
+from slam.files import read_json
 from slam.settings import from_mapping, to_mapping
 from training.learning.choice_world import make_world
 from training.learning.config import TrainConfig
@@ -60,11 +60,11 @@ def export_run(run: Path, target: Path) -> None:
         Where the folder holds no run that got as far as an evaluation.
     """
     try:
-        progress = json.loads((run / "progress.json").read_text(encoding="utf-8"))
+        progress = read_json(run / "progress.json", nan=True)
         drives = progress["config"].get("policy") == "drive"
         config = TrainConfig() if drives else from_mapping(TrainConfig, progress["config"])
         curve = curve_of(config, run)
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{run} holds no finished part of a run; train it, or go on with mecanum train --resume ({error})"
         ) from error
@@ -93,7 +93,7 @@ def write_zip(source: Path, target: Path, member: int | None = None) -> None:
     count = len(ppo_frontier.load_choice_policy(source)[0].members)
     if not 1 <= (member or (1 if count == 1 else 0)) <= count:
         raise ValueError(f"{source} is of {count} network{'s' * (count > 1)}: choose one by --member 1 … {count}")
-    described = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
+    described = read_json(source.with_suffix(".json"), nan=True)
     if "config" not in described:
         raise ValueError(f"{source.with_suffix('.json')} does not say with which config it was trained")
     config = from_mapping(TrainConfig, described["config"])

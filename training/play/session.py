@@ -18,6 +18,7 @@ from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.render import render_frame
+from slam.files import plain_name
 from training.episodes.explore import make_agent
 from training.episodes.known_map import NAME as KNOWN_MAP
 from training.play.controls import Command
@@ -174,7 +175,7 @@ class Session:
 
 def _place(config: EnvConfig, seed: int) -> str:
     rooms = config.rooms if config.floor_plan is None else Path(config.floor_plan).name
-    return f"{rooms}, seed {seed}"
+    return f"{plain_name(rooms)}, seed {seed}"
 
 
 def _after(item: T, items: Sequence[T]) -> T:

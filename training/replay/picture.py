@@ -43,7 +43,7 @@ def draw_replay(
     axes.plot(reckoned[:, 0], reckoned[:, 1], color=COLOURS[4], linewidth=1, label="odometry", zorder=1)
     axes.axis(shown)
     axes.set_aspect("equal")
-    label(axes, title, "x [m]", "y [m]")
+    label(axes, title.replace("$", r"\$"), "x [m]", "y [m]")  # no formula
     return figure
 
 

@@ -16,6 +16,7 @@ import tomli_w
 from numpy.typing import NDArray
 
 from slam.belief import Belief
+from slam.files import plain_name
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.logs import ScanLog
@@ -176,4 +177,4 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
         ("took", speed),
         ("files", f"{out}/: {', '.join(files)}"),
     )
-    return "\n".join(f"{name:<12} {text}" for name, text in rows)
+    return "\n".join(f"{name:<12} {plain_name(text, 1000)}" for name, text in rows)

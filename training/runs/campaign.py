@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import slam
+from slam.files import quoted, read_json
 from slam.formats import atomic_write
 from slam.settings import check_name
 from training.runs.cluster import Cluster, RayPool, ray_pool
@@ -88,19 +89,23 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
     path = out / SETTINGS
     now = json.loads(json.dumps(settings))
     try:
-        before = json.loads(path.read_text("utf-8")) if path.exists() else now
-    except (OSError, ValueError) as error:
-        raise BadInput(f"cannot read {path} ({error}); choose another --out, or remove that one") from error
+        before = read_json(path, nan=True) if path.exists() else now
+    except ValueError as error:
+        raise BadInput(f"{error}; choose another --out, or remove that one") from error
     if before != now:
         old = before if isinstance(before, dict) else {}
         keys = [key for key in (*now, *old) if now.get(key) != old.get(key)]
         key = keys[0] if keys else "other settings"
         raise BadInput(
-            f"{out} holds runs with {key} = {json.dumps(old.get(key))}, not {json.dumps(now.get(key))}; "
+            f"{out} holds runs with {quoted(key)[1:-1]} = {_told(old.get(key))}, not {_told(now.get(key))}; "
             "choose another --out, or give the same to go on"
         )
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / SETTINGS, json.dumps(settings, indent=1) + "\n")
+
+
+def _told(value: Any) -> str:
+    return json.dumps(value)[:200]
 
 
 # ---- running it ------------------------------------------------------------------------------------------------

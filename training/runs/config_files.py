@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from training.runs.errors import BadInput
+from slam.files import read_toml
+from training.runs.errors import BadInput, bad_input
 
 __all__ = ["read_config"]
 
@@ -20,12 +20,8 @@ def read_config(path: Path, kinds: Mapping[str, tuple[type, ...]]) -> tuple[dict
     BadInput
         In one line: what is wrong with the file.
     """
-    try:
-        values = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise BadInput(f"cannot read config {path}: {error.strerror}; check the path") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise BadInput(f"config {path} is not TOML: {error}; correct it there") from error
+    with bad_input():
+        values = read_toml(path)
     run = values.pop("run", {})
     if not isinstance(run, dict):
         raise BadInput(f"config {path}: [run] has the wrong type, it is a table; see a config.toml")

@@ -14,6 +14,7 @@ import tomli_w
 
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
+from slam.files import plain_name
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
@@ -28,7 +29,7 @@ from training.views.report_page import episode_page
 from training.views.rerun_file import check_rerun, write_rerun
 
 __all__ = [
-    "Saver", "check_extras", "config_text", "episode_folder", "place_of", "write_episode",
+    "Saver", "check_extras", "config_text", "episode_folder", "place_of", "who_of", "write_episode",
     "write_landmarks",
 ]  # fmt: skip
 
@@ -108,7 +109,7 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     write_landmarks(folder / "landmarks.db", env)
     view = episode_view(env.truth.ground, belief)
     robot, where = episode.config.robot, place_of(episode)
-    who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
+    who = who_of(episode)
     pictures = {
         "map.png": draw_map(
             belief, estimates, view=view, robot=robot,
@@ -160,4 +161,11 @@ def config_text(episode: Course) -> str:
 def place_of(episode: Course) -> str:
     """Return where an episode was, in words."""
     plan = episode.config.floor_plan
-    return Path(plan).name if plan is not None else f"{episode.config.rooms}, seed {episode.run['seed']}"
+    if plan is None:
+        return f"{episode.config.rooms}, seed {episode.run['seed']}"
+    return plain_name(Path(plan).name)
+
+
+def who_of(episode: Course) -> str:
+    """Return who explored, in words."""
+    return plain_name(Path(episode.run["agent"]).name.removesuffix(".safetensors"))

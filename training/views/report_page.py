@@ -25,9 +25,11 @@ from mecanum_env.physics.robot import wheel_positions
 from mecanum_env.views.canvas import Canvas, View
 from mecanum_env.views.paint import paint_plan
 from mecanum_env.views.pictures import episode_view
+from slam.files import plain_name
 from slam.geometry import inverse
 from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
+from training.figures.page import HEAD, security_policy, text_html
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
@@ -76,12 +78,12 @@ def episode_page(
     view = episode_view(env.truth.ground, env.belief, longest_px=TRUTH_PX)
     header |= about_plan(env.config, env.truth.ground, view)
     return filled("episode.html", header, arrays, {
-        "TITLE": escape(title),
-        "ENDING": escape(ending),
+        "TITLE": text_html(title),
+        "ENDING": text_html(ending),
         "TILES": tiles(first_asked(metrics)),
         "METRICS": metrics_table(metrics),
-        "COMMAND": escape(command),
-        "CONFIG": escape(config),
+        "COMMAND": text_html(command),
+        "CONFIG": text_html(config),
         "SCRIPT": assets(_SCRIPTS),
     })  # fmt: skip
 
@@ -100,11 +102,18 @@ def about_plan(config: EnvConfig, ground: GroundTruth, view: View) -> dict[str, 
     }  # fmt: skip
 
 
-def filled(template: str, header: Mapping[str, Any], arrays: Arrays, parts: Mapping[str, str]) -> str:
-    """Return ``assets/page.html`` with what the template has of its own, and all parts, in their places."""
+def filled(
+    template: str, header: Mapping[str, Any], arrays: Arrays, parts: Mapping[str, str], *, style: str = ""
+) -> str:
+    """Return ``assets/page.html`` with what the template has of its own, and all parts, in their places.
+
+    ``style`` is what a page has besides the style of all; of scripts it runs ``parts["SCRIPT"]`` and no other.
+    """
+    style = STYLE + assets(["episode.css"]) + style
     parts = dict(parts) | {
-        "STYLE": STYLE + assets(["episode.css"]),
-        "HEADER": json.dumps(header).replace("</", "<\\/"),
+        "HEAD": security_policy(styles=[style], scripts=[parts["SCRIPT"]]) + "\n" + HEAD,
+        "STYLE": style,
+        "HEADER": json.dumps(header).replace("<", "\\u003c"),
         "DATA": _deflated(header["arrays"], arrays),
     }
     frame = assets(["page.html"])
@@ -285,5 +294,5 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
         if name in _WALL_CLOCK:
             continue
         text = "–" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-        rows.append(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>")
+        rows.append(f"<tr><th>{escape(name)}</th><td>{escape(plain_name(text, 400))}</td></tr>")
     return "".join(rows)

@@ -17,7 +17,7 @@ from training.episodes.explore import ENDINGS
 from training.episodes.recording import Recording
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
-from training.views.episode_files import config_text, episode_folder, place_of, write_landmarks
+from training.views.episode_files import config_text, episode_folder, place_of, who_of, write_landmarks
 from training.views.team_page import team_page
 
 __all__ = ["write_team_episode"]
@@ -59,7 +59,7 @@ def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recordi
     atomic_write(folder / "team.png", cv2.imencode(".png", picture)[1].tobytes())
     config, metrics = config_text(episode), episode.metrics()
     atomic_write(folder / "config.toml", config)
-    who = Path(episode.run["agent"]).name.removesuffix(".safetensors")
+    who = who_of(episode)
     page = team_page(
         episode, recordings, metrics=metrics, config=config,
         title=f"{place_of(episode)}: {team.team.robots} robots, {who} on {episode.config.slam}",

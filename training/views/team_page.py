@@ -14,6 +14,7 @@ from mecanum_env.views.canvas import View
 from mecanum_env.views.paint import extent_of_truth, with_margin
 from training.episodes.recording import Recording
 from training.episodes.team import TeamEpisode
+from training.figures.page import text_html
 from training.views.report_page import (
     TRUTH_PX,
     about_plan,
@@ -65,16 +66,16 @@ def team_page(
         **about_plan(episode.config, team.ground, view),
     }  # fmt: skip
     return filled("team.html", header, arrays, {
-        "TITLE": escape(title),
-        "ENDING": escape(ending),
+        "TITLE": text_html(title),
+        "ENDING": text_html(ending),
         "TILES": tiles([("robots", str(n), ""), *first_asked(metrics)]),
         "ROBOTS": _robots_table(metrics["per_robot"]),
         "MAPS": "".join(f'<option value="{k}">robot {k}</option>' for k in range(n)),
         "METRICS": metrics_table({key: v for key, v in metrics.items() if key != "per_robot"}),
-        "COMMAND": escape(command),
-        "CONFIG": escape(config),
+        "COMMAND": text_html(command),
+        "CONFIG": text_html(config),
         "SCRIPT": assets(_SCRIPTS),
-    })  # fmt: skip
+    }, style="".join(f".robot-{k} {{ --c: {colour(k)} }}\n" for k in range(n)))  # fmt: skip
 
 
 def colour(robot: int) -> str:
@@ -87,7 +88,7 @@ def _robots_table(robots: Sequence[Mapping[str, Any]]) -> str:
     """Return a row a robot, with its colour before its name."""
     head = "".join(f"<th>{escape(heading)}</th>" for heading in ("", *(heading for heading, *_ in _COLUMNS)))
     rows = "".join(
-        f'<tr><th><span class="key" style="--c: {colour(k)}"></span>robot {k}</th>'
+        f'<tr><th><span class="key robot-{k}"></span>robot {k}</th>'
         + "".join(f"<td>{number(robot[name], factor, digits)}</td>" for _, name, factor, digits in _COLUMNS)
         + "</tr>"
         for k, robot in enumerate(robots)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mecanum_env.rooms.floor_plan import FloorPlanError
+from slam.files import read_bytes as read_file
+from slam.files import shown_path
 
 __all__ = ["IMAGE_SUFFIXES", "read_bytes", "read_grey"]
 
@@ -32,18 +34,19 @@ def read_bytes(path: Path, *, what: str, limit: int = _MAX_BYTES) -> bytes:
         If it is missing, not a file, not readable or larger than ``limit`` bytes.
     """
     try:
-        if not path.exists():
-            raise FloorPlanError(f"{what} {path} does not exist; check the path")
-        if not path.is_file():
-            raise FloorPlanError(f"{what} {path} is not a file; give the path of one")
-        if path.stat().st_size > limit:
-            raise FloorPlanError(f"{what} {path} is larger than {limit >> 20} MiB; give a smaller file")
-        return path.read_bytes()
+        if not (path.exists() or path.is_symlink()):
+            raise FloorPlanError(f"{what} {shown_path(path)} does not exist; check the path")
+        return read_file(path, what=what, limit=limit)
     except (OSError, ValueError) as error:
         if isinstance(error, FloorPlanError):
             raise
-        reason = getattr(error, "strerror", None) or str(error)
-        raise FloorPlanError(f"cannot read {what} {path}: {reason}; check its permissions") from error
+        if type(error) is ValueError:
+            raise FloorPlanError(str(error)) from error
+        raise FloorPlanError(f"cannot read {what} {shown_path(path)}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    return getattr(error, "strerror", None) or str(error)
 
 
 def read_grey(path: Path) -> NDArray[np.float32]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES, read_bytes, read_grey
@@ -20,6 +19,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.assembly import DRIVE_RADIUS_M, generator
 from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
+from slam.files import parse_yaml, quoted, shown_path
 
 __all__ = ["from_raster", "load"]
 
@@ -31,6 +31,8 @@ _START_CLEARANCE_M = 0.6
 _RADII_M = (DRIVE_RADIUS_M, 0.35, 0.3, 0.2, 0.1, 0.0)
 _MODES = ("trinary", "scale", "raw")
 _MAX_RESOLUTION_M = 10.0
+_FARTHEST_M = 1e7  # of the origin: farther away, floats tell too little apart
+_MOST_WALLS = 100_000  # the time that their corners take goes by the square
 
 
 def load(
@@ -55,15 +57,17 @@ def load(
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES:
-        what = f"image {path}"
+        what = f"image {shown_path(path)}"
         raster = _read_image(path, 0.05 if resolution is None else resolution, what)
     elif suffix not in (".yaml", ".yml"):
         valid = ", ".join((".yaml", ".yml", *IMAGE_SUFFIXES))
-        raise FloorPlanError(f"floor plan {path} has the unknown suffix {suffix!r}; valid: {valid}")
+        raise FloorPlanError(f"floor plan {shown_path(path)} has the unknown suffix {suffix!r}; valid: {valid}")
     elif resolution is not None:
-        raise FloorPlanError(f"map {path} says its own resolution; leave resolution out or give the image")
+        raise FloorPlanError(
+            f"map {shown_path(path)} says its own resolution; leave resolution out or give the image"
+        )
     else:
-        what = f"map {path}"
+        what = f"map {shown_path(path)}"
         raster = _read_ros_map(path, what)
     free, cell_m, origin = raster
     return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)
@@ -87,19 +91,33 @@ def _read_ros_map(path: Path, what: str) -> Raster:
     _threshold(values, "occupied_thresh", 0.65, what)
     negate = values.get("negate", 0)
     if negate not in (0, 1):
-        raise FloorPlanError(f"{what}: negate must be 0 or 1, got {negate!r}")
+        raise FloorPlanError(f"{what}: negate must be 0 or 1, got {quoted(negate)}")
     mode = values.get("mode", "trinary")
     if mode not in _MODES:
-        raise FloorPlanError(f"{what}: unknown mode {mode!r}; valid: {', '.join(_MODES)}")
+        raise FloorPlanError(f"{what}: unknown mode {quoted(mode)}; valid: {', '.join(_MODES)}")
     image = values.get("image")
     if not isinstance(image, str) or not image or "\0" in image:
-        raise FloorPlanError(f"{what}: image must name a file, got {image!r}; add a line such as image: map.pgm")
-    grey = read_grey(path.parent / image)[::-1]
+        raise FloorPlanError(
+            f"{what}: image must name a file, got {quoted(image)}; add a line such as image: map.pgm"
+        )
+    grey = read_grey(_beside(path, image, what))[::-1]
     if mode == "raw":
         occupancy = grey / np.float32(100.0)
     else:
         occupancy = (grey if negate else np.float32(255.0) - grey) / np.float32(255.0)
     return occupancy < limit, resolution, origin
+
+
+def _beside(path: Path, image: str, what: str) -> Path:
+    """Return the image that a map names; a map from elsewhere shall not have other folders' files read."""
+    target = path.parent / image
+    try:
+        leads_to, within = target.resolve(), {path.parent.resolve(), path.resolve().parent}
+        if any(leads_to.is_relative_to(folder) for folder in within):
+            return target
+    except (OSError, RuntimeError) as error:  # links in a circle, a name too long
+        raise FloorPlanError(f"{what}: image {quoted(image)} leads nowhere; name a file beside it") from error
+    raise FloorPlanError(f"{what}: image {quoted(image)} lies outside of its folder; put it beside the map")
 
 
 def from_raster(
@@ -131,6 +149,10 @@ def from_raster(
         )
     rng = generator(seed)
     walls = outline_segments(free) * resolution
+    if len(walls) > _MOST_WALLS:
+        raise FloorPlanError(
+            f"{what} has {len(walls)} walls, more than {_MOST_WALLS}: it is no plan, or noisy; smooth the image"
+        )
     walls += np.tile(np.asarray(origin, np.float64), 2)
     return FloorPlan(
         name=name,
@@ -168,11 +190,9 @@ def _given(start: Pose, what: str) -> tuple[float, float, float]:
 def _read_yaml(path: Path, what: str) -> Mapping[str, Any]:
     data = read_bytes(path, what="map", limit=2**20)
     try:
-        values = yaml.safe_load(data.decode("utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark is not None else ""
-        raise FloorPlanError(f"{what} is damaged: not YAML{where}; compare it with ROS's map_server") from error
+        values = parse_yaml(data, what=what)
+    except ValueError as error:
+        raise FloorPlanError(f"{error}; compare it with ROS's map_server") from error
     if not isinstance(values, Mapping):
         raise FloorPlanError(f"{what} is damaged: it must hold keys such as image, resolution and origin")
     return values
@@ -192,15 +212,18 @@ def _resolution(value: object, what: str) -> float:
     resolution = _number(value)
     if not 0 < resolution <= _MAX_RESOLUTION_M:
         raise FloorPlanError(
-            f"{what}: resolution must be above 0 and at most {_MAX_RESOLUTION_M:g} m, got {value!r}; correct it"
+            f"{what}: resolution must be above 0 and at most {_MAX_RESOLUTION_M:g} m, got {quoted(value)}; "
+            "correct it"
         )
     return resolution
 
 
 def _origin(value: object, what: str) -> tuple[float, float]:
     numbers = [_number(v) for v in value] if isinstance(value, (list, tuple)) else []
-    if len(numbers) not in (2, 3) or any(math.isnan(v) for v in numbers):
-        raise FloorPlanError(f"{what}: origin must be [x, y, yaw] in m and rad, got {value!r}")
+    if len(numbers) not in (2, 3) or not all(abs(v) <= _FARTHEST_M for v in numbers):
+        raise FloorPlanError(
+            f"{what}: origin must be [x, y, yaw] in m and rad, up to {_FARTHEST_M:g} m away, got {quoted(value)}"
+        )
     if len(numbers) == 3 and abs(numbers[2]) > 1e-9:
         raise FloorPlanError(f"{what}: origin's yaw must be 0, got {numbers[2]:g}; turn the image instead")
     return numbers[0], numbers[1]
@@ -209,5 +232,5 @@ def _origin(value: object, what: str) -> tuple[float, float]:
 def _threshold(values: Mapping[str, Any], key: str, default: float, what: str) -> float:
     threshold = _number(values.get(key, default))
     if not 0 <= threshold <= 1:
-        raise FloorPlanError(f"{what}: {key} must be between 0 and 1, got {values.get(key)!r}")
+        raise FloorPlanError(f"{what}: {key} must be between 0 and 1, got {quoted(values.get(key))}")
     return threshold

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from tests.training.pages import assert_strict
 from training.episodes import explore
 from training.episodes.recording import Recorded as Recording_
 from training.episodes.recording import Recorder, Recording, _MapFollower
@@ -180,6 +181,7 @@ def test_the_page_needs_nothing_else_and_says_what_it_shows(episode: Recorded) -
     page = (episode.out / "report.html").read_text("utf-8")
     assert not re.search(r'(src|href)="(?!#|data:)', page) and "http" not in page.replace("http-equiv", "")
     assert "{{" not in page
+    assert_strict(page)
     assert "apartment, seed 3: brisk-tour on invariant-ekf" in page and "time: the step limit" in page
     assert len(page) < 400_000
 

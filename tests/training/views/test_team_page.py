@@ -11,6 +11,7 @@ import pytest
 
 from mecanum_env.team.picture import COLOURS, draw_maps
 from slam.grids.occupancy import FREE
+from tests.training.pages import assert_strict
 from tests.training.team_episode import STEPS, Explored, explore_together
 from tests.training.views.test_report_page import opened, page_data, settled
 from training.views.film import filmed
@@ -35,6 +36,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
 def test_the_page_holds_every_robots_steps(written: Written) -> None:
     page = (written.out / "report.html").read_text("utf-8")
     assert "https://" not in page.replace("http://www.w3.org", "") and "{{" not in page
+    assert_strict(page)
     header, arrays = page_data(page)
     team, log = written.explored.episode.team, written.explored.episode.log
     assert header["rows"] == STEPS + 1 and len(header["robots"]) == 3

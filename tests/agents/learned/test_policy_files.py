@@ -1,0 +1,73 @@
+"""Policies that lie about themselves: one line that names the file."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+import agents
+from agents.ppo import SHIPPED
+
+
+@pytest.fixture
+def policy(tmp_path: Path) -> Path:
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(SHIPPED.with_suffix(suffix), tmp_path / f"mine{suffix}")
+    return tmp_path / "mine.safetensors"
+
+
+def refused(policy: Path, words: str = "policy") -> None:
+    with pytest.raises(ValueError, match=words) as caught:
+        agents.make(str(policy))
+    text = str(caught.value)
+    assert type(caught.value) is ValueError and text.isprintable() and len(text) < 600 and policy.stem in text
+
+
+def test_a_sound_one_is_read(policy: Path) -> None:
+    assert agents.make(str(policy)).about["format"] == agents.make("ppo").about["format"]
+
+
+def test_weights_that_are_no_numbers_are_refused(policy: Path) -> None:
+    sound = policy.read_bytes()
+    begin = 8 + int.from_bytes(sound[:8], "little")
+    for byte in (b"\xff", b"\x7c"):  # nan, and infinity
+        policy.write_bytes(sound[:begin] + byte * (len(sound) - begin))
+        refused(policy, "no finite number" if byte == b"\xff" else "policy")
+
+
+@pytest.mark.parametrize("kind", ["BF16", "F8_E4M3", "I64", "BOOL", "F64", "OBJECT", ""])
+def test_weights_of_another_kind_are_refused(kind: str, policy: Path) -> None:
+    tensor = {"dtype": kind, "shape": [1], "data_offsets": [0, 8]}
+    header = json.dumps({"a": tensor}).encode()
+    policy.write_bytes(len(header).to_bytes(8, "little") + header + bytes(8))
+    refused(policy)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"planning": []}, {"planning": {"goal_m": [1]}}, {"planning": {"goal_m": 10**400}}, {"planning": None},
+        {"format": "a\nb\x1b"}, {"format": "x" * 10_000}, {"format": []},
+        {"format": "mecanum-slam station policy 2"}, {"format": "mecanum-slam choice policy 1"},
+    ],
+)  # fmt: skip
+def test_descriptions_that_do_not_fit_are_refused(values: dict[str, object], policy: Path) -> None:
+    about = policy.with_suffix(".json")
+    about.write_text(json.dumps(json.loads(about.read_text()) | values))
+    refused(policy)
+
+
+@pytest.mark.parametrize("text", [b"[" * 100_000, b"\xff", b"", b"9" * 5000])
+def test_descriptions_that_are_no_json_are_refused(text: bytes, policy: Path) -> None:
+    policy.with_suffix(".json").write_bytes(text)
+    refused(policy)
+
+
+def test_a_pipe_is_no_policy(policy: Path) -> None:
+    policy.unlink()
+    os.mkfifo(policy)
+    refused(policy, "missing|not a file")

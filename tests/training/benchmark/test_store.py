@@ -1,0 +1,78 @@
+"""A benchmark's store from elsewhere: nothing in it runs, and rows that no table can be made of are refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from training.benchmark.store import Store
+from training.runs.errors import BadInput
+from training.studies.reliability.files import results
+
+
+@pytest.fixture(scope="module")
+def sound() -> bytes:
+    content = results.store()["results.sqlite"]
+    assert isinstance(content, bytes)
+    return content
+
+
+def stored(folder: Path, sound: bytes, script: str = "") -> Path:
+    path = folder / "results.sqlite"
+    path.write_bytes(sound)
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
+        database.executescript(script)
+    return path
+
+
+def keys(path: Path) -> list[Any]:
+    with Store(path) as store:
+        return [key for key, _ in store.rows(store.made_by())]
+
+
+def refused(path: Path, words: str) -> None:
+    with pytest.raises(BadInput, match=words) as caught:
+        keys(path)
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 700
+
+
+def test_a_sound_one_is_read(tmp_path: Path, sound: bytes) -> None:
+    assert len(keys(stored(tmp_path, sound))) == 3
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("CREATE TRIGGER t AFTER INSERT ON episodes BEGIN DELETE FROM episodes; END", "holds the 'trigger' 't'"),
+        ("CREATE VIEW team_episodes AS SELECT * FROM episodes", "holds the 'view'"),
+        ("CREATE INDEX i ON episodes (length(metrics))", "holds the 'index'"),
+        ("CREATE TABLE other (a)", "holds the 'table' 'other'"),
+        ("ALTER TABLE episodes DROP COLUMN thumbnail", "thumbnail"),
+        ("PRAGMA application_id = 1", "no store of a benchmark"),
+        ("UPDATE episodes SET nees = x'010203'", "cannot use"),
+        ("UPDATE episodes SET coverage_by_time = x''", "curve is empty"),
+        ("UPDATE episodes SET metrics = printf('%.*c', 100000, '[')", "nested too deep"),
+    ],
+)
+def test_what_its_writer_did_not_write_is_refused(script: str, words: str, tmp_path: Path, sound: bytes) -> None:
+    refused(stored(tmp_path, sound, script), words)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("coverage", None), ("coverage", "x"), ("time_s", None), ("limit_s", -math.inf), ("collisions", True),
+        ("anees", 1e308), ("anees", math.nan), ("end", 3), ("time_to_95_s", [1]), ("ate_rmse_m", 10**400),
+    ],
+)  # fmt: skip
+def test_metrics_that_no_table_can_be_made_of_are_refused(
+    name: str, value: Any, tmp_path: Path, sound: bytes
+) -> None:
+    text = json.dumps(results.metrics_of(1) | {name: value})
+    refused(stored(tmp_path, sound, f"UPDATE episodes SET metrics = '{text}' WHERE seed = 1"), "cannot use")

@@ -1,0 +1,71 @@
+"""``mecanum study reliability``: a campaign against everything that takes input; each part has a size of its own.
+
+What is found is in ``<part>.json`` and on one page; ``docs/studies/reliability.md`` tells what was mended.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from slam.formats import atomic_write
+from slam.settings import unknown_name
+from training.figures.tables import text_table
+from training.runs.campaign import installed_version, keep_settings
+from training.runs.errors import bad_input
+from training.runs.options import Ray, Seed, Workers, workers_of
+from training.runs.rows import resume
+from training.studies.reliability.files.part import FILES
+from training.studies.reliability.page import page
+from training.studies.reliability.parts import Part, Summary
+
+__all__ = ["PARTS", "study"]
+
+PARTS: dict[str, Part] = {"files": FILES}
+"""Name → part; each has an option of its name, its size."""
+
+PAGE = "report.html"
+
+
+def study(
+    parts: Annotated[str, typer.Option(help=f"Of {', '.join(PARTS)}; separated by commas.")] = ",".join(PARTS),
+    files: Annotated[int, typer.Option(min=1, help="Files for each reader.")] = FILES.size,
+    seed: Seed = 0,
+    workers: Workers = 1,
+    ray: Ray = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/reliability"),
+) -> None:
+    """Try to break what takes input: mutated and hostile files for every reader. Goes on where it was broken off.
+
+    \b
+    Examples:
+      mecanum study reliability
+      mecanum study reliability --parts files --files 10000 --out out/reliability
+    """  # noqa: D301
+    with bad_input():
+        chosen = list(dict.fromkeys(name.strip() for name in parts.split(",")))
+        for name in chosen:
+            if name not in PARTS:
+                raise unknown_name("part", name, PARTS)
+    sizes = {"files": files}
+    who = workers_of(workers, ray)
+    keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
+    found: dict[str, Summary] = {}
+    for name in chosen:
+        part = PARTS[name]
+        rows = resume(out / f"{name}.jsonl", part.jobs(sizes[name], seed), part.work, workers=who, what=name)
+        found[name] = part.sum_up(rows) | {"size": sizes[name], "seed": seed}
+        atomic_write(out / f"{name}.json", json.dumps(found[name], indent=1, ensure_ascii=False) + "\n")
+    atomic_write(out / PAGE, page({name: (PARTS[name], summary) for name, summary in found.items()}))
+    for name, summary in found.items():
+        print(text_table(*PARTS[name].table(summary)))
+        print("\n".join([f"{name}: {summary['tried']} tried, {len(summary['failures'])} failed"]))
+        print("\n".join(f"  {line}" for line in summary["failures"][:_SHOWN]))
+    if any(summary["failures"] for summary in found.values()):
+        raise typer.Exit(1)
+
+
+_SHOWN = 20  # failures on the terminal
