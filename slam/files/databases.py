@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-from slam.files.names import quoted
+from slam.files.names import plain_name, quoted
 from slam.files.reading import MOST_TEXT, check_file
 
 __all__ = ["check_tables", "open_database", "trust"]
@@ -61,7 +61,7 @@ def check_tables(database: sqlite3.Connection, names: Collection[str], *, alone:
             raise sqlite3.DatabaseError(f"its table {name} is computed")
     problem = database.execute("PRAGMA quick_check(1)").fetchone()[0]
     if problem != "ok":
-        raise sqlite3.DatabaseError(" ".join(str(problem).split())[:200])
+        raise sqlite3.DatabaseError(plain_name(" ".join(str(problem).split()), 200))
 
 
 def trust(database: sqlite3.Connection) -> None:

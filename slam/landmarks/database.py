@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam.files import check_tables, open_database, quoted
+from slam.files import check_tables, open_database, plain_name, quoted
 from slam.formats import replacing
 from slam.types import CONCAVE, CONVEX, Array
 
@@ -242,7 +242,9 @@ def read_landmark_map(path: str | Path) -> LandmarkMap:
         _check_values(landmarks, relations, sightings)
         return LandmarkMap(landmarks, relations, meta, sightings)
     except (sqlite3.Error, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise ValueError(f"{path} is not a landmark map: {' '.join(str(error).split())[:300]}") from error
+        raise ValueError(
+            f"{path} is not a landmark map: {plain_name(' '.join(str(error).split()), 300)}"
+        ) from error
 
 
 def _read(database: sqlite3.Connection, table: str, columns: list[tuple[str, str]]) -> NDArray[np.void]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from slam.files import check_tables, open_database, parse_json, quoted, trust
+from slam.files import check_tables, open_database, parse_json, plain_name, quoted, trust
 from training.benchmark.episode import EpisodeJob, EpisodeRow, Key
 from training.benchmark.figures import METRICS
 from training.runs.errors import BadInput
@@ -147,7 +147,7 @@ class Store:
         try:
             yield
         except (sqlite3.Error, ValueError) as error:
-            problem = " ".join(str(error).split())[:300]
+            problem = plain_name(" ".join(str(error).split()), 300)
             raise BadInput(f"cannot use {self._path} ({problem}); choose another --out, or remove it") from error
 
 

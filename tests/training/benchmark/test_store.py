@@ -54,6 +54,11 @@ def test_a_sound_one_is_read(tmp_path: Path, sound: bytes) -> None:
         ("CREATE INDEX i ON episodes (length(metrics))", "holds the 'index'"),
         ("CREATE TABLE other (a)", "holds the 'table' 'other'"),
         ("ALTER TABLE episodes DROP COLUMN thumbnail", "thumbnail"),
+        (
+            "CREATE TABLE other (a); PRAGMA writable_schema = ON; "
+            "UPDATE sqlite_schema SET sql = 'CREATE TABLE other (' || char(5) || ')' WHERE name = 'other'",
+            "malformed|unrecognized",  # SQLite tells the character itself
+        ),
         ("PRAGMA application_id = 1", "no store of a benchmark"),
         ("UPDATE episodes SET nees = x'010203'", "cannot use"),
         ("UPDATE episodes SET coverage_by_time = x''", "curve is empty"),
