@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
+from agents.stations.sensor import SENSORS, rays
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import not_negative, positive, require
+from slam.settings import not_negative, positive, require, unknown_name
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
@@ -29,11 +30,14 @@ class StationsConfig:
     spacing_m: float = 0.0  # between stations, through the start; 0: there are none
     hop: int = 2  # stations a hop goes at most along each axis
     reach_m: float = 12.0  # from which a piece of frontier is looked at
+    sensor: str = SENSORS[0]  # that the robot looks with
 
     def __post_init__(self) -> None:
         not_negative(self, "spacing_m")
         require(self.hop >= 1, f"StationsConfig.hop must be at least 1, got {self.hop}")
         positive(self, "reach_m")
+        if self.sensor not in SENSORS:
+            raise unknown_name("StationsConfig.sensor", self.sensor, SENSORS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,18 @@ class StationAgent(Agent):
         super().looked(belief)
         self._looked_at += (np.array(belief.pose[:2], dtype=np.float64),)
 
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return where to go next: a station, where the robot stands on one and there is something to see."""
+        stop = self._stop(belief)
+        if stop is None:
+            return super().choose(belief)
+        self._frontiers, self._status = stop.frontiers(), "driving"
+        return stop.goal(self._station(stop), belief)
+
+    def _station(self, stop: StationStop) -> int:
+        """Return the station to go to, of those in ``stop.found.cells``."""
+        raise NotImplementedError
+
     def _stop(self, belief: Belief) -> StationStop | None:
         """Return what there is to do, ``None`` where there is nothing or the robot stands on no station.
 
@@ -103,7 +119,8 @@ class StationAgent(Agent):
                 visited[cell] = True
         pieces = no_pieces(known.shape)
         find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-        found = survey(known, pieces, visited, first, robot, resolution, stations.reach_m / resolution)
+        reach = stations.reach_m / resolution
+        found = survey(known, pieces, visited, first, robot, resolution, reach, rays(stations.sensor))
         return StationStop(known, visited, corner, first, robot, resolution, found) if found.worth.any() else None
 
 

@@ -11,8 +11,9 @@ import pytest
 import agents
 from agents.learned.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
-from agents.stations.lattice import edges, join, lengths, ways
-from agents.stations.survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
+from agents.stations.lattice import edges, in_sight, join, lengths, ways
+from agents.stations.sensor import BLIND, SENSORS, look, rays
+from agents.stations.survey import STRIDE, VOXEL, find_pieces, first_hop, no_pieces, options, survey
 from agents.ways.routing import draw_luck
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -40,7 +41,7 @@ def stop(known: np.ndarray, robot: tuple[int, int]):
     visited[robot] = True
     pieces = no_pieces(known.shape)
     find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-    return survey(known, pieces, visited, robot, robot, CELL_M, 30.0), visited
+    return survey(known, pieces, visited, robot, robot, CELL_M, 30.0, rays(SENSORS[0])), visited
 
 
 def belief_of(known: np.ndarray, robot: tuple[int, int], start: tuple[int, int], pad: int = 0) -> Belief:
@@ -95,6 +96,28 @@ def test_pieces_are_the_same_whether_found_at_once_or_bit_by_bit():
     before = whole.copy()
     find_pieces(known, whole, np.array([130, -1, 130, -1]))  # nothing became known
     np.testing.assert_array_equal(whole, before)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_counts_as_settled_is_settled_by_a_look(seed, sensor):
+    """Where all that is unknown is wall, each piece that counts, and is no near one in sight, is gone then."""
+    known, robot = rooms(seed), (65, 65)
+    visited = np.zeros(known.shape, np.bool_)
+    pieces = no_pieces(known.shape)
+    find_pieces(known, pieces, np.array([0, 129, 0, 129]))
+    blind, seeing = (
+        survey(known, pieces, visited, robot, robot, CELL_M, 30.0, rays_) for rays_ in (BLIND, rays(sensor))
+    )
+    np.testing.assert_array_equal(blind.worth, seeing.worth)
+    assert set(blind.places) <= set(seeing.places) and seeing.sight.sum() > blind.sight.sum()
+    near = in_sight(known, seeing.cells, seeing.pieces, 30.0)
+    for place, settles in list(zip(seeing.places.tolist(), seeing.sight, strict=True))[1:]:
+        shown, left = known.copy(), no_pieces(known.shape)
+        look(known == FREE, *seeing.cells[place].tolist(), rays(sensor), shown)
+        find_pieces(shown, left, np.array([0, 129, 0, 129]))
+        rows, cols = (seeing.pieces[settles & ~near[place]] // VOXEL).T
+        assert (left[rows, cols] < 0).all()
 
 
 @pytest.mark.parametrize("seed", range(4))

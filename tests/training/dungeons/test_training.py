@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from agents.learned.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
-from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options
+from agents.stations.sensor import BLIND
+from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options, survey
 from slam.grids.occupancy import UNKNOWN
 from training.cli import main
 from training.dungeons import networks as dungeon_networks
@@ -18,8 +19,8 @@ from training.dungeons.episode import _Run
 from training.dungeons.lessons import gather, lessons_of, read_lessons
 from training.dungeons.plans import dungeon_plan, loops
 from training.dungeons.training import TrainingConfig, batch_of, train, turned
-from training.dungeons.walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
-from training.dungeons.world import CELL_M, Lattice, frontier_points
+from training.dungeons.walks import BLIND_REACH, LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
+from training.dungeons.world import CELL_M, SENSORS, Lattice, frontier_points
 
 # ---- plans -----------------------------------------------------------------------------------------------------
 
@@ -45,7 +46,7 @@ def test_plans_are_like_the_published_maps():
 def test_a_walk_sees_and_counts_as_the_protocol_does():
     """Stations, ways, pieces and what is worth a visit, against the protocol's own count at every stop."""
     plan = dungeon_plan(4)
-    walk, run = Walk(plan), _Run(plan, continuous=False)
+    walk, run = Walk(plan), _Run(plan, continuous=False, sensor=SENSORS[0])
     for _ in range(12):
         run.look()
         found = walk.survey()
@@ -65,13 +66,20 @@ def test_a_walk_sees_and_counts_as_the_protocol_does():
 
 def test_the_rest_of_the_tour_is_what_the_tour_takes():
     walk = Walk(dungeon_plan(2))
-    found = walk.survey()
-    hop = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
-    (foreseen,) = TourDriver().finish([walk.after((int(hop[0]), int(hop[1])))])
-    assert walk.path_m == 0.0 and not walk.visited[tuple(hop)]
-    while (found := walk.survey()).worth.any():
-        cell = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
-        walk.hop((int(cell[0]), int(cell[1])))
+    blind = dict(known=walk.known, pieces=walk.pieces, visited=walk.visited, first=walk.plan.start, cell_m=CELL_M)
+
+    def next_cell():
+        found = survey(robot=walk.cell, reach=BLIND_REACH, sensor=BLIND, **blind)
+        if not found.worth.any():
+            return None
+        hop = first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))
+        return int(found.cells[hop][0]), int(found.cells[hop][1])
+
+    hop = next_cell()
+    (foreseen,) = TourDriver().finish([walk.after(hop)])
+    assert walk.path_m == 0.0 and not walk.visited[hop]
+    while (cell := next_cell()) is not None:
+        walk.hop(cell)
     assert walk.path_m == pytest.approx(foreseen)
     assert (walk.plan.free & (walk.known == UNKNOWN)).sum() <= 25
 
