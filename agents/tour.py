@@ -94,16 +94,14 @@ class Tour(StationAgent, Explorer):
     _index = 0  # of the piece that the tour begins with
 
     def _station(self, stop: StationStop) -> int:
-        places = stop.found.places
-        return int(places[begin(stop.found, draw_luck(self.config.tries, len(places)))])
+        return begin(stop.found, draw_luck(self.config.tries, len(stop.found.places)))
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of frontier that the tour begins with."""
         return self._index
 
     def _costs_asked(self) -> int | None:
-        # Those that the tour is over; stations ask for ways to all of them.
-        return self.config.places if self.config.stations.spacing_m == 0 else None
+        return self.config.places  # those that the tour is over
 
     def _candidates(self, belief: Belief) -> Candidates:
         """Return the candidates, the first place of the tour put in as the view point of what is picked."""

@@ -146,8 +146,7 @@ def rest_of_the_tour(
         found = survey(known, pieces, visited, first, robot, cell_m, reach, BLIND)
         if not found.worth.any():
             break
-        target = found.places[begin(found, luck)]
-        cell = found.cells[first_hop(found.before, found.places[0], target)]
+        cell = found.cells[first_hop(found.before, found.places[0], begin(found, luck))]
         total += math.hypot(cell[0] - robot[0], cell[1] - robot[1]) * cell_m
         robot = (cell[0], cell[1])
         visited[cell[0], cell[1]] = True
