@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
@@ -13,7 +14,17 @@ from agents.learned.station_network import PLANES, SIDE, outside, picture, pixel
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
 from agents.stations.lattice import edges, in_sight, join, lengths, ways
 from agents.stations.sensor import BLIND, SENSORS, look, rays
-from agents.stations.survey import STRIDE, VOXEL, find_pieces, first_hop, no_pieces, options, survey
+from agents.stations.survey import (
+    STRIDE,
+    VOXEL,
+    Survey,
+    find_pieces,
+    first_hop,
+    no_pieces,
+    options,
+    survey,
+    tour,
+)
 from agents.ways.routing import draw_luck
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -135,6 +146,52 @@ def test_openings_begin_differently(seed):
         assert leg == pytest.approx(found.way[target] * CELL_M)
     few = draw_luck(6, 2)  # fewer columns than places: drawn anew
     assert len(options(found, few, most=3, most_loss_m=40.0).targets) <= 3
+
+
+def to_do(seed: int) -> Survey:
+    """What there is to do for a robot among six places in a square of 30 m that settle nine pieces."""
+    rng = np.random.default_rng(seed)
+    at = rng.uniform(0.0, 30.0, (7, 2))
+    seen = rng.random((6, 9)) < 0.5
+    sight = np.vstack([np.zeros(9, np.bool_), seen & (rng.random((6, 9)) < 0.8)])
+    seen &= sight.any(axis=0)  # any piece can be settled
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    own = np.arange(7)
+    return Survey(
+        np.zeros((7, 2), np.int64), own, distance[0], own > 0, own, np.zeros((9, 2), np.int64), seen, own, sight,
+        distance,
+    )  # fmt: skip
+
+
+def shortest(found: Survey, first: int | None = None) -> float:
+    """The shortest order of places, by trying all, after which no station sees two pieces that are not settled."""
+    best = math.inf
+    for count in range(7):
+        for order in itertools.permutations(range(1, 7), count):
+            left = ~found.sight[list(order)].any(axis=0)
+            if (found.seen[:, left].sum(axis=1) < 2).all() and (first is None or order[:1] == (first,)):
+                best = min(best, sum(found.distance[a, b] for a, b in itertools.pairwise((0, *order))))
+    return best
+
+
+def test_a_tour_leaves_nothing_worth_a_visit_and_is_not_much_longer_than_the_shortest():
+    shares, begun = [], []
+    for seed in range(12):
+        found = to_do(seed)
+        if shortest(found) == 0.0:
+            continue
+        order = tour(found, LUCK)
+        left = ~found.sight[order].any(axis=0)
+        assert order[0] == 0 and len(set(order.tolist())) == len(order)
+        assert (found.seen[:, left].sum(axis=1) < 2).all()
+        cost = sum(found.distance[a, b] for a, b in itertools.pairwise(order))
+        shares.append(cost / shortest(found))
+        openings = options(found._replace(before=np.zeros(7, np.int64)), LUCK, most=6, most_loss_m=1e3)
+        assert openings.targets[0] == order[1]
+        for target, loss in zip(openings.targets, openings.losses, strict=True):
+            begun.append((cost + loss) / shortest(found, int(target)))
+    assert min(shares + begun) > 1.0 - 1e-9
+    assert np.mean(shares) < 1.25 and np.mean(begun) < 1.25
 
 
 # ---- what the network is shown ---------------------------------------------------------------------------------

@@ -25,13 +25,14 @@ from torch import Tensor, nn
 
 from agents.learned.policy_files import write_policy
 from agents.learned.station_network import PLANES, opening_numbers, with_walls
-from agents.learned_tour import FORMAT
+from agents.learned_tour import FORMAT, load_station_policy
 from slam.formats import replacing
 from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
-from training.dungeons.networks import StationNetwork
+from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.plans import dungeon_plan
 from training.runs.campaign import Workers, installed_version, keep_settings
+from training.runs.errors import bad_input
 from training.runs.options import Ray, workers_of
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
@@ -57,6 +58,7 @@ class TrainingConfig:
     weight_decay: float = 1e-2
     untold: float = 0.125  # share of the lessons that do not tell how far the plan extends
     free_weight: float = 0.3  # of foreseeing what is free, besides what openings cost
+    start: str = ""  # policy whose weights the first round's network begins with; none: drawn at random
     seed: int = 0
 
 
@@ -164,6 +166,8 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
     unseen = read_lessons((out / "lessons", _unseen(config)))
     torch.manual_seed(config.seed)
     network = StationNetwork()
+    if config.start and number == 1:
+        network = read_network(Path(config.start).read_bytes())
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     curve = _resume(out / _CHECKPOINT, network, optimiser)
@@ -249,14 +253,20 @@ def study(
         float, typer.Option(min=0, max=1, help="Share of lessons that do not tell how far the plan extends.")
     ] = 0.125,
     free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
+    start: Annotated[
+        str, typer.Option(metavar="FILE", help="Policy (.safetensors) whose weights the network begins with.")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0)] = 0,
     workers: Annotated[int, typer.Option(min=1, help="Processes that gather lessons.")] = 1,
     ray: Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""
+    if start:
+        with bad_input():
+            load_station_policy(Path(start))
     config = TrainingConfig(
         rounds=rounds, plans=plans, later_plans=later_plans, validation_plans=validation_plans, epochs=epochs,
-        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, seed=seed,
+        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, start=start, seed=seed,
     )  # fmt: skip
     run(out, config, workers=workers_of(workers, ray))
     print(out / _WEIGHTS)

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numba import njit
 from numpy.typing import NDArray
-from safetensors.torch import load
 
 from agents.learned.station_network import (
     PLANES,
@@ -31,7 +30,7 @@ from agents.stations.sensor import BLIND, SENSORS, Rays, look, rays
 from agents.stations.survey import Openings, Survey, begin, find_pieces, first_hop, no_pieces, options, survey
 from agents.ways.routing import draw_luck
 from slam.grids.occupancy import UNKNOWN
-from training.dungeons.networks import StationNetwork
+from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.world import CELL_M, Dungeon, scan
 
 __all__ = ["LUCK", "MOST", "REACH", "LearnedDriver", "Stop", "TourDriver", "Walk", "rest_of_the_tour"]
@@ -196,10 +195,7 @@ class LearnedDriver(TourDriver):
     @classmethod
     def read(cls, weights: bytes) -> LearnedDriver:
         """Return the driver of a file of weights, without what only training needs."""
-        network = StationNetwork()
-        found = {name: value.float() for name, value in load(weights).items()}
-        network.load_state_dict(found, strict=False)  # the part that foresees free space is left out there
-        return cls(network)
+        return cls(read_network(weights))
 
     def choose(self, stops: Sequence[Stop]) -> list[int]:
         """Return the opening to take at each stop."""
