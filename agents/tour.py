@@ -7,8 +7,7 @@ the first leg is carried out.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +17,9 @@ from agents.stations.lattice import in_sight
 from agents.stations.stop import StationAgent, StationsConfig, StationStop
 from agents.stations.survey import begin
 from agents.view_points.gain import expected_area
-from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from slam.belief import Belief
-from slam.grids.occupancy import FREE
 from slam.settings import not_negative, require
 
 __all__ = ["Outlook", "Tour", "TourConfig"]

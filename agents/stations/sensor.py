@@ -1,7 +1,7 @@
 """What a robot on a station sees: rays that walk over the cells of a grid until a wall.
 
-``public`` is the sensor of the published benchmark's code (DARE, ICRA 2025), ``wide`` one that shows the cells beside
-the rays, too. Where all rays begin many of them pass the same cells: as one tree, a third of the steps is left.
+``public`` is the sensor of the published benchmark's code (DARE, ICRA 2025), ``wide`` one that shows the cells
+beside the rays, too. Near the robot many rays pass the same cells: as one tree, a third of the steps is left.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def rays(sensor: str) -> Rays:
     """Return the rays of one of :data:`SENSORS`: 720, half a degree apart, up to 50 cells long.
 
     ``public``: a ray steps along one axis at a time, shows what it passes and the first wall, not its last cell.
-    ``wide``: it may step along both axes at once, shows the eight cells around each that it passes, and ends before
-    the first wall.
+    ``wide``: it may step along both axes at once, shows the eight cells around each that it passes, and ends
+    before the first wall.
     """
     walk = {"public": _steps, "wide": _line}[sensor]
     root: dict[tuple[int, int], Any] = {}
@@ -85,9 +85,7 @@ def _line(dr: int, dc: int) -> Iterator[tuple[int, int]]:
 
 
 @njit(cache=True, nogil=True)
-def look(
-    free: NDArray[np.bool_], row: int, col: int, sensor: Rays, known: NDArray[np.int8]
-) -> NDArray[np.int64]:
+def look(free: NDArray[np.bool_], row: int, col: int, sensor: Rays, known: NDArray[np.int8]) -> NDArray[np.int64]:
     """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell.
 
     Returns ``(4,)`` the first and last row and column in which a cell became known; the last ones −1 where none

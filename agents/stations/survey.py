@@ -163,8 +163,8 @@ def survey(
         Cells from which the tour counts a piece in sight as settled.
     sensor
         Besides, pieces count as settled that a look would leave nothing of by what is known, as far as it reaches:
-        much of a wall far off is not hit by any ray. :data:`agents.stations.sensor.BLIND`: without that, in a fifth
-        of the time.
+        much of a wall far off is not hit by any ray. :data:`agents.stations.sensor.BLIND`: without that, in a
+        fifth of the time.
     """
     r0, c0 = first[0] % STRIDE, first[1] % STRIDE
     picked = known[r0::STRIDE, c0::STRIDE] == _FREE

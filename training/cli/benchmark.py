@@ -58,7 +58,8 @@ def benchmark(
         str, typer.Option(help="How that protocol looks around: way-points or continuous.")
     ] = "way-points",
     sensor: Annotated[
-        str, typer.Option(help="What that protocol's rays show: public (as in its code) or wide (cells beside, too).")
+        str,
+        typer.Option(help="What that protocol's rays show: public (as in its code) or wide (cells beside, too)."),
     ] = "public",
     max_steps: opt.MaxSteps = None,
     workers: opt.Workers = None,

@@ -74,9 +74,7 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-def make_agent(
-    name: str, extent_m: tuple[float, float] | None = None, *, sensor: str = SENSORS[0]
-) -> Agent:
+def make_agent(name: str, extent_m: tuple[float, float] | None = None, *, sensor: str = SENSORS[0]) -> Agent:
     """Return an agent set up for this world, with as much of the setting as its configuration has.
 
     ``extent_m`` is how far the map reaches along x and y from the frame's origin.

@@ -266,7 +266,8 @@ def study(
             load_station_policy(Path(start))
     config = TrainingConfig(
         rounds=rounds, plans=plans, later_plans=later_plans, validation_plans=validation_plans, epochs=epochs,
-        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, start=start, seed=seed,
+        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, start=start,
+        seed=seed,
     )  # fmt: skip
     run(out, config, workers=workers_of(workers, ray))
     print(out / _WEIGHTS)

@@ -126,7 +126,8 @@ class Walk:
 
     def survey(self) -> Survey:
         """Return what there is to do."""
-        return survey(self.known, self.pieces, self.visited, self.plan.start, self.cell, CELL_M, REACH, rays(SENSORS[0]))
+        sensor, start = rays(SENSORS[0]), self.plan.start
+        return survey(self.known, self.pieces, self.visited, start, self.cell, CELL_M, REACH, sensor)
 
     def _look(self) -> None:
         self.visited[self.cell] = True
