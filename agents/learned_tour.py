@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.learned.policy_files import read_policy
-from agents.learned.station_network import StationNetwork, outside, picture, pixels, with_walls
+from agents.learned.station_network import StationEnsemble, outside, picture, pixels, with_walls
 from agents.stations.stop import StationStop
 from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
@@ -53,9 +53,9 @@ class LearnedTourConfig(TourConfig):
         not_negative(self, "most_loss_m")
 
 
-def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
-    return read_policy(path, FORMAT, lambda weights, _: StationNetwork(weights))
+def load_station_policy(path: Path) -> tuple[StationEnsemble, dict[str, Any]]:
+    """Read a policy: its networks, and what the JSON file says of its training; see :func:`read_policy`."""
+    return read_policy(path, FORMAT, lambda weights, _: StationEnsemble(weights))
 
 
 class LearnedTour(Tour):

@@ -8,9 +8,11 @@ import math
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 import agents
-from agents.learned.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
+from agents.learned.choice_network import apart
+from agents.learned.station_network import PLANES, SIDE, StationNetwork, outside, picture, pixels, with_walls
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
 from agents.stations.lattice import edges, in_sight, join, lengths, ways
 from agents.stations.sensor import BLIND, SENSORS, look, rays
@@ -378,15 +380,27 @@ def test_its_policy_comes_with_where_it_is_from():
     assert costs.shape == openings.losses.shape and np.isfinite(costs).all() and math.isfinite(costs.std())
 
 
-def test_a_policy_is_named_by_its_file_and_a_damaged_one_refused(tmp_path):
-    from safetensors.numpy import load_file, save_file
+def test_several_networks_say_the_mean_of_what_each_says():
+    ensemble, _ = load_station_policy(SHIPPED)
+    weights = load_file(SHIPPED)
+    assert len(ensemble.members) == 2
+    known, robot = rooms(1), (65, 65)
+    found, visited = stop(known, robot)
+    openings = options(found, LUCK, most=5, most_loss_m=40.0)
+    shown = picture(known, visited, robot, CELL_M, found)
+    targets, hops = (pixels(found.cells[at], robot, shown) for at in (openings.targets, openings.hops))
+    alone = [StationNetwork(own).costs_m(shown, targets, hops, openings) for own in apart(weights)]
+    np.testing.assert_allclose(ensemble.costs_m(shown, targets, hops, openings), np.mean(alone, axis=0))
+    assert np.abs(alone[0] - alone[1]).max() > 0.1
 
+
+def test_a_policy_is_named_by_its_file_and_a_damaged_one_refused(tmp_path):
     weights = load_file(SHIPPED)
     path = tmp_path / "mine.safetensors"
     save_file(weights, path)
     path.with_suffix(".json").write_text(SHIPPED.with_suffix(".json").read_text())
     assert isinstance(agents.make(str(path)), LearnedTour)
-    weights.pop("up_1.first.bias")
+    weights.pop("members.1.up_1.first.bias")
     save_file(weights, path)
     with pytest.raises(ValueError, match=r"mine.*up_1\.first\.bias"):
         agents.make("learned-tour", config={"policy": str(path)})

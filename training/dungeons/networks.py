@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import cast
 
 import torch
-from safetensors.torch import load
+from safetensors.numpy import load
 from torch import Tensor, nn
 
+from agents.learned.choice_network import apart
 from agents.learned.station_network import PLANES
 
 __all__ = ["StationNetwork", "read_network"]
@@ -74,10 +75,13 @@ class StationNetwork(nn.Module):
 
 
 def read_network(weights: bytes) -> StationNetwork:
-    """Return the network of a file of weights; what only training needs is not in it, and is drawn at random."""
+    """Return the network of a file of weights, the first of several.
+
+    What only training needs is not in it, and is drawn at random.
+    """
     network = StationNetwork()
-    found = {name: value.float() for name, value in load(weights).items()}
-    network.load_state_dict(found, strict=False)
+    first, *_ = apart(load(weights))
+    network.load_state_dict({name: torch.tensor(value).float() for name, value in first.items()}, strict=False)
     return network
 
 

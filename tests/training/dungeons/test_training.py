@@ -226,6 +226,26 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
         np.testing.assert_array_equal(again.state_dict()[name], value, err_msg=name)
 
 
+def test_training_may_begin_with_a_policy_and_trusts_the_tour_more(run_folder, tmp_path):
+    from safetensors.numpy import load_file
+
+    from agents.learned.choice_network import apart
+    from agents.learned_tour import SHIPPED
+    from training.dungeons.training import _kept
+
+    (tmp_path / "round-1").mkdir()
+    (tmp_path / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
+    config = TrainingConfig(plans=2, validation_plans=1, epochs=1, batch=8, rate=1e-9, start=str(SHIPPED))
+    begun, _ = train(tmp_path, config)
+    first = apart(load_file(SHIPPED))[0]
+    kept = _kept(begun, 0.25)
+    assert kept.keys() == first.keys()
+    for name, value in first.items():
+        np.testing.assert_allclose(kept[name] - (0.25 if name == "loss_share" else 0.0), value, atol=1e-5)
+    other, _ = train(tmp_path, config, member=1)  # the others begin anew
+    assert np.abs(_kept(other, 0.0)["up_0.first.weight"] - first["up_0.first.weight"]).max() > 0.01
+
+
 def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys):
     import agents
     from training.dungeons.episode import explore
@@ -245,13 +265,13 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         "--validation-plans",
         "1",
     ]
-    arguments += ["--epochs", "1", "--batch", "8"]
+    arguments += ["--members", "2", "--epochs", "1", "--batch", "8"]
     assert main(arguments) == 0
     path = out / "learned-tour.safetensors"
     assert capsys.readouterr().out.strip() == str(path)
     about = json.loads(path.with_suffix(".json").read_text())
     assert about["config"]["plans"] == 2 and "--epochs=1" in about["command"]
-    assert [len(curve) for curve in about["curves"]] == [1, 1]
+    assert [len(curve) for curve in about["curves"]] == [1, 1, 1, 1]  # two rounds of two networks
     assert set(about["validation_path_m"]) == {"tour", "learned-tour"}
     first, second = ({p.name for p in (out / name / "lessons").iterdir()} for name in ("round-1", "round-2"))
     assert first == {*second, "000001.npz"}  # of the same plans, driven by what the first round learned
@@ -273,6 +293,8 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         (["--later-plans", "1001"], "--later-plans"),
         (["--untold", "1.5"], "--untold"),
         (["--workers", "0"], "--workers"),
+        (["--members", "0"], "--members"),
+        (["--start", "nowhere.safetensors"], "nowhere.safetensors"),
     ],
 )
 def test_bad_input_is_one_line(change, says, tmp_path, capsys):
