@@ -86,11 +86,11 @@ class StationAgent(Agent):
         super().looked(belief)
         self._looked_at += (np.array(belief.pose[:2], dtype=np.float64),)
 
-    def choose(self, belief: Belief) -> Goal | None:
-        """Return where to go next: a station, where the robot stands on one and there is something to see."""
+    def _hop(self, belief: Belief) -> Goal | None:
+        """Return the station to go to, ``None`` where the robot stands on none or there is nothing to see."""
         stop = self._stop(belief)
         if stop is None:
-            return super().choose(belief)
+            return None
         self._frontiers, self._status = stop.frontiers(), "driving"
         return stop.goal(self._station(stop), belief)
 
