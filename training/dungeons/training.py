@@ -60,9 +60,7 @@ class TrainingConfig:
     untold: float = 0.125  # share of the lessons that do not tell how far the plan extends
     free_weight: float = 0.3  # of foreseeing what is free, besides what openings cost
     members: int = 1  # networks that are trained apart on the same lessons, and asked together
-    trust: float = (
-        0.25  # put on the tour's own count of what an opening loses, over what the network learned of it
-    )
+    trust: float = 0.4  # more of what an opening loses by the tour's own count than was learned
     start: str = ""  # policy whose weights the first network begins with; none: drawn at random
     seed: int = 0
 
@@ -262,7 +260,7 @@ def study(
     ] = 0.125,
     free_weight: Annotated[float, typer.Option(help="Of foreseeing what is free.")] = 0.3,
     members: Annotated[int, typer.Option(min=1, help="Networks that are asked together.")] = 1,
-    trust: Annotated[float, typer.Option(help="In the tour's own count, over what was learned of it.")] = 0.25,
+    trust: Annotated[float, typer.Option(help="In the tour's own count, over what was learned of it.")] = 0.4,
     start: Annotated[
         str, typer.Option(metavar="FILE", help="Policy (.safetensors) whose weights the network begins with.")
     ] = "",
