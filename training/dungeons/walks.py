@@ -33,7 +33,17 @@ from slam.grids.occupancy import UNKNOWN
 from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.world import CELL_M, Dungeon, scan
 
-__all__ = ["BLIND_REACH", "LUCK", "MOST", "REACH", "LearnedDriver", "Stop", "TourDriver", "Walk", "rest_of_the_tour"]
+__all__ = [
+    "BLIND_REACH",
+    "LUCK",
+    "MOST",
+    "REACH",
+    "LearnedDriver",
+    "Stop",
+    "TourDriver",
+    "Walk",
+    "rest_of_the_tour",
+]
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
