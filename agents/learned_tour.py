@@ -14,14 +14,12 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Goal
 from agents.learned.policy_files import read_policy
-from agents.learned.station_network import StationNetwork, outside, picture, pixels, with_walls
+from agents.learned.station_network import StationEnsemble, outside, picture, pixels, with_walls
 from agents.stations.stop import StationStop
 from agents.stations.survey import Openings, options
 from agents.tour import Tour, TourConfig
 from agents.ways.routing import draw_luck
-from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
 from slam.settings import Few, NotNegative, Within, require
 
@@ -53,9 +51,9 @@ class LearnedTourConfig(TourConfig):
         )
 
 
-def load_station_policy(path: Path) -> tuple[StationNetwork, dict[str, Any]]:
-    """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
-    return read_policy(path, FORMAT, lambda weights, _: StationNetwork(weights))
+def load_station_policy(path: Path) -> tuple[StationEnsemble, dict[str, Any]]:
+    """Read a policy: its networks, and what the JSON file says of its training; see :func:`read_policy`."""
+    return read_policy(path, FORMAT, lambda weights, _: StationEnsemble(weights))
 
 
 class LearnedTour(Tour):
@@ -86,18 +84,12 @@ class LearnedTour(Tour):
         self._known_cells = 0
         self._decided_at: set[tuple[int, int]] = set()  # stations, since anything new was seen
 
-    def choose(self, belief: Belief) -> Goal | None:
-        """Return the station to go to next, or where the tour goes where there are no stations worth a visit."""
-        stop = self._stop(belief)
-        if stop is None:
-            return super().choose(belief)
+    def _station(self, stop: StationStop) -> int:
         openings = options(stop.found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
         best = 0
         if len(openings.targets) > 1 and self._is_news(stop):
             best = int(np.argmin(self._costs_m(stop, openings)))
-        self._frontiers = stop.frontiers()
-        self._status = "driving"
-        return stop.goal(int(openings.targets[best]), belief)
+        return int(openings.targets[best])
 
     def _costs_m(self, stop: StationStop, openings: Openings) -> NDArray[np.float64]:
         shown = picture(stop.known, stop.visited, stop.first, stop.resolution, stop.found)

@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.stations.stop import StationAgent, StationsConfig
+from agents.stations.stop import StationAgent, StationsConfig, StationStop
 from slam.belief import Belief
 from slam.settings import NotNegative
 
@@ -37,13 +37,11 @@ class NearestFrontier(StationAgent, Explorer):
     config_type = NearestFrontierConfig
 
     def choose(self, belief: Belief) -> Goal | None:
-        """Return where to go next: a station, where the robot stands on one."""
-        stop = self._stop(belief)
-        if stop is None:
-            return super().choose(belief)
-        self._frontiers = stop.frontiers()
-        self._status = "driving"
-        return stop.goal(int(np.argmin(np.where(stop.found.worth, stop.found.way, math.inf))), belief)
+        """Return where to go next: a station, where the robot stands on one and there is something to see."""
+        return self._hop(belief) or super().choose(belief)
+
+    def _station(self, stop: StationStop) -> int:
+        return int(np.argmin(np.where(stop.found.worth, stop.found.way, math.inf)))
 
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the cheapest, unless the present one costs hardly more."""

@@ -7,21 +7,20 @@ the first leg is carried out.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
-from agents.stations.lattice import in_sight, join, ways
-from agents.stations.stop import StationAgent, StationsConfig
+from agents.stations.lattice import in_sight
+from agents.stations.stop import StationAgent, StationsConfig, StationStop
+from agents.stations.survey import begin
 from agents.view_points.gain import expected_area
-from agents.ways.cost_map import CostMap
 from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from slam.belief import Belief
-from slam.grids.occupancy import FREE
 from slam.settings import Few, Gap, NotNegative
 from slam.types import Array
 
@@ -88,13 +87,19 @@ class Tour(StationAgent, Explorer):
     config_type = TourConfig
     _index = 0  # of the piece that the tour begins with
 
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return where to go next: a station, where the robot stands on one and there is something to see."""
+        return self._hop(belief) or super().choose(belief)
+
+    def _station(self, stop: StationStop) -> int:
+        return begin(stop.found, draw_luck(self.config.tries, len(stop.found.places)))
+
     def pick(self, candidates: Candidates, belief: Belief) -> int:
         """Return the piece of frontier that the tour begins with."""
         return self._index
 
     def _costs_asked(self) -> int | None:
-        # Those that the tour is over; stations ask for ways to all of them.
-        return self.config.places if self.config.stations.spacing_m == 0 else None
+        return self.config.places  # those that the tour is over
 
     def _candidates(self, belief: Belief) -> Candidates:
         """Return the candidates, the first place of the tour put in as the view point of what is picked."""
@@ -105,8 +110,6 @@ class Tour(StationAgent, Explorer):
         if not len(open_):
             return found
         self._index = int(open_[np.argmin(found.costs[open_])])
-        if self.config.stations.spacing_m > 0:
-            return self._by_stations(found, open_)
         self._index = self._by_views(found, open_)
         return found
 
@@ -151,56 +154,3 @@ class Tour(StationAgent, Explorer):
         )
         area[0] = 0.0
         return np.asarray(self.config.hurry * area / max(float(area.mean()), 1e-9))
-
-    # ---- hopping over stations -----------------------------------------------------------------------------
-
-    def _by_stations(self, found: Candidates, pieces: Cells) -> Candidates:
-        """Return the candidates with the tour's first station as the view point of a piece seen from there."""
-        config, cost_map = self.config.stations, found.cost_map
-        cells, joined, here = _stations(cost_map, config, self._began_at)
-        if here < 0:
-            return found
-        targets = cost_map.to_cells(found.frontiers.targets[pieces])
-        sight = in_sight(cost_map.classes, cells, targets, config.reach_m / cost_map.resolution)
-        lengths, _ = ways(cells, joined, here)
-        reached = np.isfinite(lengths) & np.isfinite(found.travel.cost[tuple(cells.T)])
-        reached[here] = False
-        reached &= ~self._looked_from(cost_map, cells)
-        useful = np.flatnonzero(reached & sight.any(axis=1))
-        if not len(useful):
-            return found
-        places = np.concatenate([[here], useful])
-        distance = np.array([ways(cells, joined, int(i))[0][places] for i in places]) * cost_map.resolution
-        seen = sight[places]
-        seen[0] = False
-        order, _ = best_tour(seen, distance, np.zeros(len(places)), draw_luck(self.config.tries, len(places)))
-        first = order[1]
-        away = np.hypot(*(targets - cells[places[first]]).T)
-        away[~seen[first]] = np.inf
-        self._index = int(pieces[np.argmin(away)])
-        views, costs = found.cells.copy(), found.costs.copy()
-        views[self._index] = cells[places[first]]
-        costs[self._index] = found.travel.cost[tuple(views[self._index])]
-        return replace(found, cells=views, costs=costs)
-
-    def _looked_from(self, cost_map: CostMap, cells: Cells) -> NDArray[np.bool_]:
-        """Return from which stations ``(n,)`` the sensor looked already: what is left was not seen from there."""
-        looked = np.zeros(cost_map.classes.shape, dtype=np.bool_)
-        looked[tuple(cost_map.to_cells(self._track.poses[:, :2]).T)] = True
-        return np.asarray(looked[tuple(cells.T)])
-
-
-def _stations(cost_map: CostMap, config: StationsConfig, start: Array) -> tuple[Cells, Cells, int]:
-    """Return the stations known to be free ``(n, 2)``, which hops join them, and the robot's own, −1 off them."""
-    stride = max(1, round(config.spacing_m / cost_map.resolution))
-    corner = [round(v / cost_map.resolution) for v in cost_map.origin[::-1]]  # lattice row, column of cell (0, 0)
-    first = [
-        (math.floor(v / cost_map.resolution) - low) % stride for v, low in zip(start[::-1], corner, strict=True)
-    ]
-    picked = cost_map.classes[first[0] :: stride, first[1] :: stride] == FREE
-    places = np.argwhere(picked)
-    index = np.full(picked.shape, -1, dtype=np.int64)
-    index[picked] = np.arange(len(places))
-    cells = places * stride + np.array(first)
-    at = np.flatnonzero((cells == np.asarray(cost_map.start)).all(axis=1))
-    return cells, join(cost_map.classes, cells, places, index, config.hop), int(at[0]) if len(at) else -1

@@ -7,12 +7,14 @@ is in ``training/dungeons/networks.py``.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from agents.learned.choice_network import apart
 from agents.learned.layers import Layers
 from agents.stations.survey import STRIDE, Openings, Survey
 from slam.grids.occupancy import FREE, UNKNOWN
@@ -22,6 +24,7 @@ __all__ = [
     "PLANES",
     "SIDE",
     "Picture",
+    "StationEnsemble",
     "StationNetwork",
     "opening_numbers",
     "outside",
@@ -172,6 +175,28 @@ class StationNetwork(Layers):
         skip = self._convolved(f"{name}.skip", x) if f"{name}.skip.weight" in self._weights else x
         inner = np.maximum(self._convolved(f"{name}.first", x), 0.0)
         return np.asarray(np.maximum(skip + self._convolved(f"{name}.second", inner), 0.0))
+
+
+class StationEnsemble:
+    """Several networks, and the mean of what they say of each opening.
+
+    Parameters
+    ----------
+    weights : mapping
+        As :func:`agents.learned.choice_network.joined` makes it; or those of a single network.
+
+    Raises
+    ------
+    ValueError
+        Where a weight is missing or does not fit the others.
+    """
+
+    def __init__(self, weights: Mapping[str, NDArray[Any]]) -> None:
+        self.members = [StationNetwork(own) for own in apart(weights)]
+
+    def costs_m(self, shown: Picture, targets: Cells, hops: Cells, openings: Openings) -> Array:
+        """Return what each opening ``(c,)`` is expected to cost [m]; see :meth:`StationNetwork.costs_m`."""
+        return np.asarray(np.mean([m.costs_m(shown, targets, hops, openings) for m in self.members], axis=0))
 
 
 def _halved(x: Floats) -> Floats:

@@ -6,15 +6,17 @@ Shared by the agents that choose among stations with :mod:`agents.stations.surve
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
+from agents.stations.sensor import SENSORS, rays
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import Config, Few, Gap, Length
+from slam.settings import Config, Few, Gap, Length, OneOf
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
@@ -29,6 +31,7 @@ class StationsConfig(Config):
     spacing_m: Gap = 0.0  # between stations, through the start; 0: there are none
     hop: Few = 2  # stations a hop goes at most along each axis
     reach_m: Length = 12.0  # from which a piece of frontier is looked at
+    sensor: Annotated[str, OneOf(SENSORS)] = SENSORS[0]  # that the robot looks with
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +80,18 @@ class StationAgent(Agent):
         super().looked(belief)
         self._looked_at += (np.array(belief.pose[:2], dtype=np.float64),)
 
+    def _hop(self, belief: Belief) -> Goal | None:
+        """Return the station to go to, ``None`` where the robot stands on none or there is nothing to see."""
+        stop = self._stop(belief)
+        if stop is None:
+            return None
+        self._frontiers, self._status = stop.frontiers(), "driving"
+        return stop.goal(self._station(stop), belief)
+
+    def _station(self, stop: StationStop) -> int:
+        """Return the station to go to, of those in ``stop.found.cells``."""
+        raise NotImplementedError
+
     def _stop(self, belief: Belief) -> StationStop | None:
         """Return what there is to do, ``None`` where there is nothing or the robot stands on no station.
 
@@ -98,7 +113,8 @@ class StationAgent(Agent):
                 visited[cell] = True
         pieces = no_pieces(known.shape)
         find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-        found = survey(known, pieces, visited, first, robot, resolution, stations.reach_m / resolution)
+        reach = stations.reach_m / resolution
+        found = survey(known, pieces, visited, first, robot, resolution, reach, rays(stations.sensor))
         return StationStop(known, visited, corner, first, robot, resolution, found) if found.worth.any() else None
 
 

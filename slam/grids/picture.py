@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import UNKNOWN, OccupancyGrid
+from slam.types import Array
 
 __all__ = ["draw_known"]
-
-Array = NDArray[np.float64]
 
 _LONGEST_PX, _MARGIN_CELLS = 480, 8
 _UNSEEN = 175  # its tone: free cells are lighter from their first scan on, occupied ones darker

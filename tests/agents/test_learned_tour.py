@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 import agents
-from agents.learned.station_network import PLANES, SIDE, outside, picture, pixels, with_walls
+from agents.learned.choice_network import apart
+from agents.learned.station_network import PLANES, SIDE, StationNetwork, outside, picture, pixels, with_walls
 from agents.learned_tour import SHIPPED, LearnedTour, load_station_policy
-from agents.stations.lattice import edges, join, lengths, ways
-from agents.stations.survey import STRIDE, find_pieces, first_hop, no_pieces, options, survey
+from agents.stations.lattice import edges, in_sight, join, lengths, ways
+from agents.stations.sensor import BLIND, SENSORS, look, rays
+from agents.stations.survey import (
+    STRIDE,
+    VOXEL,
+    Survey,
+    find_pieces,
+    first_hop,
+    no_pieces,
+    options,
+    survey,
+    tour,
+)
 from agents.ways.routing import draw_luck
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
@@ -40,7 +54,7 @@ def stop(known: np.ndarray, robot: tuple[int, int]):
     visited[robot] = True
     pieces = no_pieces(known.shape)
     find_pieces(known, pieces, np.array([0, known.shape[0] - 1, 0, known.shape[1] - 1]))
-    return survey(known, pieces, visited, robot, robot, CELL_M, 30.0), visited
+    return survey(known, pieces, visited, robot, robot, CELL_M, 30.0, rays(SENSORS[0])), visited
 
 
 def belief_of(known: np.ndarray, robot: tuple[int, int], start: tuple[int, int], pad: int = 0) -> Belief:
@@ -97,6 +111,28 @@ def test_pieces_are_the_same_whether_found_at_once_or_bit_by_bit():
     np.testing.assert_array_equal(whole, before)
 
 
+@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_counts_as_settled_is_settled_by_a_look(seed, sensor):
+    """Where all that is unknown is wall, each piece that counts, and is no near one in sight, is gone then."""
+    known, robot = rooms(seed), (65, 65)
+    visited = np.zeros(known.shape, np.bool_)
+    pieces = no_pieces(known.shape)
+    find_pieces(known, pieces, np.array([0, 129, 0, 129]))
+    blind, seeing = (
+        survey(known, pieces, visited, robot, robot, CELL_M, 30.0, rays_) for rays_ in (BLIND, rays(sensor))
+    )
+    np.testing.assert_array_equal(blind.worth, seeing.worth)
+    assert set(blind.places) <= set(seeing.places) and seeing.sight.sum() > blind.sight.sum()
+    near = in_sight(known, seeing.cells, seeing.pieces, 30.0)
+    for place, settles in list(zip(seeing.places.tolist(), seeing.sight, strict=True))[1:]:
+        shown, left = known.copy(), no_pieces(known.shape)
+        look(known == FREE, *seeing.cells[place].tolist(), rays(sensor), shown)
+        find_pieces(shown, left, np.array([0, 129, 0, 129]))
+        rows, cols = (seeing.pieces[settles & ~near[place]] // VOXEL).T
+        assert (left[rows, cols] < 0).all()
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_openings_begin_differently(seed):
     found, _ = stop(rooms(seed), (65, 65))
@@ -112,6 +148,52 @@ def test_openings_begin_differently(seed):
         assert leg == pytest.approx(found.way[target] * CELL_M)
     few = draw_luck(6, 2)  # fewer columns than places: drawn anew
     assert len(options(found, few, most=3, most_loss_m=40.0).targets) <= 3
+
+
+def to_do(seed: int) -> Survey:
+    """What there is to do for a robot among six places in a square of 30 m that settle nine pieces."""
+    rng = np.random.default_rng(seed)
+    at = rng.uniform(0.0, 30.0, (7, 2))
+    seen = rng.random((6, 9)) < 0.5
+    sight = np.vstack([np.zeros(9, np.bool_), seen & (rng.random((6, 9)) < 0.8)])
+    seen &= sight.any(axis=0)  # any piece can be settled
+    distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
+    own = np.arange(7)
+    return Survey(
+        np.zeros((7, 2), np.int64), own, distance[0], own > 0, own, np.zeros((9, 2), np.int64), seen, own, sight,
+        distance,
+    )  # fmt: skip
+
+
+def shortest(found: Survey, first: int | None = None) -> float:
+    """The shortest order of places, by trying all, after which no station sees two pieces that are not settled."""
+    best = math.inf
+    for count in range(7):
+        for order in itertools.permutations(range(1, 7), count):
+            left = ~found.sight[list(order)].any(axis=0)
+            if (found.seen[:, left].sum(axis=1) < 2).all() and (first is None or order[:1] == (first,)):
+                best = min(best, sum(found.distance[a, b] for a, b in itertools.pairwise((0, *order))))
+    return best
+
+
+def test_a_tour_leaves_nothing_worth_a_visit_and_is_not_much_longer_than_the_shortest():
+    shares, begun = [], []
+    for seed in range(12):
+        found = to_do(seed)
+        if shortest(found) == 0.0:
+            continue
+        order = tour(found, LUCK)
+        left = ~found.sight[order].any(axis=0)
+        assert order[0] == 0 and len(set(order.tolist())) == len(order)
+        assert (found.seen[:, left].sum(axis=1) < 2).all()
+        cost = sum(found.distance[a, b] for a, b in itertools.pairwise(order))
+        shares.append(cost / shortest(found))
+        openings = options(found._replace(before=np.zeros(7, np.int64)), LUCK, most=6, most_loss_m=1e3)
+        assert openings.targets[0] == order[1]
+        for target, loss in zip(openings.targets, openings.losses, strict=True):
+            begun.append((cost + loss) / shortest(found, int(target)))
+    assert min(shares + begun) > 1.0 - 1e-9
+    assert np.mean(shares) < 1.25 and np.mean(begun) < 1.25
 
 
 # ---- what the network is shown ---------------------------------------------------------------------------------
@@ -298,15 +380,27 @@ def test_its_policy_comes_with_where_it_is_from():
     assert costs.shape == openings.losses.shape and np.isfinite(costs).all() and math.isfinite(costs.std())
 
 
-def test_a_policy_is_named_by_its_file_and_a_damaged_one_refused(tmp_path):
-    from safetensors.numpy import load_file, save_file
+def test_several_networks_say_the_mean_of_what_each_says():
+    ensemble, _ = load_station_policy(SHIPPED)
+    weights = load_file(SHIPPED)
+    assert len(ensemble.members) == 2
+    known, robot = rooms(1), (65, 65)
+    found, visited = stop(known, robot)
+    openings = options(found, LUCK, most=5, most_loss_m=40.0)
+    shown = picture(known, visited, robot, CELL_M, found)
+    targets, hops = (pixels(found.cells[at], robot, shown) for at in (openings.targets, openings.hops))
+    alone = [StationNetwork(own).costs_m(shown, targets, hops, openings) for own in apart(weights)]
+    np.testing.assert_allclose(ensemble.costs_m(shown, targets, hops, openings), np.mean(alone, axis=0))
+    assert np.abs(alone[0] - alone[1]).max() > 0.1
 
+
+def test_a_policy_is_named_by_its_file_and_a_damaged_one_refused(tmp_path):
     weights = load_file(SHIPPED)
     path = tmp_path / "mine.safetensors"
     save_file(weights, path)
     path.with_suffix(".json").write_text(SHIPPED.with_suffix(".json").read_text())
     assert isinstance(agents.make(str(path)), LearnedTour)
-    weights.pop("up_1.first.bias")
+    weights.pop("members.1.up_1.first.bias")
     save_file(weights, path)
     with pytest.raises(ValueError, match=r"mine.*up_1\.first\.bias"):
         agents.make("learned-tour", config={"policy": str(path)})

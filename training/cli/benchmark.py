@@ -57,6 +57,10 @@ def benchmark(
     scan: Annotated[
         str, typer.Option(help="How that protocol looks around: way-points or continuous.")
     ] = "way-points",
+    sensor: Annotated[
+        str,
+        typer.Option(help="What that protocol's rays show: public (as in its code) or wide (cells beside, too)."),
+    ] = "public",
     max_steps: opt.MaxSteps = None,
     workers: opt.Workers = None,
     ray: opt.Ray = None,
@@ -103,7 +107,7 @@ def benchmark(
         names = [part.strip() for part in agents.split(",") if part.strip()]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan)
+        summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan, sensor=sensor)
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task

@@ -18,37 +18,39 @@ from numpy.typing import NDArray
 from agents.stations.lattice import ways
 from agents.ways.routing import best_tour, draw_luck
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from training.dungeons.world import CELL_M, Dungeon, Lattice, frontier_points, scan
+from training.dungeons.world import CELL_M, SENSORS, Dungeon, Lattice, frontier_points, scan
 
 __all__ = ["BOUNDS", "known_map_path", "known_walls_path"]
 
 _SQUARE = 4  # cells: all of a square is taken for seen where its middle is
 
 
-def known_map_path(dungeon: Dungeon, *, tries: int = 5) -> float:
+def known_map_path(dungeon: Dungeon, sensor: str = SENSORS[0], *, tries: int = 5) -> float:
     """Return the length [m] of a tour that sees the whole map from its start, 0 where one look is enough.
 
     Parameters
     ----------
     dungeon
         The map.
+    sensor
+        Of :data:`SENSORS`.
     tries
         Choices of way-points that the shortest tour is taken from.
     """
-    return _shortest(dungeon, lambda lattice, reached: _sight(dungeon, lattice.cells[reached]), tries)
+    return _shortest(dungeon, lambda lattice, reached: _sight(dungeon, lattice.cells[reached], sensor), tries)
 
 
-def known_walls_path(dungeon: Dungeon, *, tries: int = 5) -> float:
+def known_walls_path(dungeon: Dungeon, sensor: str = SENSORS[0], *, tries: int = 5) -> float:
     """Return the length [m] of a tour that sees all walls from within 16 m, 0 where one look is enough.
 
-    Arguments are those of :func:`known_map_path`.
+    Arguments are those of :func:`known_map_path`; with all sensors it is the same.
     """
     walls = np.where(dungeon.free, FREE, UNKNOWN).astype(np.int8)  # pieces of wall are found as frontier is
     points = frontier_points(walls)
     return _shortest(dungeon, lambda lattice, reached: lattice.sight(points, lattice.cells[reached]), tries)
 
 
-BOUNDS: dict[str, Callable[[Dungeon], float]] = {"known-map": known_map_path, "known-walls": known_walls_path}
+BOUNDS: dict[str, Callable[[Dungeon, str], float]] = {"known-map": known_map_path, "known-walls": known_walls_path}
 """What stands among the agents' names for each."""
 
 
@@ -72,7 +74,7 @@ def _shortest(
     return float(cost)
 
 
-def _sight(dungeon: Dungeon, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _sight(dungeon: Dungeon, cells: NDArray[np.int64], sensor: str) -> NDArray[np.bool_]:
     """Return which free squares' middles each way-point's scan sees ``(n, m)``."""
     middle = np.zeros(dungeon.free.shape, dtype=np.bool_)
     middle[_SQUARE // 2 :: _SQUARE, _SQUARE // 2 :: _SQUARE] = True
@@ -80,6 +82,6 @@ def _sight(dungeon: Dungeon, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
     sight = np.zeros((len(cells), len(points)), dtype=np.bool_)
     for i, (row, col) in enumerate(cells):
         seen = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
-        scan(dungeon.free, int(row), int(col), seen)
+        scan(dungeon.free, int(row), int(col), seen, sensor)
         sight[i] = seen[tuple(points.T)] == FREE
     return sight

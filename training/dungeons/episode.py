@@ -22,7 +22,7 @@ from agents.stations.lattice import line_is_free
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN, OccupancyGrid
-from training.dungeons.world import CELL_M, HOP, RANGE_M, STRIDE, Dungeon, Lattice, scan
+from training.dungeons.world import CELL_M, HOP, RANGE_M, SENSORS, STRIDE, Dungeon, Lattice, scan
 
 __all__ = ["NEAREST", "NEAREST_VIEW", "SCANS", "explore", "make_agent"]
 
@@ -74,7 +74,7 @@ _SETTINGS: dict[str, Any] = {
 }
 
 
-def make_agent(name: str, extent_m: tuple[float, float] | None = None) -> Agent:
+def make_agent(name: str, extent_m: tuple[float, float] | None = None, *, sensor: str = SENSORS[0]) -> Agent:
     """Return an agent set up for this world, with as much of the setting as its configuration has.
 
     ``extent_m`` is how far the map reaches along x and y from the frame's origin.
@@ -84,12 +84,16 @@ def make_agent(name: str, extent_m: tuple[float, float] | None = None) -> Agent:
     config = getattr(agents.make(name), "config", None)
     known = {f.name for f in fields(config)} if is_dataclass(config) else set()
     settings = {key: value for key, value in _SETTINGS.items() if key in known and (told or key != "stations")}
+    if "stations" in settings:
+        settings["stations"] = settings["stations"] | {"sensor": sensor}
     if extent_m is not None and "extent" in known:
         settings["extent"] = (0.0, 0.0, *extent_m)
     return agents.make(name, config=settings or None, robot=_ROBOT, lidar=_LIDAR)
 
 
-def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0) -> dict[str, Any]:
+def explore(
+    dungeon: Dungeon, name: str, *, scan: str = SCANS[0], sensor: str = SENSORS[0], seed: int = 0
+) -> dict[str, Any]:
     """Run one agent on one map; return what became of it.
 
     Returns
@@ -100,9 +104,9 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
         off before, ``stuck`` (a goal that no way-point serves) or ``hop limit``; ``path_to_250_m`` the path until
         at most 250 free cells were unseen, ``None`` where it never came to that.
     """
-    run = _Run(dungeon, continuous=scan == "continuous")
+    run = _Run(dungeon, continuous=scan == "continuous", sensor=sensor)
     rows, cols = dungeon.free.shape
-    agent = None if name == NEAREST else make_agent(name, (cols * CELL_M, rows * CELL_M))
+    agent = None if name == NEAREST else make_agent(name, (cols * CELL_M, rows * CELL_M), sensor=sensor)
     if agent is not None:
         agent.reset(run.belief(), seed)
     decisions: list[float] = []
@@ -145,8 +149,8 @@ def explore(dungeon: Dungeon, name: str, *, scan: str = SCANS[0], seed: int = 0)
 class _Run:
     """The robot on its way: where it is, what is known, how far it has come."""
 
-    def __init__(self, dungeon: Dungeon, *, continuous: bool) -> None:
-        self._dungeon, self._continuous = dungeon, continuous
+    def __init__(self, dungeon: Dungeon, *, continuous: bool, sensor: str) -> None:
+        self._dungeon, self._continuous, self._sensor = dungeon, continuous, sensor
         self.known: NDArray[np.int8] = np.full(dungeon.free.shape, UNKNOWN, dtype=np.int8)
         self._visited = np.zeros(dungeon.free.shape, dtype=np.bool_)
         self._cell = dungeon.start
@@ -156,7 +160,7 @@ class _Run:
         self._scan()
 
     def _scan(self) -> None:
-        scan(self._dungeon.free, *self._cell, self.known)
+        scan(self._dungeon.free, *self._cell, self.known, self._sensor)
 
     def look(self) -> None:
         """Take stock of what is known now."""

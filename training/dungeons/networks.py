@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import cast
 
 import torch
+from safetensors.numpy import load
 from torch import Tensor, nn
 
+from agents.learned.choice_network import apart
 from agents.learned.station_network import PLANES
 
-__all__ = ["StationNetwork"]
+__all__ = ["StationNetwork", "read_network"]
 
 _WIDTHS = 24, 40, 56  # channels at 4, 8, and 16 and 32 m a pixel
 _OUT = 32
@@ -70,6 +72,17 @@ class StationNetwork(nn.Module):
         rows = torch.relu(self.score_2(torch.relu(self.score_1(rows))))
         score = self.loss_share * numbers[..., 0] + 0.5 * self.score_3(rows)[..., 0]
         return cast("Tensor", score), cast("Tensor", self.free(y0))
+
+
+def read_network(weights: bytes) -> StationNetwork:
+    """Return the network of a file of weights, the first of several.
+
+    What only training needs is not in it, and is drawn at random.
+    """
+    network = StationNetwork()
+    first, *_ = apart(load(weights))
+    network.load_state_dict({name: torch.tensor(value).float() for name, value in first.items()}, strict=False)
+    return network
 
 
 def _halved(x: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from slam.formats import atomic_write
 from slam.settings import unknown_name
 from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
-from training.dungeons.world import Dungeon, layout, load
+from training.dungeons.world import SENSORS, Dungeon, layout, load
 from training.figures.tables import csv_table, markdown_table, number
 from training.runs.campaign import Workers, installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
@@ -32,7 +32,7 @@ from training.runs.rows import resume
 __all__ = ["PUBLISHED", "run_dungeons", "summarise", "table"]
 
 Row = dict[str, Any]
-_Job = tuple[str, str, str]  # agent; digest of the map's file: another map of the same name is another; scan
+_Job = tuple[str, str, str, str]  # agent; digest of the map's file (its name says nothing); scan; sensor
 
 BASELINE = "nearest-frontier"
 """The agent that the others' ratios are taken to: the published rule, as far as it is known."""
@@ -61,8 +61,9 @@ _RESAMPLES = 10_000
 
 
 def run_dungeons(
-    maps: Path, agent_names: Sequence[str], *, out: Path, workers: Workers = 1, scan: str = "way-points"
-) -> dict[str, Any]:
+    maps: Path, agent_names: Sequence[str], *, out: Path, workers: Workers = 1, scan: str = SCANS[0],
+    sensor: str = SENSORS[0],
+) -> dict[str, Any]:  # fmt: skip
     """Run every agent on every map that ``out`` does not hold yet, and return the summary of all asked for.
 
     Raises
@@ -73,18 +74,19 @@ def run_dungeons(
     with bad_input():
         for name in agent_names:
             agents.check(name, NEAREST, NEAREST_VIEW, *BOUNDS)
-    if scan not in SCANS:
-        raise BadInput(str(unknown_name("--scan", scan, SCANS)))
+    for option, given, valid in (("--scan", scan, SCANS), ("--sensor", sensor, SENSORS)):
+        if given not in valid:
+            raise BadInput(str(unknown_name(option, given, valid)))
     paths = _maps(maps)
     if (out / _STORE).exists() and (out / _STORE).read_text("utf-8").startswith("{"):
         raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
     # A map that cannot be used is found before any work is lost.
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
-    settings = {"protocol": "dungeons", "scan": scan, "version": installed_version()}
+    settings = {"protocol": "dungeons", "sensor": sensor, "scan": scan, "version": installed_version()}
     keep_settings(out, settings, [_STORE, _CSV, _SUMMARY])
     files = {digests[path]: path for path in paths}
-    asked = [(path, (name, digests[path], scan)) for path in paths for name in dict.fromkeys(agent_names)]
+    asked = [(path, (name, digests[path], scan, sensor)) for path in paths for name in dict.fromkeys(agent_names)]
     done = resume(out / _STORE, [job for _, job in asked], partial(_run, files), workers=workers, what="episodes")
     rows = [done[job] | {"map": path.stem, "layout": layouts[path]} for path, job in asked]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
@@ -185,16 +187,16 @@ def _maps(folder: Path) -> list[Path]:
 
 
 def _run(files: Mapping[str, Path], job: _Job) -> Row:
-    agent, digest, scan = job
+    agent, digest, scan, sensor = job
     dungeon = load(files[digest])
-    return _bound(dungeon, agent) if agent in BOUNDS else explore(dungeon, agent, scan=scan)
+    return _bound(dungeon, agent, sensor) if agent in BOUNDS else explore(dungeon, agent, scan=scan, sensor=sensor)
 
 
-def _bound(dungeon: Dungeon, name: str) -> Row:
+def _bound(dungeon: Dungeon, name: str, sensor: str) -> Row:
     return dict.fromkeys(_COLUMNS) | {
         "agent": name,
         "map": dungeon.name,
-        "path_m": BOUNDS[name](dungeon),
+        "path_m": BOUNDS[name](dungeon, sensor),
         "coverage": 1.0,
         "unseen_cells": 0,
         "end": "covered",

@@ -23,23 +23,25 @@ import typer
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from agents.learned.choice_network import joined
 from agents.learned.policy_files import write_policy
 from agents.learned.station_network import PLANES, opening_numbers, with_walls
-from agents.learned_tour import FORMAT
+from agents.learned_tour import FORMAT, load_station_policy
 from slam.formats import replacing
 from slam.settings import Config, Few, NotNegative, PositiveShare, Seed, Share, Within
 from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
-from training.dungeons.networks import StationNetwork
+from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.plans import dungeon_plan
 from training.runs.campaign import Workers, installed_version, keep_settings
+from training.runs.errors import bad_input
 from training.runs.options import Ray, workers_of
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
 Floats = NDArray[np.float32]
 
-_CHECKPOINT, _WEIGHTS = "checkpoint.pt", "learned-tour.safetensors"
+_CHECKPOINT, _WEIGHTS = "checkpoint-{}.pt", "learned-tour.safetensors"
 _SCORE_M = 20.0
 _VALIDATION = 1000  # seed of the first plan that is validated on
 
@@ -59,6 +61,9 @@ class TrainingConfig(Config):
     weight_decay: Share = 1e-2
     untold: Share = 0.125  # share of the lessons that do not tell how far the plan extends
     free_weight: NotNegative = 0.3  # of foreseeing what is free, besides what openings cost
+    members: Few = 1  # networks that are trained apart on the same lessons, and asked together
+    trust: NotNegative = 0.4  # more of what an opening loses by the tour's own count than was learned
+    start: str = ""  # policy whose weights the first network begins with; none: drawn at random
     seed: Seed = 0
 
 
@@ -155,8 +160,10 @@ def regret_m(network: StationNetwork, lessons: Lessons) -> tuple[float, float]:
     return float(longer.mean()), float(longer.std() / math.sqrt(len(longer)))
 
 
-def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNetwork, list[dict[str, float]]]:
-    """Train on the lessons of all rounds up to one; return the network and its curve.
+def train(
+    out: Path, config: TrainingConfig, number: int = 1, member: int = 0
+) -> tuple[StationNetwork, list[dict[str, float]]]:
+    """Train a network on the lessons of all rounds up to one; return it and its curve.
 
     A run that was broken off goes on from its last whole epoch. What is validated on is the last round's.
     """
@@ -164,16 +171,19 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
     lessons = read_lessons(*((_round(out, k) / "lessons", _seeds(config, k)) for k in rounds))
     out = _round(out, number)
     unseen = read_lessons((out / "lessons", _unseen(config)))
-    torch.manual_seed(config.seed)
+    seed, checkpoint = config.seed + member, out / _CHECKPOINT.format(member)
+    torch.manual_seed(seed)
     network = StationNetwork()
+    if config.start and number == 1 and member == 0:
+        network = read_network(Path(config.start).read_bytes())
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
-    curve = _resume(out / _CHECKPOINT, network, optimiser)
+    curve = _resume(checkpoint, network, optimiser)
     batches = len(lessons.planes) // config.batch
     for epoch in range(len(curve), config.epochs):
         begun = time.monotonic()
         # Drawn anew from the epoch's number: a run that goes on draws what it would have drawn.
-        rng = np.random.default_rng([config.seed, epoch])
+        rng = np.random.default_rng([seed, epoch])
         order = rng.permutation(len(lessons.planes))
         sums = np.zeros(2)
         for k in range(batches):
@@ -195,7 +205,7 @@ def train(out: Path, config: TrainingConfig, number: int = 1) -> tuple[StationNe
             "validation_regret_m": regret, "validation_regret_se_m": error, "wall_s": time.monotonic() - begun,
         }  # fmt: skip
         curve.append({key: round(value, 5) for key, value in point.items()})
-        _keep(out / _CHECKPOINT, network, optimiser, curve)
+        _keep(checkpoint, network, optimiser, curve)
         print(", ".join(f"{key} {value}" for key, value in curve[-1].items()), file=sys.stderr, flush=True)
     return network, curve
 
@@ -253,14 +263,25 @@ def study(
         float, typer.Option(min=0, max=1, help="Share of lessons that do not tell how far the plan extends.")
     ] = 0.125,
     free_weight: Annotated[float, typer.Option(min=0, max=1e6, help="Of foreseeing what is free.")] = 0.3,
+    members: Annotated[int, typer.Option(min=1, max=1000, help="Networks that are asked together.")] = 1,
+    trust: Annotated[
+        float, typer.Option(min=0, max=1e6, help="In the tour's own count, over what was learned of it.")
+    ] = 0.4,
+    start: Annotated[
+        str, typer.Option(metavar="FILE", help="Policy (.safetensors) whose weights the network begins with.")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
     workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes that gather lessons.")] = 1,
     ray: Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""
+    if start:
+        with bad_input():
+            load_station_policy(Path(start))
     config = TrainingConfig(
         rounds=rounds, plans=plans, later_plans=later_plans, validation_plans=validation_plans, epochs=epochs,
-        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, seed=seed,
+        batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, members=members,
+        trust=trust, start=start, seed=seed,
     )  # fmt: skip
     run(out, config, workers=workers_of(workers, ray))
     print(out / _WEIGHTS)
@@ -276,19 +297,25 @@ def run(out: Path, config: TrainingConfig, *, workers: Workers) -> None:
         folder = _round(out, number)
         for seeds in (_seeds(config, number), _unseen(config)):
             gather(folder / "lessons", seeds, policy=policy, workers=workers)
-        network, curve = train(out, config, number)
-        curves.append(curve)
-        weights = {name: v.numpy() for name, v in network.state_dict().items() if not name.startswith("free.")}
+        trained = [train(out, config, number, member) for member in range(config.members)]
+        curves += [curve for _, curve in trained]
+        weights = [_kept(network, config.trust) for network, _ in trained]
         policy, about = folder / _WEIGHTS, _about(config, curves)
-        write_policy(policy, weights, about)
-    write_policy(out / _WEIGHTS, weights, about)
+        write_policy(policy, weights[0], about)  # drives the next round
+    write_policy(out / _WEIGHTS, joined(weights), about)
     # What counts is whole episodes: what a single choice gains, as lessons have it, says little of them.
     plans = [dungeon_plan(seed) for seed in _unseen(config)]
     about["validation_path_m"] = {
         name: round(statistics.fmean(float(explore(plan, agent)["path_m"]) for plan in plans), 2)
         for name, agent in (("tour", "tour"), ("learned-tour", str(out / _WEIGHTS)))
     }
-    write_policy(out / _WEIGHTS, weights, about)
+    write_policy(out / _WEIGHTS, joined(weights), about)
+
+
+def _kept(network: StationNetwork, trust: float) -> dict[str, NDArray[Any]]:
+    """Return the weights that are needed to choose, more of the tour's own count in them."""
+    weights = {name: v.numpy() for name, v in network.state_dict().items() if not name.startswith("free.")}
+    return weights | {"loss_share": weights["loss_share"] + trust}
 
 
 def _about(config: TrainingConfig, curves: list[list[dict[str, float]]]) -> dict[str, Any]:

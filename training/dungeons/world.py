@@ -1,32 +1,30 @@
 """The world of the dungeons protocol: a map with perfect poses, a noise-free sensor, and a lattice of way-points.
 
 What is modelled is what the published benchmark does (DARE, ICRA 2025, and the ARiADNE family before it): maps of
-0.2 m pixels pooled twofold, a ray every half degree that marks what it passes and the cells beside it, way-points
+0.2 m pixels pooled twofold, a ray every half degree that marks what it passes and the first wall, way-points
 every 4 m through the start, hops of up to two way-points along each axis over cells known to be free, and an end
 when no way-point sees two pieces of frontier any more.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from agents.stations.lattice import count_in_sight, in_sight, join, ways
+from agents.stations.sensor import SENSORS, look, rays
 from agents.stations.survey import HOP, STRIDE, VOXEL
 from mecanum_env.rooms.files.image_files import read_grey
-from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.grids.occupancy import FREE, UNKNOWN
 from training.runs.errors import BadInput, bad_input
 
 __all__ = [
-    "CELL_M", "HOP", "RANGE_M", "STRIDE", "TREE", "Dungeon", "Lattice", "dungeon_of", "frontier_points", "layout",
-    "load", "look", "scan",
+    "CELL_M", "HOP", "RANGE_M", "SENSORS", "STRIDE", "Dungeon", "Lattice", "dungeon_of", "frontier_points",
+    "layout", "load", "scan",
 ]  # fmt: skip
 
 CELL_M = 0.4
@@ -36,9 +34,7 @@ RANGE_M = 20.0
 
 _SEEN_FROM = 40.0  # cells: frontiers count as in sight of a way-point up to 16 m away
 _WORTH = 2  # of these make a way-point worth a visit
-_RAYS = 720
 _TILE_M = 5.0  # the benchmark's maps are made of such tiles
-_UNKNOWN = int(UNKNOWN)
 _WALL_BELOW, _START = 150, 208  # pixel values
 _MOST_PIXELS = 4000  # a side
 
@@ -82,13 +78,11 @@ def dungeon_of(pixels: NDArray[np.uint8], name: str) -> Dungeon:
     return Dungeon(name, pooled > _WALL_BELOW, (int(row), int(col)))
 
 
-def scan(free: NDArray[np.bool_], row: int, col: int, known: NDArray[np.int8]) -> NDArray[np.int64]:
-    """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell.
-
-    Returns ``(4,)`` the first and last row and column in which a cell became known; the last ones −1 where none
-    did.
-    """
-    return np.asarray(look(free, row, col, TREE, known))
+def scan(
+    free: NDArray[np.bool_], row: int, col: int, known: NDArray[np.int8], sensor: str = SENSORS[0]
+) -> NDArray[np.int64]:
+    """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell (:func:`look`)."""
+    return np.asarray(look(free, row, col, rays(sensor), known))
 
 
 class Lattice:
@@ -168,58 +162,3 @@ def frontier_points(known: NDArray[np.int8]) -> NDArray[np.int64]:
     order = np.lexsort((away, key))
     _, first = np.unique(key[order], return_index=True)
     return np.asarray(cells[order[first]])
-
-
-def _tree_of_rays() -> NDArray[np.int32]:
-    """Return the rays as one tree ``(n, 3)``, depth first: row and column from the sensor, and where to go on.
-
-    To go on where a wall hides all that is behind. Near the sensor many rays pass the same cells: a third is left.
-    """
-    reach = RANGE_M / CELL_M
-    root: dict[tuple[int, int], Any] = {}
-    for k in range(_RAYS):
-        angle = 2.0 * math.pi * k / _RAYS
-        dr, dc = math.floor(reach * math.sin(angle) + 0.5), math.floor(reach * math.cos(angle) + 0.5)
-        count = max(abs(dr), abs(dc))
-        node = root
-        for i in range(count):
-            share = i / count
-            node = node.setdefault((math.floor(share * dr + 0.5), math.floor(share * dc + 0.5)), {})
-    rows: list[list[int]] = []
-
-    def walk(node: dict[tuple[int, int], Any]) -> None:
-        for cell, behind in node.items():
-            own = [*cell, 0]
-            rows.append(own)
-            walk(behind)
-            own[2] = len(rows)
-
-    walk(root)
-    return np.array(rows, dtype=np.int32)
-
-
-TREE = _tree_of_rays()
-"""The sensor's rays, for :func:`look`."""
-
-
-@njit(cache=True, nogil=True)
-def look(
-    free: NDArray[np.bool_], row: int, col: int, tree: NDArray[np.int32], known: NDArray[np.int8]
-) -> NDArray[np.int64]:
-    """Compiled :func:`scan`, with the tree of rays."""
-    rows, cols = free.shape
-    box = np.array([rows, -1, cols, -1])
-    i = 0
-    while i < len(tree):
-        r, c = row + tree[i, 0], col + tree[i, 1]
-        if r < 0 or c < 0 or r >= rows or c >= cols or not free[r, c]:
-            i = tree[i, 2]
-            continue
-        i += 1
-        for rr in range(max(r - 1, 0), min(r + 2, rows)):
-            for cc in range(max(c - 1, 0), min(c + 2, cols)):
-                if known[rr, cc] == _UNKNOWN:
-                    known[rr, cc] = FREE if free[rr, cc] else OCCUPIED
-                    box[0], box[1] = min(box[0], rr), max(box[1], rr)
-                    box[2], box[3] = min(box[2], cc), max(box[3], cc)
-    return box

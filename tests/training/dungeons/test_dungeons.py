@@ -19,7 +19,7 @@ from training.dungeons.bound import known_map_path, known_walls_path
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, explore, make_agent
 from training.dungeons.plans import dungeon_plan
 from training.dungeons.protocol import run_dungeons, summarise, table
-from training.dungeons.world import Dungeon, Lattice, dungeon_of, frontier_points, layout, load, scan
+from training.dungeons.world import SENSORS, Dungeon, Lattice, dungeon_of, frontier_points, layout, load
 from training.runs.errors import BadInput
 
 WALL, OPEN, START = 127, 195, 208
@@ -79,31 +79,6 @@ def test_a_map_that_is_none_is_refused_in_one_line(what, tmp_path):
     assert "1" in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_scan_against_brute_force():
-    rng = np.random.default_rng(1)
-    free = np.zeros((120, 120), bool)
-    for _ in range(14):
-        row, col, rows, cols = (*rng.integers(2, 80, 2), *rng.integers(6, 36, 2))
-        free[row : row + rows, col : col + cols] = True
-    for row, col in rng.permutation(np.argwhere(free))[:5]:
-        known = np.full(free.shape, UNKNOWN, np.int8)
-        scan(free, int(row), int(col), known)
-        seen = np.zeros(free.shape, bool)
-        for k in range(720):
-            angle = math.radians(0.5 * k)
-            end = np.floor(50.0 * np.array([math.sin(angle), math.cos(angle)]) + 0.5).astype(int)
-            count = int(max(abs(end)))
-            for i in range(count):
-                r, c = np.floor(np.array([row, col]) + i / count * end + 0.5).astype(int)
-                if not (0 <= r < 120 and 0 <= c < 120) or not free[r, c]:
-                    break
-                seen[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] = True
-        np.testing.assert_array_equal(known != UNKNOWN, seen)
-        np.testing.assert_array_equal(known[seen] == FREE, free[seen])
-        away = np.argwhere(seen) - (row, col)
-        assert np.hypot(*away.T).max() <= 52.0
-
-
 def test_a_map_turned_or_mirrored_is_the_same_layout():
     plan, other = dungeon_plan(3), dungeon_plan(4)
     for free in (np.rot90(plan.free), plan.free[::-1], np.rot90(plan.free, 3)[:, ::-1], np.roll(plan.free, 1, 1)):
@@ -146,14 +121,18 @@ def test_frontiers_are_counted_by_squares():
 # ---- an episode ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("sensor", "hops"), [("wide", 9), ("public", 13)])
 @pytest.mark.parametrize("name", ["nearest-frontier", "tour", "learned-tour"])
-def test_a_corridor_is_as_long_as_it_is(name):
-    """The end, at 54.4 m from the start, comes into sight from 36 m: nine hops of 4 m."""
+def test_a_corridor_is_as_long_as_it_is(name, sensor, hops):
+    """The end, at 54.4 m from the start, comes into sight from 36 m: nine hops of 4 m.
+
+    Rays that graze the walls near the end hit every cell of them from the last way-point only: thirteen hops.
+    """
     dungeon = corridor(55.6)
-    row = explore(dungeon, name)
+    row = explore(dungeon, name, sensor=sensor)
     assert row["end"] == "covered" and row["unseen_cells"] == 0 and row["coverage"] == 1.0
-    assert row["path_m"] == pytest.approx(36.0) and row["hops"] == 9
-    again = explore(dungeon, name)
+    assert row["path_m"] == pytest.approx(4.0 * hops) and row["hops"] == hops
+    again = explore(dungeon, name, sensor=sensor)
     row.pop("decision_ms_median")
     again.pop("decision_ms_median")
     assert row == again
@@ -195,10 +174,19 @@ def test_bounds_see_what_they_say():
 
 def test_one_look_is_enough():
     dungeon = dungeon_of(hall(), "hall")
-    row = explore(dungeon, "nearest-frontier")
+    row = explore(dungeon, "nearest-frontier", sensor="wide")
     assert (row["path_m"], row["hops"], row["end"], row["path_to_250_m"]) == (0.0, 0, "covered", 0.0)
     assert row["decision_ms_median"] is None
     assert known_map_path(dungeon) == 0.0
+
+
+def test_a_sensor_that_shows_the_cells_beside_its_rays_needs_less_way():
+    plan = dungeon_plan(3)
+    public, wide = (explore(plan, "nearest-frontier", sensor=sensor) for sensor in SENSORS)
+    assert public == explore(plan, "nearest-frontier") | {"decision_ms_median": public["decision_ms_median"]}
+    assert public["end"] == wide["end"] == "covered" and wide["path_m"] < 0.95 * public["path_m"]
+    assert known_map_path(plan, "wide", tries=1) <= known_map_path(plan, tries=1) < public["path_m"]
+    assert make_agent("tour", sensor="wide").config.stations.sensor == "wide"
 
 
 def test_scanning_on_the_way_sees_no_less():
@@ -220,7 +208,7 @@ class Stubborn(Agent):
 
 
 def test_an_agent_that_gets_nowhere_is_stuck(monkeypatch):
-    monkeypatch.setattr(dungeon_episode, "make_agent", lambda name, extent_m: Stubborn())
+    monkeypatch.setattr(dungeon_episode, "make_agent", lambda name, extent_m, sensor: Stubborn())
     row = explore(corridor(95.6), "stubborn")
     assert row["end"] == "stuck" and 0 < row["hops"] < 20
 
@@ -274,8 +262,9 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
     bound = run_dungeons(maps, ["known-map", "nearest-frontier"], out=out)["agents"]["known-map"]
     assert bound["path_m_mean"] <= summary["agents"]["nearest-frontier"]["path_m_mean"] and bound["ratio"] <= 1.0
     # The same folder for another protocol is refused, and so is one whose rows an earlier version kept.
-    assert main([*arguments, "--scan", "continuous"]) == 2
-    assert "scan" in capsys.readouterr().err
+    for option, other in (("scan", "continuous"), ("sensor", "wide")):
+        assert main([*arguments, f"--{option}", other]) == 2
+        assert option in capsys.readouterr().err
     store.write_text(json.dumps(json.loads(rows[0])[1]) + "\n")
     assert main(arguments) == 2
     assert "earlier version" in capsys.readouterr().err
@@ -289,6 +278,7 @@ def test_runs_are_kept_and_gone_on_with(tmp_path, monkeypatch, capsys):
         ({"--maps": "nowhere"}, "--maps"),
         ({"--maps": "."}, "no PNG"),
         ({"--scan": "always"}, "way-points"),
+        ({"--sensor": "broad"}, "public"),
         ({"--workers": "0"}, "--workers"),
     ],
 )

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from agents.learned.station_network import SIDE, StationNetwork, opening_numbers, picture, pixels
-from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options
+from agents.stations.sensor import BLIND
+from agents.stations.survey import begin, find_pieces, first_hop, no_pieces, options, survey
 from slam.grids.occupancy import UNKNOWN
 from training.cli import main
 from training.dungeons import networks as dungeon_networks
@@ -18,8 +19,8 @@ from training.dungeons.episode import _Run
 from training.dungeons.lessons import gather, lessons_of, read_lessons
 from training.dungeons.plans import dungeon_plan, loops
 from training.dungeons.training import TrainingConfig, batch_of, train, turned
-from training.dungeons.walks import LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
-from training.dungeons.world import CELL_M, Lattice, frontier_points
+from training.dungeons.walks import BLIND_REACH, LUCK, MOST, REACH, LearnedDriver, TourDriver, Walk
+from training.dungeons.world import CELL_M, SENSORS, Lattice, frontier_points
 
 # ---- plans -----------------------------------------------------------------------------------------------------
 
@@ -45,7 +46,7 @@ def test_plans_are_like_the_published_maps():
 def test_a_walk_sees_and_counts_as_the_protocol_does():
     """Stations, ways, pieces and what is worth a visit, against the protocol's own count at every stop."""
     plan = dungeon_plan(4)
-    walk, run = Walk(plan), _Run(plan, continuous=False)
+    walk, run = Walk(plan), _Run(plan, continuous=False, sensor=SENSORS[0])
     for _ in range(12):
         run.look()
         found = walk.survey()
@@ -56,7 +57,7 @@ def test_a_walk_sees_and_counts_as_the_protocol_does():
         np.testing.assert_array_equal(found.worth, run.worth)
         np.testing.assert_allclose(found.way * CELL_M, run._length)
         np.testing.assert_array_equal(found.before, run._before)
-        target = int(found.places[begin(found, LUCK)])
+        target = begin(found, LUCK)
         hop = found.cells[first_hop(found.before, found.places[0], target)]
         walk.hop((int(hop[0]), int(hop[1])))
         run.hop_towards(target)
@@ -65,13 +66,20 @@ def test_a_walk_sees_and_counts_as_the_protocol_does():
 
 def test_the_rest_of_the_tour_is_what_the_tour_takes():
     walk = Walk(dungeon_plan(2))
-    found = walk.survey()
-    hop = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
-    (foreseen,) = TourDriver().finish([walk.after((int(hop[0]), int(hop[1])))])
-    assert walk.path_m == 0.0 and not walk.visited[tuple(hop)]
-    while (found := walk.survey()).worth.any():
-        cell = found.cells[first_hop(found.before, found.places[0], int(found.places[begin(found, LUCK[:2])]))]
-        walk.hop((int(cell[0]), int(cell[1])))
+    blind = dict(known=walk.known, pieces=walk.pieces, visited=walk.visited, first=walk.plan.start, cell_m=CELL_M)
+
+    def next_cell():
+        found = survey(robot=walk.cell, reach=BLIND_REACH, sensor=BLIND, **blind)
+        if not found.worth.any():
+            return None
+        hop = first_hop(found.before, found.places[0], begin(found, LUCK[:2]))
+        return int(found.cells[hop][0]), int(found.cells[hop][1])
+
+    hop = next_cell()
+    (foreseen,) = TourDriver().finish([walk.after(hop)])
+    assert walk.path_m == 0.0 and not walk.visited[hop]
+    while (cell := next_cell()) is not None:
+        walk.hop(cell)
     assert walk.path_m == pytest.approx(foreseen)
     assert (walk.plan.free & (walk.known == UNKNOWN)).sum() <= 25
 
@@ -218,6 +226,26 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
         np.testing.assert_array_equal(again.state_dict()[name], value, err_msg=name)
 
 
+def test_training_may_begin_with_a_policy_and_trusts_the_tour_more(run_folder, tmp_path):
+    from safetensors.numpy import load_file
+
+    from agents.learned.choice_network import apart
+    from agents.learned_tour import SHIPPED
+    from training.dungeons.training import _kept
+
+    (tmp_path / "round-1").mkdir()
+    (tmp_path / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
+    config = TrainingConfig(plans=2, validation_plans=1, epochs=1, batch=8, rate=1e-9, start=str(SHIPPED))
+    begun, _ = train(tmp_path, config)
+    first = apart(load_file(SHIPPED))[0]
+    kept = _kept(begun, 0.25)
+    assert kept.keys() == first.keys()
+    for name, value in first.items():
+        np.testing.assert_allclose(kept[name] - (0.25 if name == "loss_share" else 0.0), value, atol=1e-5)
+    other, _ = train(tmp_path, config, member=1)  # the others begin anew
+    assert np.abs(_kept(other, 0.0)["up_0.first.weight"] - first["up_0.first.weight"]).max() > 0.01
+
+
 def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys):
     import agents
     from training.dungeons.episode import explore
@@ -237,13 +265,13 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         "--validation-plans",
         "1",
     ]
-    arguments += ["--epochs", "1", "--batch", "8"]
+    arguments += ["--members", "2", "--epochs", "1", "--batch", "8"]
     assert main(arguments) == 0
     path = out / "learned-tour.safetensors"
     assert capsys.readouterr().out.strip() == str(path)
     about = json.loads(path.with_suffix(".json").read_text())
     assert about["config"]["plans"] == 2 and "--epochs=1" in about["command"]
-    assert [len(curve) for curve in about["curves"]] == [1, 1]
+    assert [len(curve) for curve in about["curves"]] == [1, 1, 1, 1]  # two rounds of two networks
     assert set(about["validation_path_m"]) == {"tour", "learned-tour"}
     first, second = ({p.name for p in (out / name / "lessons").iterdir()} for name in ("round-1", "round-2"))
     assert first == {*second, "000001.npz"}  # of the same plans, driven by what the first round learned
@@ -265,6 +293,8 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
         (["--later-plans", "1001"], "--later-plans"),
         (["--untold", "1.5"], "--untold"),
         (["--workers", "0"], "--workers"),
+        (["--members", "0"], "--members"),
+        (["--start", "nowhere.safetensors"], "nowhere.safetensors"),
     ],
 )
 def test_bad_input_is_one_line(change, says, tmp_path, capsys):
