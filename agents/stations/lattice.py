@@ -12,10 +12,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import FREE
+from slam.types import Array
 
 __all__ = ["count_in_sight", "edges", "in_sight", "join", "lengths", "line_is_free", "ways"]
 
-Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
 
 

@@ -17,10 +17,10 @@ from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_p
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
 from slam.settings import Config, Few, Gap, Length, OneOf
+from slam.types import Array
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
-Array = NDArray[np.float64]
 Cell = tuple[int, int]
 
 

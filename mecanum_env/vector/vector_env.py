@@ -24,10 +24,10 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.vector.board import Board
 from mecanum_env.vector.workers import CALL, LISTEN, RESET, SET, STEP, Answer, Share, Worker
 from slam.settings import Within, check_name, checked, require, shown
+from slam.types import Array
 
 __all__ = ["ExploreVectorEnv"]
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Observations = dict[str, NDArray[Any]]
 

@@ -16,16 +16,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import relative
 from slam.logs.laser import check_jumps, message_of, scan_of
 from slam.logs.scans import ScanLog, chain, rising, scan_log
 from slam.logs.tables import read_lines
+from slam.types import Array
 
 __all__ = ["read", "read_poses"]
-
-Array = NDArray[np.float64]
 
 _ODOM = "ODOM x y theta tv rv accel time host logger_time"
 _AFTER_RANGES = 9  # words

@@ -13,15 +13,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.logs.laser import check_jumps, message_of, scan_of
 from slam.logs.scans import ScanLog, scan_log
 from slam.logs.tables import read_lines
+from slam.types import Array
 
 __all__ = ["NOMINAL_DT_S", "read"]
-
-Array = NDArray[np.float64]
 
 NOMINAL_DT_S = 0.5
 """Time between two scans that a log without time stamps is given. Only floors of the noise depend on it."""

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.logs.tables import numbers_of
+from slam.types import Array
 
 __all__ = ["check_jumps", "message_of", "scan_of"]
-
-Array = NDArray[np.float64]
 
 _FEWEST_BEAMS, _MOST_BEAMS = 2, 10_000
 # Damage leaves numbers that are finite and yet no robot's: no log spans 100 km, a clock in seconds since 1970 is

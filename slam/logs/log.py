@@ -7,14 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import wrap
-from slam.types import Observations, Odometry, Scan
+from slam.types import Array, Observations, Odometry, Scan
 
 __all__ = ["Event", "Log"]
-
-Array = NDArray[np.float64]
 
 
 class Event(NamedTuple):

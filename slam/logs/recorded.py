@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 from slam.geometry import wrap
 from slam.logs.log import Event, Log
 from slam.settings import Config, NotNegative, Positive
-from slam.types import Observations, Odometry
+from slam.types import Array, Observations, Odometry
 
 __all__ = ["Event", "ObservationNoise", "RecordedLog", "group_by_time", "split_holds"]
-
-Array = NDArray[np.float64]
 
 _LEAST_TOLD = 1e-3  # by a sighting, of what one on its own tells: two at the same time are no division by zero
 

@@ -16,11 +16,9 @@ from slam.geometry import compose, inverse, wrap
 from slam.logs.log import Event, Log
 from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
-from slam.types import Odometry, Scan
+from slam.types import Array, Odometry, Scan
 
 __all__ = ["ScanLog", "beam_angles", "chain", "rising", "scan_log", "without_returns"]
-
-Array = NDArray[np.float64]
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
 # way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.

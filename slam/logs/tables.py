@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.files import open_bounded
+from slam.types import Array
 
 __all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
-
-Array = NDArray[np.float64]
 
 _LARGEST = 512 * 2**20  # bytes, unpacked: many times the largest log; a damaged or hostile file stops here
 _LONGEST_S = 2 * 86_400.0

@@ -26,10 +26,9 @@ from slam.files import plain_name
 from slam.geometry import wrap
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time, split_holds
 from slam.logs.tables import find, read_table, read_timed
+from slam.types import Array
 
 __all__ = ["FIRST_LANDMARK", "NOISE", "SETTINGS", "read"]
-
-Array = NDArray[np.float64]
 
 FIRST_LANDMARK = 6
 """Subjects below this are robots."""

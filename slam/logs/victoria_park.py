@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time
 from slam.logs.tables import find, read_table, read_timed
+from slam.types import Array
 
 __all__ = [
     "AXLES_M",
@@ -26,8 +27,6 @@ __all__ = [
     "plausible",
     "read",
 ]
-
-Array = NDArray[np.float64]
 
 AXLES_M = 2.83
 """L: distance of the two axles."""

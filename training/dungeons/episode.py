@@ -22,11 +22,10 @@ from agents.stations.lattice import line_is_free
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN, OccupancyGrid
+from slam.types import Array
 from training.dungeons.world import CELL_M, HOP, RANGE_M, SENSORS, STRIDE, Dungeon, Lattice, scan
 
 __all__ = ["NEAREST", "NEAREST_VIEW", "SCANS", "explore", "make_agent"]
-
-Array = NDArray[np.float64]
 
 SCANS = ("way-points", "continuous")
 """Where the sensor is read: only where a hop ends, or in every cell on the way, too."""
