@@ -230,16 +230,31 @@ def test_what_kills_a_run_takes_no_more_than_a_minute_of_it(tmp_path: Path) -> N
     assert episode.end == "time" and seen and seen[0] <= 1
 
 
+_INTERRUPTED_AT = """
+import os, signal, sys
+
+class CtrlC:
+    def find_spec(self, name, path=None, target=None):
+        if name == sys.argv[1]:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, CtrlC())
+from training.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
 def test_ctrl_c_before_the_episode_writes_nothing(tmp_path: Path) -> None:
-    # A config that is read from a pipe keeps the command waiting before the first step.
-    os.mkfifo(tmp_path / "config.toml")
-    process = run("explore", "--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out"))
-    with open(tmp_path / "config.toml", "w"):  # opens as soon as the other side reads
-        process.send_signal(signal.SIGINT)
-    # Closed by now: a signal just before the other side's read does not wake it, the end of the file does.
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert err == "mecanum explore: interrupted before the results were written\n"
+    # It comes when the command imports what explores.
+    result = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED_AT, "training.episodes.explore", "explore", "--out", tmp_path / "out"],
+        capture_output=True, text=True, check=False, timeout=60,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert result.returncode == 130
+    assert result.stderr == "mecanum explore: interrupted before the results were written\n"
     assert not (tmp_path / "out").exists()
 
 
