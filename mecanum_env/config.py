@@ -69,7 +69,7 @@ class RobotConfig(Config):
     max_speed_m_s: Annotated[float, Within("[0.01, 10]")] = 0.8
     max_turn_rate_rad_s: Annotated[float, Within("[0.01, 20]")] = 1.5
     motor_lag_s: Annotated[float, Within("[0, 10]")] = 0.05
-    motor_torque_nm: Annotated[float, Within("[0.001, 1000]")] = 2.0
+    motor_torque_nm: Annotated[float, Within("[0.001, 1e6]")] = 2.0
     motor_gain: Annotated[float, Within("[0.001, 1000]")] = 2.0  # torque per speed error [N·m·s/rad]
     wheel_inertia_kg_m2: Sigma = 0.01
     wheel_friction: Annotated[float, Within("[0, 100]")] = 0.01  # viscous, torque per wheel speed [N·m·s/rad]

@@ -39,7 +39,7 @@ class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
 
     # Larger regions than its parent's: another one takes as long as a hundred steps.
     leave_share: Annotated[float, Within("[0.001, 10]")] = 1.5
-    whole_up_to: Annotated[int, Within("[0, 10000]")] = 300
+    whole_up_to: Annotated[int, Within("[0, 1000000000]")] = 300
     rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-8
 
     wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numba import njit
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
-from slam.settings import Config, Count, Gap
+from slam.settings import Config, Gap, Within
 from slam.types import Array, Scan
 
 __all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
@@ -40,7 +41,7 @@ class KeyScanConfig(Config):
 
     spacing_m: Gap = 0.2
     spacing_rad: Gap = 0.25
-    check_every: Count = 20  # updates between two looks at the landmarks
+    check_every: Annotated[int, Within("[1, 1000000000]")] = 20  # updates between two looks at the landmarks
     lever_m: Gap = 4.0  # distance at which a turn of a key scan counts as a shift [m]
 
 

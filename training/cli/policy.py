@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from slam.files import read_json
 from training.runs.errors import BadInput, bad_input, check_writable, needs_extra
 
 __all__ = ["policy"]
@@ -65,6 +64,8 @@ def _kind(path: Path) -> str:
 
 
 def _read(path: Path) -> dict[str, object]:
+    from slam.files import read_json
+
     with bad_input():
         described = read_json(path, nan=True)
         if not isinstance(described, dict) or "config" not in described:

@@ -28,7 +28,7 @@ from agents.learned.policy_files import write_policy
 from agents.learned.station_network import PLANES, opening_numbers, with_walls
 from agents.learned_tour import FORMAT, load_station_policy
 from slam.formats import replacing
-from slam.settings import Config, Few, NotNegative, PositiveShare, Seed, Share, Within
+from slam.settings import Config, Few, NotNegative, Seed, Share, Within
 from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork, read_network
@@ -57,7 +57,7 @@ class TrainingConfig(Config):
     validation_plans: Annotated[int, Within("[1, 1000000]")] = 60  # seeds 1000 …
     epochs: Annotated[int, Within("[1, 1000000]")] = 12
     batch: Annotated[int, Within("[1, 1000000]")] = 64
-    rate: PositiveShare = 1.5e-3
+    rate: Annotated[float, Within("[1e-9, 1]")] = 1.5e-3
     weight_decay: Share = 1e-2
     untold: Share = 0.125  # share of the lessons that do not tell how far the plan extends
     free_weight: NotNegative = 0.3  # of foreseeing what is free, besides what openings cost

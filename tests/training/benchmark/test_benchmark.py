@@ -447,7 +447,8 @@ def test_the_dungeons_protocol_gets_its_options(
     argv = ["--protocol", "dungeons", "--maps", "m", "--agents", "random, tour", "--workers", "2", "--json"]
     assert main(["benchmark", "--out", str(tmp_path), *argv, "--scan", "continuous"]) == 0
     assert json.loads(capsys.readouterr().out) == {"agents": {}}
-    assert given == [((Path("m"), ["random", "tour"]), {"out": tmp_path, "workers": 2, "scan": "continuous"})]
+    how = {"scan": "continuous", "sensor": "public"}
+    assert given == [((Path("m"), ["random", "tour"]), {"out": tmp_path, "workers": 2} | how)]
 
 
 # ---- the parts -------------------------------------------------------------------------------------------------

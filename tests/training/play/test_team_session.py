@@ -54,6 +54,6 @@ def test_commands_start_teams() -> None:
 
 
 def test_the_command(pygame: object, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["play", "--robots", "3", "--rooms", "rectangular", "--frames", "5", "--speed", "1000"]) == 0
+    assert main(["play", "--robots", "3", "--rooms", "rectangular", "--frames", "5", "--speed", "100"]) == 0
     assert "rectangular, seed 0, invariant-ekf: 0.5 s" in capsys.readouterr().out
     assert "is for several robots" in refused(["play", "--starts", "scattered"], capsys)

@@ -32,7 +32,7 @@ PAGE = "report.html"
 
 def study(
     parts: Annotated[str, typer.Option(help=f"Of {', '.join(PARTS)}; separated by commas.")] = ",".join(PARTS),
-    files: Annotated[int, typer.Option(min=1, help="Files for each reader.")] = FILES.size,
+    files: Annotated[int, typer.Option(min=1, max=10**9, help="Files for each reader.")] = FILES.size,
     seed: Seed = 0,
     workers: Workers = 1,
     ray: Ray = None,
