@@ -66,9 +66,11 @@ def _kind(path: Path) -> str:
 def _read(path: Path) -> dict[str, object]:
     from slam.files import read_json
 
-    with bad_input():
+    try:
         described = read_json(path, nan=True)
         if not isinstance(described, dict) or "config" not in described:
-            raise ValueError(f"cannot read {path}: it does not say with which config the policy was trained")
+            raise ValueError("it does not say with which config the policy was trained")
+    except ValueError as error:
+        raise BadInput(f"cannot read {path}: {error}") from error
     # What is of the format is written anew.
     return {k: v for k, v in described.items() if k not in ("format", "heads", "candidate", "state", "driver")}

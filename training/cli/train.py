@@ -100,8 +100,10 @@ def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:
     if not path.exists():
         hint = suggestion(config, shipped)
         raise BadInput(f"no configuration {config!r}{hint}; a file, or one of {', '.join(shipped)}")
-    with bad_input():
+    try:
         values = read_toml(path)
+    except ValueError as error:
+        raise BadInput(f"cannot read {path}: {error}") from error
     kind: type[TrainConfig | DriveConfig] = DriveConfig if values.get("policy") == "drive" else TrainConfig
     with bad_input():
         return from_mapping(kind, values if seed is None else values | {"seed": seed})
