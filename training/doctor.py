@@ -147,7 +147,8 @@ def _threads() -> Answers:
     import numba
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    limits = [f"{k}={os.environ[k]}" for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS") if k in os.environ]
+    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+    limits = [f"{name}={os.environ[name]}" for name in names if name in os.environ]
     said = f"{cores} cores, {numba.get_num_threads()} Numba threads" + "".join(f", {limit}" for limit in limits)
     yield {"works": True, "found": said}
 
