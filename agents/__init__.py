@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents.base import Agent, Goal
 from slam.files import quoted
-from slam.settings import check_name, shown
+from slam.settings import check_name
 
 if TYPE_CHECKING:
     from mecanum_env.config import LidarConfig, RobotConfig
@@ -108,7 +108,7 @@ def make(
     check(name)
     if name.endswith(".safetensors"):
         if not isinstance(config, Mapping | None):
-            raise ValueError(f"config: with a policy's file {name} it must be a mapping, got {shown(config)}")
+            raise ValueError(f"config: with a policy's file {name} it must be a mapping, got {quoted(config)}")
         config = {**(config or {}), "policy": name}
         name = _reader(name)
     module, _, attribute = _installed()[name].partition(":")

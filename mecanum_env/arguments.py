@@ -24,10 +24,11 @@ from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensing.calibration import backend_settings
 from slam.backend import Backend
+from slam.files import quoted
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
-from slam.settings import argument, from_mapping, require, shown
+from slam.settings import argument, from_mapping, require
 
 __all__ = ["Settings", "make_backend", "make_config", "make_plan"]
 
@@ -69,7 +70,7 @@ def make_config(
             changes[name] = options.pop("name", getattr(base, name))
             changes[f"{name}_config"] = options
         elif given is not None:
-            require(isinstance(given, str), f"{name} must be a name or a mapping, got {shown(given)}")
+            require(isinstance(given, str), f"{name} must be a name or a mapping, got {quoted(given)}")
             changes[name] = given
             if given != getattr(base, name):
                 changes[f"{name}_config"] = {}
@@ -83,7 +84,7 @@ def make_config(
         with argument("reward"):
             changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
     if floor_plan is not None:
-        require(isinstance(floor_plan, str | Path), f"floor_plan must be a path, got {shown(floor_plan)}")
+        require(isinstance(floor_plan, str | Path), f"floor_plan must be a path, got {quoted(floor_plan)}")
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
     plan = made.floor_plan

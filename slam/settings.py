@@ -11,6 +11,8 @@ from functools import cache, cached_property
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from slam.files import quoted
+
 __all__ = [
     "Angle",
     "Config",
@@ -37,7 +39,6 @@ __all__ = [
     "checked",
     "from_mapping",
     "require",
-    "shown",
     "to_mapping",
     "unknown_name",
 ]  # fmt: skip
@@ -112,7 +113,7 @@ class _NotAllowed(ValueError):
     """A value is none of its kind: the message says what is."""
 
     def __init__(self, kind: _Kind, value: object) -> None:
-        super().__init__(f"must be {kind.text}, got {shown(value)}{_suggestion(value, kind.names)}")
+        super().__init__(f"must be {kind.text}, got {quoted(value)}{_suggestion(value, kind.names)}")
 
 
 class _Kind(NamedTuple):
@@ -161,7 +162,7 @@ class Config:
 def unknown_name(what: str, name: object, valid: Iterable[str]) -> ValueError:
     """Return the error for a name that is not registered: one line that lists the valid ones."""
     names = sorted(valid)
-    return ValueError(f"unknown {what} {shown(name)}{_suggestion(name, names)}; valid: {', '.join(names)}")
+    return ValueError(f"unknown {what} {quoted(name)}{_suggestion(name, names)}; valid: {', '.join(names)}")
 
 
 def _suggestion(name: object, valid: Sequence[str]) -> str:
@@ -173,15 +174,6 @@ def check_name(what: str, name: object, valid: Iterable[str]) -> None:
     """Raise the error of :func:`unknown_name` unless the name is a valid one."""
     if not isinstance(name, str) or name not in valid:
         raise unknown_name(what, name, valid)
-
-
-def shown(value: object) -> str:
-    """Return what was given as a message shows it: on one line, not all of what is long."""
-    try:
-        text = " ".join(repr(value).split())
-    except ValueError:  # a whole number of thousands of digits
-        text = f"a huge {type(value).__name__}"
-    return text if len(text) <= 60 else f"{text[:50]} … ({type(value).__name__})"
 
 
 def require(condition: bool, message: str) -> None:
@@ -232,7 +224,7 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
     if values is None:
         return cls() if base is None else base
     if not isinstance(values, Mapping):
-        raise ValueError(f"{cls.__name__} takes a mapping or a {cls.__name__}, not {shown(values)}")
+        raise ValueError(f"{cls.__name__} takes a mapping or a {cls.__name__}, not {quoted(values)}")
     fields = dataclasses.fields(cls)  # type: ignore[arg-type]
     names = [f.name for f in fields]
     hints = get_type_hints(cls) if base is not None else {}

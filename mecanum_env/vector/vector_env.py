@@ -23,7 +23,8 @@ from mecanum_env.config import Steps
 from mecanum_env.env import ExploreEnv
 from mecanum_env.vector.board import Board
 from mecanum_env.vector.workers import CALL, LISTEN, RESET, SET, STEP, Answer, Share, Worker
-from slam.settings import Within, check_name, checked, require, shown
+from slam.files import quoted
+from slam.settings import Within, check_name, checked, require
 from slam.types import Array
 
 __all__ = ["ExploreVectorEnv"]
@@ -89,7 +90,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         copy = checked("copy", bool, copy)
         if context is not None:
             check_name("context", context, multiprocessing.get_all_start_methods())
-        require(make is None or callable(make), f"make must be a function, got {shown(make)}")
+        require(make is None or callable(make), f"make must be a function, got {quoted(make)}")
         if not isinstance(autoreset_mode, AutoresetMode):
             check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         if make is not None and settings:

@@ -19,7 +19,7 @@ def plain_name(text: str, longest: int = 120) -> str:
 def quoted(value: object, longest: int = 60) -> str:
     """Return a value as an error tells it: on one line, without control characters, cut where it is long."""
     try:
-        text = repr(value)
+        text = " ".join(line.strip() for line in repr(value).splitlines())  # an array's has several
     except ValueError:  # an integer of more digits than Python writes
         text = f"a {type(value).__name__}"
     return text if len(text) <= longest else f"{text[: longest - 1]}…"

@@ -13,7 +13,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, Piece
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
-from slam.settings import shown
+from slam.files import quoted
 
 __all__ = ["DRIVE_RADIUS_M", "START_M", "assemble", "choose_start", "generator", "unreached"]
 
@@ -37,7 +37,7 @@ def generator(seed: int) -> np.random.Generator:
         If the seed is not an integer ≥ 0.
     """
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise ValueError(f"a room's seed must be an integer ≥ 0, got {shown(seed)}")
+        raise ValueError(f"a room's seed must be an integer ≥ 0, got {quoted(seed)}")
     return np.random.Generator(np.random.PCG64(int(seed)))
 
 
