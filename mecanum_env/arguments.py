@@ -28,7 +28,7 @@ from slam.files import quoted
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
-from slam.settings import argument, from_mapping, require
+from slam.settings import argument, check_name, from_mapping, require
 
 __all__ = ["Settings", "make_backend", "make_config", "make_plan"]
 
@@ -47,13 +47,16 @@ def make_config(
     reward: Mapping[str, Any] | RewardConfig | None = None,
     floor_plan: str | Path | None = None,
     odometry_filter: Settings | None = None,
+    **unknown: Any,
 ) -> EnvConfig:
     """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
 
     A string names a preset, generator, backend or filter; a mapping configures it (``{"preset": "youbot", …}``,
     ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
-    Unknown names and keys raise ``ValueError`` that lists the valid ones.
+    Unknown names, keys and arguments raise ``ValueError`` that lists the valid ones.
     """
+    for name in unknown:
+        check_name("argument", name, {"action", "render_mode", *(make_config.__kwdefaults__ or ())})
     if isinstance(config, str | Path):
         base = from_toml(config)
     else:

@@ -95,7 +95,11 @@ def log(pose: Array) -> Array:
 
 def transform_points(pose_a_b: Array, points_b: Array) -> Array:
     """Return points ``(n, 2)`` of frame b expressed in frame a."""
-    return np.asarray(points_b) @ rotation(float(pose_a_b[2])).T + np.asarray(pose_a_b)[:2]
+    x, y, theta = (float(v) for v in pose_a_b)
+    points = np.asarray(points_b, np.float64)
+    c, s, px, py = math.cos(theta), math.sin(theta), points[..., 0], points[..., 1]
+    # No product of matrices: BLAS wakes its threads for many points, and they spin for tens of milliseconds after.
+    return np.stack([c * px - s * py + x, s * px + c * py + y], axis=-1)
 
 
 def about_z(turn: float) -> Array:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import pytest
 
+import mecanum_env  # noqa: F401 - registers the environments
 from mecanum_env.config import EnvConfig, from_toml, to_toml
 
 
@@ -32,3 +34,9 @@ def test_a_configuration_keeps_its_settings_when_the_callers_change() -> None:
     given["features"]["range_sigma_m"] = 9.0
     given["gate"] = 1.0
     assert config.slam_config == {"features": {"range_sigma_m": 0.01}}
+
+
+@pytest.mark.parametrize("name", ["Explore-v0", "ExploreFrontier-v0"])
+def test_an_argument_that_there_is_not_is_named_with_those_that_there_are(name: str) -> None:
+    with pytest.raises(ValueError, match=r"^unknown argument .room. \(did you mean .rooms.\?\); valid: .*slam$"):
+        gymnasium.make(f"mecanum_env/{name}", room="maze")
