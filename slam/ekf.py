@@ -28,6 +28,7 @@ from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend,
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
+from slam.landmarks.wheel_check import WheelCheck
 from slam.metrics.chi_square import chi2_quantile
 from slam.metrics.measures import nees_pose
 from slam.motion import Twist
@@ -65,14 +66,14 @@ class EkfSlam(LandmarkBackend):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
+        c, white = self.config, 1.0 / self.config.features.wall_lasting_scans
+        self._wheels = WheelCheck(c.lidar_offset_m, scans=c.wheel_scans, gate=c.wheel_gate, white_share=white)
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
 
     def _companions(self) -> Companions:
         """Return the states beside the map."""
         return Companions(len(self._match), len(self._x))
-
-    # ---- the filter ----------------------------------------------------------------------------------------
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (theory.md A, predict)."""
@@ -81,6 +82,7 @@ class EkfSlam(LandmarkBackend):
 
     def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Predict by a twist of the body."""
+        self._wheels.predict(dt, twist, var_v, var_w)
         self._beside.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
 
     def _update(self, scan: Scan) -> None:
@@ -100,8 +102,11 @@ class EkfSlam(LandmarkBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
-        if scan is not None and self._out_of_sight(*self._recall):
-            match = self._allow_for_spinning_wheels(z, match, scan)
+        if scan is not None:
+            if self._out_of_sight(*self._recall):
+                match = self._allow_for_spinning_wheels(z, match, scan)
+            if (lacking := self._wheels.doubt(z, match, self._book.ids)) is not None:
+                self._p[:3, :3] += lacking
         given = z.copy() if self.config.lines else z  # what is matched with curved walls is straightened in place
         self._accept(z, match, JOINT_LIMITS)
         if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
@@ -112,8 +117,10 @@ class EkfSlam(LandmarkBackend):
             self._accept(z, match)
         if loop:
             self._close_loop(z, match)
-        if scan is not None and self.nis_dof >= 2 * FEWEST_BACK:
-            self._unseen_motion = (0.0, 0.0)
+        if scan is not None:
+            self._wheels.note(given, match, self._book.ids, float(self._x[2]))
+            if self.nis_dof >= 2 * FEWEST_BACK:
+                self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
 
     def observe(self, observations: Observations) -> None:
@@ -208,11 +215,9 @@ class EkfSlam(LandmarkBackend):
     def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
         """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
 
-        Against a wall, or pulling away too hard, the wheels turn and the robot does not follow. V knows nothing
-        of that, and a filter that trusts it has every gate closed within two steps and is lost for good. So the
-        pose may be off by as much as the wheels claim to have moved since the landmarks were last in sight.
-        Gates so wide take any corner for a landmark. So one pose must explain them all, and the scan must fit the
-        map far better from there: in a door, where the view changes, another corner fits a bit better by chance.
+        A filter that trusts V where the robot does not follow has every gate closed within two steps. So the pose
+        may be off by all that the wheels claim since the landmarks were last in sight. Gates so wide take any
+        corner for a landmark: one pose must explain them all, and the scan must fit the map far better from there.
         """
         n = self._n
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
@@ -256,8 +261,7 @@ class EkfSlam(LandmarkBackend):
 
     def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
-        # The first scan is taken at the start, whose pose is known. Landmarks that had to wait would be placed by
-        # the wheels alone: four fifths of all errors, on slippery floors.
+        # The start's pose is known; landmarks that had to wait would be placed by the wheels alone.
         at_once = scan is not None and self._book.now == 0
         new, gone = self._book.review(self._x, self.config.lidar_offset_m, z, match, scan, at_once=at_once)
         for k in new:
@@ -300,13 +304,11 @@ class EkfSlam(LandmarkBackend):
     def _place(self, pose: Array, pose_cov: Array) -> None:
         self._settle_beliefs()
         joint.place(self._x, self._p, self._n, pose, pose_cov)
+        self._wheels.forget()
         self._beside.forget_pose()
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
-        """Go on from a pose ``(3,)`` that a scan was found to be taken from.
-
-        It says which landmarks are seen; these say where the robot is: so it inherits what is unknown of them.
-        """
+        """Go on from a pose ``(3,)`` of a scan: the landmarks it shows say where it is, and how surely."""
         self._place(pose, cov + found_cov())
         z = self._features(scan)
         match = self._associate(z).copy()
@@ -336,7 +338,6 @@ class EkfSlam(LandmarkBackend):
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the NEES of the pose against the truth ``(3,)``."""
-        # The kernel reads nothing but the upper triangle: no copies.
         return float(nees_pose(self._x, self._p, np.asarray(true_pose, dtype=np.float64)))
 
     @property
