@@ -31,7 +31,7 @@ class HealthConfig(Config):
     recover: bool = True  # when lost, find the pose again and undo what was done meanwhile; else only tell
     glance_beams: Annotated[int, Within("[8, 10000]")] = 36  # of a scan that are looked at, at most …
     beams: Annotated[int, Within("[8, 10000]")] = 120  # … and where these do not agree
-    fewest_beams: Count = 15  # that say anything, for a scan to count
+    fewest_beams: Count = 25  # that say anything, for a scan to count; fewer could not find it again, either
     # Upper edges of the bins of the share of beams in the open, and how often a scan of a robot that is fine, or
     # lost, falls into each: in logarithms, since products of them are taken.
     against_edges: Annotated[tuple[float, ...], Within("[0, 1]")] = (0.03, 0.08, 0.16, 0.3)

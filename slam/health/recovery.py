@@ -5,8 +5,8 @@ and tries to correct itself by them; one that still contradicts the map from the
 the monitor gives the belief up, the copy is put back, so that neither wrong matches nor wrong drawings stay, and
 nothing is written any more until a place is found that explains several scans in a row, or until many scans in a
 row no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
-there is none. Buildings repeat themselves, so from there no other place is looked for on the whole map. Scans that
-agree with the map cost one look at them and nothing else.
+there is none, or where no scan can say anything. Buildings repeat themselves, so from there no other place is
+looked for on the whole map. Scans that agree with the map cost one look at them and nothing else.
 """
 
 from __future__ import annotations
@@ -88,21 +88,24 @@ class Recovery:
         self.lost = True
         self.times_lost += 1
         self.kept, self._relocaliser, self._trail = None, None, None
-        self._searched = self._unopposed = 0
+        self._searched = self._unopposed = self._silent = 0
         self._searched_from: Array | None = None  # where the wheels had it when all of the map was last searched
 
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
         """Look for the place of a scan; return it once several scans agree on it, else None.
 
         ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost. Where scans
-        have not spoken against that for long enough, nothing is returned, and the belief is no longer lost.
+        have not spoken against that for long enough, or could say nothing of any place for longer, nothing is
+        returned, and the belief is no longer lost.
         """
         self.scans_lost += 1
         if np.count_nonzero(scan.ranges <= scan.range_max) >= self._relocalisation.fewest_beams:
             x, y, theta = believed.tolist()
             opposed = self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
-            self._unopposed = 0 if opposed else self._unopposed + 1
-        if self._unopposed >= self._relocalisation.unopposed:
+            self._unopposed, self._silent = 0 if opposed else self._unopposed + 1, 0
+        else:
+            self._silent += 1
+        if self._unopposed >= self._relocalisation.unopposed or self._silent >= self._relocalisation.silent:
             self._end()
             return None
         if self._relocaliser is None:

@@ -69,6 +69,8 @@ class RelocalisationConfig(Config):
     confirm: Annotated[int, Within("[1, 1000000]")] = 3  # scans that a place must explain, one after the other
     # Scans in a row that do not speak against where the wheels have it, to go on from there.
     unopposed: Annotated[int, Within("[1, 1000000]")] = 30
+    # The same of scans that say nothing of any place: too few beams return, in a wide hall.
+    silent: Annotated[int, Within("[1, 1000000]")] = 300
     # Reach of a surface when a place is refined last.
     sharp_smooth_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     matching: MatchConfig = field(

@@ -130,6 +130,22 @@ def test_where_nothing_is_known_a_lost_robot_goes_on_from_where_the_wheels_have_
     assert known.known_cells > backend.grid.known_cells > 0  # and it draws again
 
 
+def test_where_hardly_a_beam_returns_a_lost_robot_goes_on_in_the_end() -> None:
+    """In a wide hall no scan says where it is, nor that the wheels are wrong: it was lost for good."""
+    env = driven("invariant-ekf", 60, settings={"relocalisation": {"silent": 20}})
+    backend = env.backend
+    few = np.full(360, np.inf)
+    few[:20] = 3.0
+    backend.recovery.give_up()
+    for k in range(21):
+        assert backend.recovery.lost == (k < 20)
+        backend.update(Scan(few, -math.pi, 2.0 * math.pi / 360, 8.0))
+
+
+def test_so_few_beams_as_cannot_find_it_again_do_not_give_it_up() -> None:
+    assert HealthConfig().fewest_beams >= RelocalisationConfig().fewest_beams
+
+
 def test_dead_reckoning_is_never_found_anew() -> None:
     env = driven("odometry", 40)
     assert make_fault("teleport").begin(env, np.random.default_rng(0))
