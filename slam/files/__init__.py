@@ -1,8 +1,10 @@
 """Files of unknown origin: whatever the project reads is read here, bounded, with every fault in one line.
 
-``reading`` is bytes, gzip, JSON, TOML and YAML, ``databases`` SQLite, ``names`` how names from outside are shown.
+``reading`` is bytes, gzip, JSON, TOML and YAML, ``databases`` SQLite, ``bags`` what ROS 2 recorded, ``names`` how
+names from outside are shown.
 """
 
+from slam.files.bags import BagMessage, bag_messages, is_bag
 from slam.files.databases import check_tables, open_database, trust
 from slam.files.names import plain_name, quoted, shown_path
 from slam.files.reading import (
@@ -17,8 +19,11 @@ from slam.files.reading import (
 )
 
 __all__ = [
+    "BagMessage",
+    "bag_messages",
     "check_file",
     "check_tables",
+    "is_bag",
     "open_bounded",
     "open_database",
     "parse_json",

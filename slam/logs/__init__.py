@@ -1,7 +1,8 @@
 """Recorded logs of real robots: one reader a format (``docs/how-to/replay.md``).
 
-``utias`` and ``victoria_park`` are logs of landmark observations and become a ``recorded`` log, ``carmen`` and
-``dpslam`` are logs of ``laser`` scans and become ``scans``; ``log`` is what both are, ``tables`` reads numbers.
+``utias`` and ``victoria_park`` are logs of landmark observations and become a ``recorded`` log, ``carmen``,
+``dpslam`` and ``ros_bag`` are logs of ``laser`` scans and become ``scans``; ``log`` is what both are, ``tables``
+reads numbers.
 """
 
 from __future__ import annotations
@@ -13,13 +14,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.logs import carmen, dpslam, utias, victoria_park
+from slam.files import is_bag
+from slam.logs import carmen, dpslam, ros_bag, utias, victoria_park
 from slam.logs.log import Event
 from slam.logs.recorded import ObservationNoise, RecordedLog
+from slam.logs.ros_bag import BagTopics, parse_mount
 from slam.logs.scans import ScanLog
 from slam.logs.tables import read_lines
 
-__all__ = ["AnyLog", "Event", "ObservationNoise", "RecordedLog", "ScanLog", "open_log", "with_reference"]
+__all__ = [
+    "AnyLog", "BagTopics", "Event", "ObservationNoise", "RecordedLog", "ScanLog", "open_log", "parse_mount",
+    "with_reference",
+]  # fmt: skip
 
 AnyLog = RecordedLog | ScanLog
 
@@ -34,18 +40,23 @@ _READERS = dict.fromkeys(_CARMEN_WORDS, carmen.read) | dict.fromkeys(("Odometry"
 _LINES_TO_KNOW_BY = 10_000
 
 
-def open_log(path: str | Path, *, robot: int | None = None, raw: bool = False) -> AnyLog:
+def open_log(
+    path: str | Path, *, robot: int | None = None, raw: bool = False, topics: BagTopics | None = None
+) -> AnyLog:
     """Read a log; its format is known by the names of its files, that of one with scans by its lines.
 
     Parameters
     ----------
     path : path
-        A UTIAS MRCLAM odometry file ``Robot1_Odometry.dat[.gz]`` or its folder; Victoria Park's folder; or a
-        CARMEN or DP-SLAM log, plain or gzip, whatever its name.
+        A UTIAS MRCLAM odometry file ``Robot1_Odometry.dat[.gz]`` or its folder; Victoria Park's folder; a ROS 2
+        bag, its folder or a file ``.mcap`` or ``.db3``; or a CARMEN or DP-SLAM log, plain or gzip, whatever its
+        name.
     robot : int, optional
         Which robot of a UTIAS folder; not needed where it has only one.
     raw : bool
         Of a UTIAS log: ranges, stamps and commands as recorded, not as calibrated (:mod:`slam.logs.utias`).
+    topics : BagTopics, optional
+        Of a bag: which topics, and where the lidar sits.
 
     Raises
     ------
@@ -55,6 +66,12 @@ def open_log(path: str | Path, *, robot: int | None = None, raw: bool = False) -
     path = Path(path)
     if not path.exists():
         raise ValueError(f"log {path} does not exist; check the path")
+    if is_bag(path):
+        _refuse(robot, raw, path)
+        return ros_bag.read(path, topics or BagTopics())
+    if topics is not None:
+        raise ValueError(f"log {path} is no ROS 2 bag; leave --scan-topic, --odom-topic, --reference-topic and "
+                         "--mount out")  # fmt: skip
     if path.is_dir():
         if any((path / f"steering.txt{end}").exists() for end in ("", ".gz")):
             _refuse(robot, raw, path)
@@ -121,8 +138,9 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
 
 
 _KNOWN = (
-    "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), the folder with steering.txt[.gz] (Victoria Park), or a "
-    "file with FLASER lines (CARMEN) or Odometry and Laser lines (DP-SLAM)"
+    "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), the folder with steering.txt[.gz] (Victoria Park), a "
+    "ROS 2 bag's folder, .mcap or .db3, or a file with FLASER lines (CARMEN) or Odometry and Laser lines "
+    "(DP-SLAM)"
 )
 
 

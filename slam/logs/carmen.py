@@ -19,7 +19,7 @@ import numpy as np
 
 from slam.geometry import relative
 from slam.logs.laser import check_jumps, message_of, scan_of
-from slam.logs.scans import ScanLog, chain, rising, scan_log
+from slam.logs.scans import ScanLog, chain, moved_by, rising, scan_log
 from slam.logs.tables import read_lines
 from slam.types import Array
 
@@ -52,7 +52,7 @@ def read(path: Path) -> ScanLog:
     mount = relative(robot, poses[:, :3])
     offset = np.median(mount, axis=0)
     if np.abs(mount - offset).max() < _MOUNT_VARIES and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M:
-        travelled = _moved_by(travelled, offset)
+        travelled = moved_by(travelled, offset)
     note = "no reference; give one with --reference"
     return scan_log(path, ranges, travelled, times=rising(stamps), stamps=stamps, note=note)
 
@@ -104,8 +104,3 @@ def _odom(words: Sequence[str], path: Path, number: int) -> Array:
         raise ValueError(f"{path}, line {number}: expected 9 values after ODOM ({_ODOM}), got {len(words)}; "
                          "the line is cut short or damaged")  # fmt: skip
     return message_of(words[:7], poses_at=(0,), stamp_at=6, path=path, line=number, what=_ODOM)
-
-
-def _moved_by(poses: Array, offset: Array) -> Array:
-    """Return poses ``(n, 3)`` each followed by the same transform ``(3,)``."""
-    return relative(relative(poses, np.zeros_like(poses)), np.broadcast_to(offset, poses.shape))

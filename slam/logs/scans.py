@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.files import plain_name
-from slam.geometry import compose, inverse, wrap
+from slam.geometry import compose, inverse, relative, wrap
 from slam.logs.log import Event, Log
 from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
 from slam.types import Array, Odometry, Scan
 
-__all__ = ["ScanLog", "beam_angles", "chain", "rising", "scan_log", "without_returns"]
+__all__ = ["SETTINGS", "ScanLog", "beam_angles", "chain", "moved_by", "rising", "scan_log", "without_returns"]
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
 # way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.
-_SETTINGS = {
+SETTINGS = {
     "lidar_offset_m": 0.0,
     "odometry": {
         "lever_m": 0.25, "speed_floor_m_s": 0.002, "speed_share": 0.1, "turn_floor_rad_s": 0.002,
@@ -46,12 +46,14 @@ class ScanLog(Log):
     """Odometry and laser scans of a real robot, one odometry pose a scan.
 
     Times are seconds since the first scan. The body frame is that of the sensor: the odometry is of the laser, and
-    scans are made at its origin. The reference is at scans only.
+    scans are made at its origin, or so far ahead of it as ``settings`` says in ``lidar_offset_m``. The reference
+    is at scans only.
     """
 
     times: Array  # (n ≥ 1,) [s] rising, the first 0
     stamps: Array  # (n,) [s] as recorded, by which a reference is matched: not always rising
-    ranges: Array  # (n, beams) [m]; inf where nothing within reach returned, nan where the beam was lost
+    # (n, beams) [m]; inf where nothing within reach returned, nan where the beam was lost. As precise as recorded.
+    ranges: Array | NDArray[np.float32]
     angle_min: float  # bearing of the first beam [rad]
     angle_increment: float  # [rad]
     range_max: float  # [m]
@@ -74,8 +76,9 @@ class ScanLog(Log):
         return self.times
 
     def scan(self, index: int) -> Scan:
-        """Return one scan; its ranges are a view."""
-        return Scan(self.ranges[index], self.angle_min, self.angle_increment, self.range_max)
+        """Return one scan; its ranges are a view where they are kept in full."""
+        ranges = np.asarray(self.ranges[index], np.float64)
+        return Scan(ranges, self.angle_min, self.angle_increment, self.range_max)
 
     def until(self, limit_s: float) -> ScanLog:
         """Return the log's beginning: the scans no later than ``limit_s`` ≥ 0."""
@@ -131,7 +134,7 @@ def scan_log(
         times=times - times[0], stamps=stamps,
         ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach,
         odometry_poses=odometry_poses, start_pose=odometry_poses[0].copy(), reference_times=np.zeros(0),
-        reference_poses=np.zeros((0, 3)), reference_gap_s=30.0, settings=_SETTINGS, note=note,
+        reference_poses=np.zeros((0, 3)), reference_gap_s=30.0, settings=SETTINGS, note=note,
     )  # fmt: skip
 
 
@@ -153,6 +156,11 @@ def chain(start: Array, steps: Array) -> Array:
     x = start[0] + np.append(0.0, np.cumsum(c * steps[:, 0] - s * steps[:, 1]))
     y = start[1] + np.append(0.0, np.cumsum(s * steps[:, 0] + c * steps[:, 1]))
     return np.column_stack([x, y, wrap(theta)])
+
+
+def moved_by(poses: Array, offset: Array) -> Array:
+    """Return poses ``(n, 3)`` each followed by the same transform ``(3,)``."""
+    return relative(relative(poses, np.zeros_like(poses)), np.broadcast_to(offset, poses.shape))
 
 
 def rising(stamps: Array) -> Array:

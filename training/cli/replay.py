@@ -20,7 +20,7 @@ def replay(
         Path,
         typer.Argument(
             metavar="LOG",
-            help="CARMEN or DP-SLAM log; UTIAS: Robot1_Odometry.dat or folder; Victoria Park: folder.",
+            help="ROS 2 bag, CARMEN or DP-SLAM log; UTIAS: Robot1_Odometry.dat or folder; Victoria Park: folder.",
         ),
     ],
     slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
@@ -31,6 +31,25 @@ def replay(
     reference: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Log of the same scans with corrected poses.  [default: none]"),
+    ] = None,
+    scan_topic: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Of a bag: LaserScan.  [default: /scan, or the only one]")
+    ] = None,
+    odom_topic: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOPIC", help="Of a bag: Odometry, or /tf.  [default: /odom, the only one, or odom in /tf]"
+        ),
+    ] = None,
+    reference_topic: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Of a bag: Odometry or PoseStamped, the true path.  [default: none]"),
+    ] = None,
+    mount: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,DEG", help="Of a bag: where the lidar is, m and degrees.  [default: by its transforms]"
+        ),
     ] = None,
     seed: Annotated[
         int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
@@ -53,6 +72,7 @@ def replay(
       mecanum replay utias6/Robot1_Odometry.dat.gz --slam ekf --out out/utias1
       mecanum replay utias6 --robot 3 --association unknown --json
       mecanum replay victoria_park --slam ekf --limit-s 300 --out out/park
+      mecanum replay rosbag2_2026_01_31 --slam graph-slam --scan-topic /front/scan --out out/bag
       mecanum replay intel.gfs.log.gz --reference intel-corrected.log.gz --slam invariant-ekf
     """  # noqa: D301
     from training.replay import report as replay_report
@@ -60,7 +80,8 @@ def replay(
 
     prepared = task.prepare(
         log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
-        limit_s=limit_s, config=config,
+        limit_s=limit_s, config=config, scan_topic=scan_topic, odom_topic=odom_topic,
+        reference_topic=reference_topic, mount=mount,
     )  # fmt: skip
     whole_s = prepared.log.duration_s
     with Progress("replaying", whole_s) as progress:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend
-from slam.logs import AnyLog, ObservationNoise, ScanLog, open_log, with_reference
+from slam.logs import AnyLog, BagTopics, ObservationNoise, ScanLog, open_log, parse_mount, with_reference
 from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.registry import config_type, make
@@ -48,7 +48,7 @@ SAMPLE_S = 0.1
 
 _RUN_KINDS: dict[str, tuple[type, ...]] = {
     "association": (str,), "seed": (int,), "limit_s": (int, float), "reference": (str,),
-    "raw": (bool,),
+    "raw": (bool,), "scan_topic": (str,), "odom_topic": (str,), "reference_topic": (str,), "mount": (str,),
 }  # fmt: skip
 
 
@@ -102,11 +102,13 @@ class Replay:
 def prepare(
     path: Path, *, out: Path, robot: int | None = None, reference: Path | None = None, slam: str | None = None,
     association: str | None = None, seed: int | None = None, limit_s: float | None = None,
-    config: Path | None = None,
+    config: Path | None = None, scan_topic: str | None = None, odom_topic: str | None = None,
+    reference_topic: str | None = None, mount: str | None = None,
 ) -> Replay:  # fmt: skip
     """Read the log, check everything that can be checked, and set the backend at the start; nothing is written.
 
-    Of what is ``None`` the config file, the log or the default decides; ``reference`` is of a log of scans.
+    Of what is ``None`` the config file, the log or the default decides; ``reference`` is of a log of scans, the
+    last four are of a ROS 2 bag.
 
     Raises
     ------
@@ -119,8 +121,10 @@ def prepare(
         check_writable(out, (*MAP_FILES, *FILES))
         values, past = read_config(config, _RUN_KINDS) if config is not None else ({}, {})
         given = {"association": association, "seed": seed, "limit_s": limit_s, "reference": reference}
+        given |= {"scan_topic": scan_topic, "odom_topic": odom_topic, "reference_topic": reference_topic}
+        given |= {"mount": mount}
         run = {"seed": 0} | past | {name: value for name, value in given.items() if value is not None}
-        log = open_log(path, robot=robot, raw=run.get("raw", False))
+        log = open_log(path, robot=robot, raw=run.get("raw", False), topics=_topics(run))
         if "reference" in run:
             log = with_reference(log, run["reference"])
             run["reference"] = str(Path(run["reference"]).absolute())
@@ -147,6 +151,13 @@ def prepare(
         run["robot"] = robot
     times, rows = sample_times(log)
     return Replay(log, effective, backend, run, out, times, rows)
+
+
+def _topics(run: Mapping[str, Any]) -> BagTopics | None:
+    """Return what a bag is asked for; ``None`` where nothing was said of one."""
+    names = {name: run[f"{name}_topic"] for name in ("scan", "odom", "reference") if f"{name}_topic" in run}
+    mount = parse_mount(run["mount"]) if "mount" in run else None
+    return BagTopics(**names, mount=mount) if names or mount else None
 
 
 def sample_times(log: AnyLog) -> tuple[Array, NDArray[np.int64]]:

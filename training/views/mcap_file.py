@@ -8,7 +8,6 @@ Axes and units follow REP 103, ranges REP 117. Time is the episode's own, from 0
 from __future__ import annotations
 
 import heapq
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
@@ -19,17 +18,25 @@ from numpy.typing import NDArray
 
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.formats import replacing
-from slam.geometry import compose, inverse, wrap
+from slam.geometry import compose, inverse
 from slam.motion import twist_between
-from slam.types import Array
+from slam.ros import (
+    Message,
+    grid_message,
+    header,
+    nanoseconds,
+    odometry_message,
+    pose_message,
+    pose_with_covariance,
+    rosbags_message,
+    scan_message,
+    transform_message,
+)
 from training.episodes.playback import dead_reckoned, ellipses, map_origin, maps
 from training.episodes.recording import Recording
 from training.runs.errors import needs_extra
 
 __all__ = ["TOPICS", "check_mcap", "write_mcap"]
-
-Message = Mapping[str, Any]
-"""A message as nested mappings; a field that is left out is zero or empty."""
 
 TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -126,41 +133,25 @@ def write_mcap(
                 topic, "cdr", schemas[datatype], {"offered_qos_profiles": qos}
             )
         for step, topic, message in _messages(recording, robot, lidar):
-            at = _nanoseconds(recording.times[step])
-            encoded = types.serialize_cdr(_filled(types, TOPICS[topic], message), TOPICS[topic])
+            at = nanoseconds(recording.times[step])
+            encoded = types.serialize_cdr(rosbags_message(types, TOPICS[topic], message), TOPICS[topic])
             writer.add_message(channels[topic], at, bytes(encoded), at)
         writer.finish()
-
-
-def _filled(types: Any, datatype: str, message: Message) -> Any:
-    """Return a message as rosbags takes it, whole: what is left out is zero or empty."""
-    from rosbags.interfaces import Nodetype
-
-    def filled(node: Any, value: Any) -> Any:
-        kind, what = node
-        if kind == Nodetype.NAME:
-            return _filled(types, what, value or {})
-        if kind == Nodetype.BASE:
-            return ("" if what[0] == "string" else 0) if value is None else value
-        (kind, what), length = what
-        if kind == Nodetype.NAME:
-            return [_filled(types, what, one) for one in value or ()]
-        return np.zeros(length, what[0]) if value is None else np.asarray(value, what[0])
-
-    fields = {name: filled(node, message.get(name)) for name, node in types.fielddefs[datatype][1]}
-    return types.types[datatype](**{**message, **fields})
 
 
 def _messages(recording: Recording, robot: RobotConfig, lidar: LidarConfig) -> Iterable[tuple[int, str, Message]]:
     """Return every message with its step and topic, in order of time."""
     times, landmarks = recording.times, recording.landmarks
     before = [0, *map(len, landmarks.values)]
-    laser = {"transforms": [_transform("base_link", "laser", 0.0, [lidar.offset_m, 0.0, 0.0])]}
+    laser = {"transforms": [transform_message("base_link", "laser", 0.0, [lidar.offset_m, 0.0, 0.0])]}
     return heapq.merge(
         [(0, "/tf_static", laser), (0, "/robot", _robot(robot))],
         _poses(recording),
         ((step, "/scan", _scan(recording, times[step], ranges)) for step, ranges in recording.scans.items()),
-        ((step, "/map", _map(recording, times[step], classes)) for step, classes in maps(recording)),
+        (
+            (step, "/map", grid_message(times[step], "map", classes, recording.resolution, map_origin(recording)))
+            for step, classes in maps(recording)
+        ),
         (
             (step, "/landmarks", _landmarks(times[step], rows, shown))
             for (step, rows), shown in zip(landmarks.items(), before, strict=False)
@@ -177,16 +168,15 @@ def _poses(recording: Recording) -> Iterator[tuple[int, str, Message]]:
         zip(recording.times, dead_reckoned(recording), recording.estimates, recording.true_poses, strict=True)
     ):
         frames = [
-            _transform("map", "odom", time_s, compose(believed, inverse(odom))),
-            _transform("odom", "base_link", time_s, odom),
-            _transform("map", "base_link_true", time_s, true),
+            transform_message("map", "odom", time_s, compose(believed, inverse(odom))),
+            transform_message("odom", "base_link", time_s, odom),
+            transform_message("map", "base_link_true", time_s, true),
         ]
         yield step, "/tf", {"transforms": frames}
-        yield step, "/odom", _odometry(time_s, "odom", "base_link", odom, recording.twists[step])
-        pose = {"pose": _pose(believed), "covariance": _covariance(recording.pose_covs[step])}
-        yield step, "/pose", {"header": _header(time_s, "map"), "pose": pose}
+        yield step, "/odom", odometry_message(time_s, "odom", "base_link", odom, recording.twists[step])
+        yield step, "/pose", pose_with_covariance(time_s, "map", believed, recording.pose_covs[step])
         twist = twist_between(true_before, true, recording.step_s)
-        yield step, "/ground_truth", _odometry(time_s, "map", "base_link_true", true, twist)
+        yield step, "/ground_truth", odometry_message(time_s, "map", "base_link_true", true, twist)
         true_before = true
 
 
@@ -194,57 +184,32 @@ def _poses(recording: Recording) -> Iterator[tuple[int, str, Message]]:
 
 
 def _scan(recording: Recording, time_s: float, ranges: NDArray[np.generic]) -> Message:
-    scan = recording.scan
-    return {
-        "header": _header(time_s, "laser"),
-        "angle_min": scan.angle_min,
-        "angle_max": scan.angle_min + (len(ranges) - 1) * scan.angle_increment,
-        "angle_increment": scan.angle_increment,
-        "time_increment": 0.0,  # all beams at once
-        "scan_time": recording.step_s,
-        "range_min": scan.range_min,
-        "range_max": scan.range_max,
-        "ranges": ranges,
-    }
-
-
-def _map(recording: Recording, time_s: float, classes: NDArray[np.int8]) -> Message:
-    x, y = map_origin(recording)
-    return {
-        "header": _header(time_s, "map"),
-        "info": {
-            "map_load_time": _stamp(time_s),
-            "resolution": recording.resolution,
-            "width": classes.shape[1],
-            "height": classes.shape[0],
-            "origin": _pose([x, y, 0.0]),
-        },
-        "data": classes.ravel(),  # UNKNOWN, FREE and OCCUPIED are the values that ROS gives them
-    }
+    scan = recording.scan._replace(ranges=np.asarray(ranges, np.float64))
+    return scan_message(time_s, "laser", scan, scan_time_s=recording.step_s)
 
 
 def _plan(time_s: float, path: NDArray[np.generic]) -> Message:
     """Return the way ahead, each pose looking along it."""
     points = np.asarray(path, np.float64)
-    header = _header(time_s, "map")
+    top = header(time_s, "map")
     along = np.diff(points, axis=0, append=points[-1:])
     headings = np.arctan2(along[:, 1], along[:, 0])
     headings[-1:] = headings[-2:-1] if len(points) > 1 else 0.0
     poses = np.column_stack([points, headings])
-    return {"header": header, "poses": [{"header": header, "pose": _pose(p)} for p in poses]}
+    return {"header": top, "poses": [{"header": top, "pose": pose_message(p)} for p in poses]}
 
 
 def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
     """Return a flat cylinder for each landmark's 3σ ellipse; of those ``shown`` the rest go."""
     axes, directions = ellipses(rows)
     size = np.maximum(2.0 * axes, _LEAST_AXIS_M)
-    ns, header = "landmarks", _header(time_s, "map")
+    ns, top = "landmarks", header(time_s, "map")
     markers = [
-        _marker(ns, k, header, _CYLINDER, _LANDMARK, _pose([x, y, turn]), (width, height, _LANDMARK_HEIGHT_M))
+        _marker(ns, k, top, _CYLINDER, _LANDMARK, pose_message([x, y, turn]), (width, height, _LANDMARK_HEIGHT_M))
         for k, (x, y, turn, width, height) in enumerate(np.column_stack([rows[:, :2], directions, size]).tolist())
     ]
     gone = [
-        {"header": header, "ns": ns, "id": k, "action": _DELETE, "pose": _pose([0.0, 0.0, 0.0])}
+        {"header": top, "ns": ns, "id": k, "action": _DELETE, "pose": pose_message([0.0, 0.0, 0.0])}
         for k in range(len(rows), shown)
     ]
     return {"markers": markers + gone}
@@ -252,70 +217,24 @@ def _landmarks(time_s: float, rows: NDArray[Any], shown: int) -> Message:
 
 def _robot(robot: RobotConfig) -> Message:
     """Return the body where it is believed to be and where it is, both moving along with their frames."""
-    pose, size = _pose([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M), (robot.length_m, robot.width_m, _BODY_HEIGHT_M)
+    pose, size = (
+        pose_message([0.0, 0.0, 0.0], z=0.5 * _BODY_HEIGHT_M),
+        (robot.length_m, robot.width_m, _BODY_HEIGHT_M),
+    )
     bodies = (("base_link", _BELIEVED), ("base_link_true", _TRUE))
     return {
         "markers": [
-            {**_marker("robot", k, _header(0.0, frame), _CUBE, colour, pose, size), "frame_locked": True}
+            {**_marker("robot", k, header(0.0, frame), _CUBE, colour, pose, size), "frame_locked": True}
             for k, (frame, colour) in enumerate(bodies)
         ]
     }
 
 
 def _marker(
-    ns: str, number: int, header: Message, kind: int, colour: tuple[float, ...], pose: Message,
+    ns: str, number: int, top: Message, kind: int, colour: tuple[float, ...], pose: Message,
     size: tuple[float, float, float],
 ) -> dict[str, Any]:  # fmt: skip
     return {
-        "header": header, "ns": ns, "id": number, "type": kind, "action": _ADD, "pose": pose,
+        "header": top, "ns": ns, "id": number, "type": kind, "action": _ADD, "pose": pose,
         "scale": dict(zip("xyz", size, strict=True)), "color": dict(zip("rgba", colour, strict=True)),
     }  # fmt: skip
-
-
-def _odometry(time_s: float, frame: str, child: str, pose: Array, twist: Array) -> Message:
-    vx, vy, omega = twist.tolist()
-    return {
-        "header": _header(time_s, frame),
-        "child_frame_id": child,
-        "pose": {"pose": _pose(pose)},
-        "twist": {"twist": {"linear": {"x": vx, "y": vy}, "angular": {"z": omega}}},
-    }
-
-
-def _transform(parent: str, child: str, time_s: float, pose: Array | list[float]) -> Message:
-    placed = _pose(pose)
-    return {
-        "header": _header(time_s, parent),
-        "child_frame_id": child,
-        "transform": {"translation": placed["position"], "rotation": placed["orientation"]},
-    }
-
-
-def _pose(pose: Array | list[float], *, z: float = 0.0) -> dict[str, Any]:
-    x, y, theta = (float(v) for v in pose)
-    half = 0.5 * float(wrap(theta))
-    return {
-        "position": {"x": x, "y": y, "z": z},
-        "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half), "w": math.cos(half)},
-    }
-
-
-def _covariance(cov: Array) -> Array:
-    """Return the covariance ``(36,)`` of x, y, z and the turns about them, of a planar pose's ``(3, 3)``."""
-    whole = np.zeros((6, 6))
-    planar = np.array([0, 1, 5])
-    whole[np.ix_(planar, planar)] = cov
-    return whole.ravel()
-
-
-def _header(time_s: float, frame: str) -> dict[str, Any]:
-    return {"stamp": _stamp(time_s), "frame_id": frame}
-
-
-def _stamp(time_s: float) -> dict[str, int]:
-    seconds, nanoseconds = divmod(_nanoseconds(time_s), 10**9)
-    return {"sec": seconds, "nanosec": nanoseconds}
-
-
-def _nanoseconds(time_s: float) -> int:
-    return round(float(time_s) * 1e9)

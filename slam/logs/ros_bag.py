@@ -1,0 +1,272 @@
+"""ROS 2 bags: laser scans, odometry, and where on the robot the lidar sits (``docs/how-to/replay.md``).
+
+A scan is a ``sensor_msgs/LaserScan``; odometry is a ``nav_msgs/Odometry``, or the transform odom → base of ``/tf``
+where there is none; the lidar's place is that of ``/tf_static``. Poses are of the robot's frame, the child frame
+of its odometry. Backends know of a lidar ahead of the robot's middle only: of one beside it the poses are of the
+point of the robot's frame that lies straight behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slam.files import BagMessage, bag_messages, plain_name, quoted
+from slam.geometry import wrap
+from slam.logs.scans import SETTINGS, ScanLog, moved_by, rising
+from slam.ros import Frames, Mount, mount_of, odometry_of, pose_of, resampled, scan_of, stamp_of, transforms_of
+from slam.types import Array, Scan
+
+__all__ = ["BagTopics", "parse_mount", "read"]
+
+_SCAN, _ODOMETRY, _TF = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
+_POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
+_TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
+
+_MOST_RANGES = 2**28  # of all scans together: a gibibyte
+_REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
+_LONGEST_JUMP_M = 1e3  # from scan to scan
+_MOST_TOPICS = 12  # that an error lists
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagTopics:
+    """What of a bag is read; ``None``: what is found by type, or bears the usual name."""
+
+    scan: str | None = None
+    odom: str | None = None  # a topic of Odometry; /tf: the transform odom → base
+    reference: str | None = None  # Odometry, PoseStamped or PoseWithCovarianceStamped
+    mount: Mount | None = None  # where no transform tells
+
+
+@dataclass
+class _Track:
+    """A frame's poses as they come."""
+
+    child: str
+    stamps: list[float] = field(default_factory=list)
+    poses: list[Array] = field(default_factory=list)
+
+    def add(self, stamp: float, pose: Array) -> None:
+        self.stamps.append(stamp)
+        self.poses.append(pose)
+
+    def sorted(self) -> tuple[Array, Array]:
+        """Return times ``(n,)`` that rise, and poses ``(n, 3)`` with unwrapped headings; of equal times one."""
+        times, first = np.unique(np.array(self.stamps), return_index=True)
+        poses = np.stack(self.poses)[first]
+        poses[:, 2] = np.unwrap(poses[:, 2])
+        return times, poses
+
+
+@dataclass
+class _Found:
+    """What was read of a bag."""
+
+    topics: dict[str, str] = field(default_factory=dict)
+    scans: dict[str, list[tuple[float, Scan]]] = field(default_factory=dict)
+    scan_frames: dict[str, str] = field(default_factory=dict)
+    tracks: dict[str, _Track] = field(default_factory=dict)  # of Odometry and poses, by topic; of odom in /tf
+    frames: Frames = field(default_factory=Frames)
+    ranges: int = 0
+
+
+def parse_mount(text: str) -> Mount:
+    """Return a lidar's place as it is typed: ``X,Y,DEG`` in m, m and degrees, and ``,flipped`` upside down."""
+    words = text.split(",")
+    flipped = len(words) == 4 and words.pop().strip() == "flipped"
+    try:
+        x, y, degrees = map(float, words)
+    except ValueError:
+        x = y = degrees = math.nan
+    if not max(abs(x), abs(y)) <= 10.0 or not abs(degrees) <= 360.0:
+        raise ValueError(f"mount {quoted(text)} is not X,Y,DEG in m and degrees; give for instance 0.2,0,180 or "
+                         "0.2,0,0,flipped")  # fmt: skip
+    return Mount(x, y, math.radians(degrees), flipped)
+
+
+def read(path: Path, topics: BagTopics) -> ScanLog:
+    """Read a ROS 2 bag: a folder of ``ros2 bag record``, or one of its files (MCAP or SQLite).
+
+    Scans before the first odometry and after the last are left out; at the others the odometry is interpolated.
+    Scans whose beams lie otherwise than the first one's take, at each of its bearings, the nearest beam.
+
+    Raises
+    ------
+    ValueError
+        One line: what is missing or damaged or says what no robot does; where topics have to be chosen, which
+        there are, and by which option.
+    """
+    found = _gather(path, topics)
+    where = f"bag {path}"
+    scan_topic = _choose(found, found.scans, topics.scan, "/scan", "scan", where)
+    odom_topic = _odometry_topic(found, topics, where)
+    track = found.tracks[odom_topic]
+    mount = topics.mount or _mount(found, track.child, found.scan_frames[scan_topic], where)
+    odometry_times, odometry = track.sorted()
+    stamps = np.array([stamp for stamp, _ in found.scans[scan_topic]])
+    covered = np.flatnonzero((stamps >= odometry_times[0]) & (stamps <= odometry_times[-1]))
+    if not len(covered):
+        raise ValueError(f"{where}: no scan of {scan_topic} is from the time of the odometry on {odom_topic}; "
+                         "record both by one clock")  # fmt: skip
+    if len(covered) > 1 and np.ptp(stamps[covered]) == 0.0:
+        raise ValueError(f"{where}: all scans of {scan_topic} have one time stamp; correct its driver")
+    stamps = stamps[covered]
+    poses = _beside(_at(stamps, odometry_times, odometry), mount)
+    jump = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    if len(jump) and jump.max() > _LONGEST_JUMP_M:
+        raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump.max():.4g} m; correct the log")
+    ranges, first = _ranges([found.scans[scan_topic][i][1] for i in covered], mount)
+    times = rising(stamps)
+    log = ScanLog(
+        name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]), times=times - times[0],
+        stamps=stamps, ranges=ranges, angle_min=first.angle_min, angle_increment=first.angle_increment,
+        range_max=first.range_max, odometry_poses=poses, start_pose=poses[0].copy(), reference_times=np.zeros(0),
+        reference_poses=np.zeros((0, 3)), reference_gap_s=_REFERENCE_GAP_S,
+        settings=SETTINGS | {"lidar_offset_m": mount.x_m}, note="no reference; give one with --reference-topic",
+    )  # fmt: skip
+    if topics.reference is None:
+        return log
+    _choose(found, found.tracks, topics.reference, "", "reference", where)
+    reference_times, reference = found.tracks[topics.reference].sorted()
+    rows = _bracketed(stamps, reference_times)
+    if not len(rows):
+        raise ValueError(f"{where}: {topics.reference} has no pose within {_REFERENCE_GAP_S} s of a scan")
+    note = f"reference: {topics.reference}; the start pose is the reference's"
+    at = _beside(_at(stamps[rows], reference_times, reference), mount)
+    return log.with_reference(rows, at, plain_name(note))
+
+
+# ---- reading ---------------------------------------------------------------------------------------------------
+
+
+def _gather(path: Path, topics: BagTopics) -> _Found:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError as error:
+        raise ValueError(f"bag {path}: reading it needs {error.name}; pip install 'mecanum-slam[ros]'") from error
+    # These types are the same in every ROS 2. What the bag says of its types is not read: it would be made code.
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    found = _Found()
+    for message in bag_messages(path, _TYPES, found.topics):
+        given = {_SCAN: topics.scan, **dict.fromkeys(_POSES, topics.reference or "")}.get(message.datatype)
+        if given not in (None, message.topic):
+            continue
+        try:
+            decoded = store.deserialize_cdr(message.data, message.datatype)
+        except Exception as error:  # struct's, NumPy's, Unicode's …
+            raise ValueError(
+                f"bag {path}: a message of {quoted(message.topic)} is damaged; mend the bag"
+            ) from error
+        try:
+            _take(found, message, decoded)
+        except ValueError as error:
+            raise ValueError(f"bag {path}: topic {quoted(message.topic)} {error}") from error
+    return found
+
+
+def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
+    topic = message.topic
+    if message.datatype == _TF:
+        for placed in transforms_of(decoded):
+            found.frames.add(placed)
+            if placed.parent.rpartition("/")[2] == "odom" and topic != "/tf_static":
+                pose = np.array([*placed.matrix[:2, 3], math.atan2(placed.matrix[1, 0], placed.matrix[0, 0])])
+                found.tracks.setdefault(topic, _Track(placed.child)).add(placed.time_s, pose)
+        return
+    if message.datatype == _SCAN:
+        scan = scan_of(decoded)
+        found.ranges += len(scan.ranges)
+        if found.ranges > _MOST_RANGES:
+            raise ValueError(f"has more than {_MOST_RANGES} ranges; cut the bag into shorter ones")
+        found.scan_frames.setdefault(topic, decoded.header.frame_id.lstrip("/"))
+        kept = scan._replace(ranges=scan.ranges.astype(np.float32))  # as they were recorded
+        found.scans.setdefault(topic, []).append((stamp_of(decoded), kept))
+        return
+    child = decoded.child_frame_id.lstrip("/") if message.datatype == _ODOMETRY else ""
+    of_pose = decoded.pose if message.datatype == _POSES[0] else decoded.pose.pose
+    pose = odometry_of(decoded) if message.datatype == _ODOMETRY else pose_of(of_pose)
+    found.tracks.setdefault(topic, _Track(child or "base_link")).add(stamp_of(decoded), pose)
+
+
+# ---- choosing --------------------------------------------------------------------------------------------------
+
+
+def _choose(found: _Found, held: Any, given: str | None, usual: str, what: str, where: str) -> str:
+    """Return the topic that is meant: the one given, the usual one, or the only one."""
+    if given is not None and given in held:
+        return given
+    if given is None and (usual in held or len(held) == 1):
+        return usual if usual in held else str(next(iter(held)))
+    said = f"no {what} on topic {quoted(given)}" if given is not None else (
+        f"{len(held)} topics could be the {what}" if held else f"no topic of a {what}"
+    )  # fmt: skip
+    raise ValueError(f"{where}: {said}; choose by --{what}-topic from {_listed(found)}")
+
+
+def _odometry_topic(found: _Found, topics: BagTopics, where: str) -> str:
+    held = [topic for topic in found.tracks if found.topics[topic] == _ODOMETRY and topic != topics.reference]
+    if topics.odom is not None or not held:
+        held += [topic for topic in found.tracks if found.topics[topic] == _TF]
+    return _choose(found, held, topics.odom, "/odom", "odom", where)
+
+
+def _listed(found: _Found) -> str:
+    shown = [
+        f"{quoted(topic)[1:-1]} ({quoted(datatype)[1:-1].rpartition('/')[2]})"
+        for topic, datatype in sorted(found.topics.items(), key=lambda item: (item[1] not in _TYPES, item[0]))
+    ]
+    more = f", and {len(shown) - _MOST_TOPICS} more" if len(shown) > _MOST_TOPICS else ""
+    return ", ".join(shown[:_MOST_TOPICS]) + more or "none: the bag has no topics"
+
+
+def _mount(found: _Found, base: str, sensor: str, where: str) -> Mount:
+    try:
+        matrix = found.frames.between(base, sensor)
+        if matrix is not None:
+            return mount_of(matrix)
+    except ValueError as error:
+        raise ValueError(f"{where} {error}") from error
+    raise ValueError(f"{where}: no transform says where the lidar {quoted(sensor)} is on {quoted(base)}; record "
+                     "/tf_static, or give --mount X,Y,DEG")  # fmt: skip
+
+
+# ---- poses and ranges at scans ---------------------------------------------------------------------------------
+
+
+def _ranges(scans: list[Scan], mount: Mount) -> tuple[Any, Scan]:
+    """Return ranges ``(n, beams)`` at the first scan's bearings by the robot's heading, and that scan."""
+    first = mount.level(scans[0])
+    like = (first.angle_min, first.angle_increment, len(first.ranges))
+    levelled = (mount.level(scan) for scan in scans)
+    rows: Iterator[Array] = (
+        s.ranges if (s.angle_min, s.angle_increment, len(s.ranges)) == like else resampled(s, *like)
+        for s in levelled
+    )
+    return np.stack([np.asarray(row, np.float32) for row in rows]), first
+
+
+def _at(stamps: Array, times: Array, poses: Array) -> Array:
+    """Return poses ``(m, 3)`` at stamps, between those at times ``(n,)``, whose headings are unwrapped."""
+    x, y, theta = (np.interp(stamps, times, column) for column in poses.T)
+    return np.column_stack([x, y, wrap(theta)])
+
+
+def _beside(poses: Array, mount: Mount) -> Array:
+    """Return poses ``(n, 3)`` of the robot's frame, moved sideways to stand behind the lidar."""
+    return moved_by(poses, np.array([0.0, mount.y_m, 0.0])) if mount.y_m else poses
+
+
+def _bracketed(stamps: Array, times: Array) -> Any:
+    """Return which stamps lie at or between times that are no farther apart than a reference may have gaps."""
+    after = np.searchsorted(times, stamps)
+    inside = after < len(times)
+    to = np.minimum(after, len(times) - 1)
+    exact = times[to] == stamps
+    gap = times[to] - times[np.maximum(to - 1, 0)]
+    return np.flatnonzero(inside & (exact | ((after > 0) & (gap <= _REFERENCE_GAP_S))))
