@@ -163,8 +163,9 @@ def fill(target: Any, message: Message) -> Any:
             fill(field, value)
         elif isinstance(value, np.ndarray):
             # An array of the very type is taken as it is; a list would be checked number by number.
-            setattr(target, name, type(field)(field.typecode, value.tolist())
-                    if hasattr(field, "typecode") else value.astype(field.dtype))  # fmt: skip
+            typed = hasattr(field, "typecode")
+            of_type = value.astype(field.typecode if typed else field.dtype)
+            setattr(target, name, type(field)(field.typecode, of_type.tobytes()) if typed else of_type)
         else:
             setattr(target, name, value)
     return target

@@ -19,6 +19,7 @@ from training.cli.play import play
 from training.cli.policy import policy
 from training.cli.replay import replay
 from training.cli.rooms import rooms
+from training.cli.ros import ros
 from training.cli.study import study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
@@ -72,7 +73,9 @@ def _root(
     """  # noqa: D301
 
 
-for command in (explore, rooms, speed, consistency, complexity, replay, benchmark, train, play, policy, doctor):
+for command in (
+    explore, rooms, speed, consistency, complexity, replay, benchmark, train, play, policy, ros, doctor,
+):  # fmt: skip
     app.command(cls=Command)(command)
 # A study's options are its own: what follows the name is handed on as it was typed.
 app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})(

@@ -1,0 +1,4 @@
+"""``mecanum ros``: a backend and an agent on a real robot's messages.
+
+``driver`` takes messages and says what to drive, without ROS; ``node`` is its only part that needs ROS 2.
+"""
