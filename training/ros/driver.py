@@ -172,7 +172,7 @@ class Driver:
         """Start the backend, now that the lidar is known."""
         assert self._mount is not None
         if abs(self._mount.y_m) > _BESIDE_M:
-            self._mount, beside = None, self._mount.y_m
+            beside, self._mount = self._mount.y_m, None
             raise ValueError(f"is of a lidar {beside:.2f} m to the left of the middle; {_BESIDE_M} m is the most")
         self.config = replace(self.config, lidar=lidar_of(scan, self._mount.x_m))
         self._backend = make_backend(self.config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, cast
 
 import gymnasium
@@ -20,22 +21,31 @@ from slam.ros import (
 from tests.slam.ros.bags_on_disk import ODOMETRY, SCAN, TF
 
 
-def packed(datatype: str, message: Message) -> Any:
-    """Return a message as it comes out of CDR."""
+@cache
+def humble() -> Any:
     from rosbags.typesys import Stores, get_typestore
 
-    types = get_typestore(Stores.ROS2_HUMBLE)
-    return types.deserialize_cdr(types.serialize_cdr(rosbags_message(types, datatype, message), datatype), datatype)
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def packed(datatype: str, message: Message) -> Any:
+    """Return a message as it comes out of CDR."""
+    types = humble()
+    return types.deserialize_cdr(
+        types.serialize_cdr(rosbags_message(types, datatype, message), datatype), datatype
+    )
 
 
 class Robot:
     """The environment's robot behind its topics: its clock began long ago, its odometry somewhere."""
 
-    def __init__(self, *, rooms: str = "rectangular", seed: int = 3, clock_s: float = 1.7e9, **settings: Any) -> None:
+    def __init__(
+        self, *, rooms: str = "rectangular", seed: int = 3, clock_s: float = 1.7e9, **settings: Any
+    ) -> None:
         wrapped = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms, disable_env_checker=True, **settings)
         wrapped.reset(seed=seed)
         self.env = cast("ExploreEnv", wrapped.unwrapped)
-        self.clock_s, self._odometry = clock_s, np.array([4.0, -2.0, 2.5])
+        self.clock_s, self.odometry_pose = clock_s, np.array([4.0, -2.0, 2.5])
         self.info: dict[str, Any] = {}
 
     def scan(self) -> Any:
@@ -43,7 +53,7 @@ class Robot:
 
     def odometry(self) -> Any:
         twist = np.asarray(self.env.odometry.twist)
-        return packed(ODOMETRY, odometry_message(self.clock_s, "odom", "base_link", self._odometry, twist))
+        return packed(ODOMETRY, odometry_message(self.clock_s, "odom", "base_link", self.odometry_pose, twist))
 
     def mount(self) -> Any:
         placed = transform_message("base_link", "laser", 0.0, [self.env.config.lidar.offset_m, 0.0, 0.0])
@@ -56,7 +66,9 @@ class Robot:
         if twist is not None:
             got = packed("geometry_msgs/msg/Twist", twist)
             limits = [config.robot.max_speed_m_s] * 2 + [config.robot.max_turn_rate_rad_s]
-            action = np.array([got.linear.x, got.linear.y, got.angular.z], np.float32) / np.array(limits, np.float32)
+            action = np.array([got.linear.x, got.linear.y, got.angular.z], np.float32) / np.array(
+                limits, np.float32
+            )
         *_, self.info = self.env.step(action)
-        self._odometry = move(self._odometry, np.asarray(self.env.odometry.twist), config.step_s)
+        self.odometry_pose = move(self.odometry_pose, np.asarray(self.env.odometry.twist), config.step_s)
         self.clock_s += config.step_s
