@@ -37,7 +37,9 @@ class BagMessage(NamedTuple):
 
 def is_bag(path: Path) -> bool:
     """Tell whether a path is a ROS 2 bag by its name: a file of one, or a folder with such files."""
-    return path.suffix in _SUFFIXES or (path.is_dir() and bool(_files(path) or list(path.glob("*.zstd"))))
+    if path.is_dir():
+        return bool(_files(path) or list(path.glob("*.zstd")))
+    return path.suffix in _SUFFIXES
 
 
 def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str]) -> Iterator[BagMessage]:

@@ -30,7 +30,7 @@ _TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
 
 _MOST_RANGES = 2**28  # of all scans together: a gibibyte
 _REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
-_LONGEST_JUMP_M = 1e3  # from scan to scan
+_LONGEST_JUMP_M = 1e3  # from one odometry to the next
 _MOST_TOPICS = 12  # that an error lists
 
 
@@ -79,9 +79,9 @@ class _Found:
 def parse_mount(text: str) -> Mount:
     """Return a lidar's place as it is typed: ``X,Y,DEG`` in m, m and degrees, and ``,flipped`` upside down."""
     words = text.split(",")
-    flipped = len(words) == 4 and words.pop().strip() == "flipped"
+    flipped = words[3:] == ["flipped"]
     try:
-        x, y, degrees = map(float, words)
+        x, y, degrees = map(float, words[:3] if flipped else words)
     except ValueError:
         x = y = degrees = math.nan
     if not max(abs(x), abs(y)) <= 10.0 or not abs(degrees) <= 360.0:
@@ -109,6 +109,9 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     track = found.tracks[odom_topic]
     mount = topics.mount or _mount(found, track.child, found.scan_frames[scan_topic], where)
     odometry_times, odometry = track.sorted()
+    jump = np.hypot(*np.diff(odometry[:, :2], axis=0).T).max(initial=0.0)
+    if jump > _LONGEST_JUMP_M:
+        raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump:.4g} m; correct the log")
     stamps = np.array([stamp for stamp, _ in found.scans[scan_topic]])
     covered = np.flatnonzero((stamps >= odometry_times[0]) & (stamps <= odometry_times[-1]))
     if not len(covered):
@@ -118,9 +121,6 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
         raise ValueError(f"{where}: all scans of {scan_topic} have one time stamp; correct its driver")
     stamps = stamps[covered]
     poses = _beside(_at(stamps, odometry_times, odometry), mount)
-    jump = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    if len(jump) and jump.max() > _LONGEST_JUMP_M:
-        raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump.max():.4g} m; correct the log")
     ranges, first = _ranges([found.scans[scan_topic][i][1] for i in covered], mount)
     times = rising(stamps)
     log = ScanLog(
@@ -203,9 +203,10 @@ def _choose(found: _Found, held: Any, given: str | None, usual: str, what: str, 
         return given
     if given is None and (usual in held or len(held) == 1):
         return usual if usual in held else str(next(iter(held)))
-    said = f"no {what} on topic {quoted(given)}" if given is not None else (
-        f"{len(held)} topics could be the {what}" if held else f"no topic of a {what}"
-    )  # fmt: skip
+    word = "odometry" if what == "odom" else what
+    said = f"{len(held)} topics could be the {word}" if held else f"no topic of {word}"
+    if given is not None:
+        said = f"no {word} on topic {quoted(given)}"
     raise ValueError(f"{where}: {said}; choose by --{what}-topic from {_listed(found)}")
 
 

@@ -61,18 +61,24 @@ class Frames:
 
     def between(self, base: str, sensor: str) -> Array | None:
         """Return the sensor's place on the base ``(4, 4)``; ``None`` where the tree does not connect them."""
-        (top, of_base), (other_top, of_sensor) = self._root(base), self._root(sensor)
-        return np.linalg.inv(of_base) @ of_sensor if top == other_top else None
+        over_base = self._chain(base)
+        for frame, matrix in self._chain(sensor).items():  # the nearest that both hang on comes first
+            if frame in over_base:
+                found: Array = np.linalg.inv(over_base[frame]) @ matrix
+                return found
+        return None
 
-    def _root(self, frame: str) -> tuple[str, Array]:
-        matrix, seen = np.eye(4), {frame}
+    def _chain(self, frame: str) -> dict[str, Array]:
+        """Return a frame and those above it, each with the first one's place in it."""
+        matrix = np.eye(4)
+        chain = {frame: matrix}
         while frame in self._above:
-            parent, step = self._above[frame]
-            if parent in seen:
-                raise ValueError(f"has frames in a circle, at {quoted(parent)}; correct its transforms")
-            frame, matrix = parent, step @ matrix
-            seen.add(frame)
-        return frame, matrix
+            frame, step = self._above[frame]
+            if frame in chain:
+                raise ValueError(f"has frames in a circle, at {quoted(frame)}; correct its transforms")
+            matrix = step @ matrix
+            chain[frame] = matrix
+        return chain
 
 
 def mount_of(matrix: Array) -> Mount:
