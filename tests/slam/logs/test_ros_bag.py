@@ -79,7 +79,8 @@ def test_a_real_log_as_a_bag_is_the_same_log(tmp_path: Path) -> None:
 def test_odometry_of_tf_and_of_any_name(log: ScanLog, tmp_path: Path) -> None:
     check_same(bag(write_bag(tmp_path / "tf", recorded(log, odometry="/tf"))), log)
     check_same(bag(write_bag(tmp_path / "named", recorded(log, odometry="/wheels"))), log)
-    both = write_bag(tmp_path / "both", chain(recorded(log), recorded(log, odometry="/tf")))
+    transforms = (message for message in recorded(log, odometry="/tf") if message[0] == "/tf")
+    both = write_bag(tmp_path / "both", chain(recorded(log), transforms))
     check_same(bag(both, odom="/tf", scan="/scan").until(log.duration_s), bag(both))
 
 

@@ -18,6 +18,7 @@ from training.studies.reliability.files.readers import READERS, Reader
 from training.studies.reliability.files.samples import landmarks
 
 QUICK = ("carmen", "configs", "landmarks", "policies", "ros-maps", "rows", "run-files", "victoria-park")
+QUICK += ("ros-bags",) if "ros-bags" in READERS else ()
 _SLOW = ("600 MB", "100 MB", "deep key", "deep table", "million", "noise", "10⁹", "end of header")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import importlib.util
 import subprocess
 import sys
 import tempfile
@@ -20,7 +21,14 @@ from slam.landmarks.database import read_landmark_map
 from training.episodes import explore
 from training.replay import run as replay
 from training.runs.errors import BadInput
-from training.studies.reliability.files import hostile, hostile_logs, hostile_stores, results, samples
+from training.studies.reliability.files import (
+    hostile,
+    hostile_bags,
+    hostile_logs,
+    hostile_stores,
+    results,
+    samples,
+)
 from training.studies.reliability.files.mutations import mutated, mutated_cells
 from training.studies.reliability.files.samples import Files, put
 
@@ -111,7 +119,7 @@ class Reader:
 
 
 def _damaged(name: str, data: bytes, rng: np.random.Generator) -> tuple[str, bytes, list[str]]:
-    if name.endswith((".db", ".sqlite")) and rng.random() < _CELLS:
+    if name.endswith((".db", ".db3", ".sqlite")) and rng.random() < _CELLS:
         return name, *mutated_cells(data, rng)
     if name.endswith(".safetensors") and rng.random() < _HEADER:
         size = 8 + int.from_bytes(data[:8], "little")
@@ -245,3 +253,9 @@ READERS: dict[str, Reader] = {
     ),
 }  # fmt: skip
 """Name → reader."""
+
+if all(map(importlib.util.find_spec, ("mcap", "rosbags"))):  # of an extra
+    READERS["ros-bags"] = Reader(
+        about="ROS 2 bags, MCAP and SQLite", sound=hostile_bags.bags, use=_log, command=_replay,
+        variants=(("drive.mcap", ("drive.mcap",)), ("drive.db3", ("drive.db3",))), hostile=hostile_bags.BAGS,
+    )  # fmt: skip
