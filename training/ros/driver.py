@@ -87,7 +87,8 @@ class Driver:
         self._heard = {"odometry": -math.inf, "scan": -math.inf}
         self._backend: Backend | None = None
         self._agent: Agent
-        self._scan: Scan  # the last, by the lidar's bearings as the agent knows them
+        self._layout: tuple[float, float, int]  # first bearing, step and beams of the scans that are mapped
+        self._scan: Scan  # the last, by the bearings of the lidar that the agent knows of
         self._at: tuple[float, Array]  # time and odometry of the last scan
         self._twist: tuple[float, float, float] = _STAND
         self._base, self._odom = "base_link", "odom"
@@ -157,11 +158,14 @@ class Driver:
             self._twist = self._plausible(twist_between(self._at[1], pose, dt))
             self._backend.predict(Odometry(self._twist, dt))
         assert self._backend is not None
-        lidar = self.config.lidar
-        ranges = resampled(levelled, lidar.angle_min, lidar.angle_increment, lidar.beams)
-        self._scan = Scan(ranges, lidar.angle_min, lidar.angle_increment, lidar.range_max_m, lidar.range_min_m)
+        lidar, layout = self.config.lidar, self._layout
+        mapped = Scan(resampled(levelled, *layout), *layout[:2], lidar.range_max_m, lidar.range_min_m)
+        ahead = resampled(mapped, lidar.angle_min, lidar.angle_increment, lidar.beams)
+        self._scan = mapped._replace(
+            ranges=ahead, angle_min=lidar.angle_min, angle_increment=lidar.angle_increment
+        )
         self._at = at, pose
-        self._backend.update(self._scan)
+        self._backend.update(mapped)
         self._heard["scan"] = now_s  # not before it was of use
         if not hasattr(self, "_agent"):
             body: dict[str, Any] = {"robot": self.config.robot, "lidar": lidar, "step_s": self.config.step_s}
@@ -175,6 +179,7 @@ class Driver:
             beside, self._mount = self._mount.y_m, None
             raise ValueError(f"is of a lidar {beside:.2f} m to the left of the middle; {_BESIDE_M} m is the most")
         self.config = replace(self.config, lidar=lidar_of(scan, self._mount.x_m))
+        self._layout = scan.angle_min, scan.angle_increment, len(scan.ranges)
         self._backend = make_backend(self.config)
         self._backend.reset(seed=self._seed)
         lidar = self.config.lidar
