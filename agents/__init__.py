@@ -16,7 +16,7 @@ from slam.settings import check_name
 if TYPE_CHECKING:
     from mecanum_env.config import LidarConfig, RobotConfig
 
-__all__ = ["Agent", "Goal", "check", "make", "names"]
+__all__ = ["Agent", "Goal", "check", "is_policy", "make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
@@ -64,10 +64,24 @@ def names() -> tuple[str, ...]:
 
 def check(name: str, *others: str) -> None:
     """Raise ``ValueError`` in one line unless :func:`make` takes the name, or it is one of the others."""
-    if isinstance(name, str) and name.endswith(".safetensors"):
-        _reader(name)
+    if isinstance(name, str) and is_policy(name):
+        _reader(_file_of(name))
     else:
         check_name("agent", name, (*names(), *others))
+
+
+def is_policy(name: str) -> bool:
+    """Tell whether an agent's name means a trained policy, in a file or on a hub."""
+    return name.endswith(".safetensors") or name.startswith("hf://")
+
+
+def _file_of(name: str) -> str:
+    """Return the file of a trained policy; one on a hub is fetched at need."""
+    if not name.startswith("hf://"):
+        return name
+    from agents.learned.hub import fetch
+
+    return str(fetch(name))
 
 
 def _reader(policy: str) -> str:
@@ -92,7 +106,8 @@ def make(
     Parameters
     ----------
     name : str
-        One of :func:`names`, or the path of a trained policy's ``.safetensors`` file, its ``.json`` beside it.
+        One of :func:`names`; the path of a trained policy's ``.safetensors`` file, its ``.json`` beside it; or
+        ``hf://USER/REPO[/NAME]@COMMIT``, one on a Hugging Face hub.
     config : dataclass or mapping, optional
         The agent's own configuration, ``agents.<module>.<Agent>Config``; a mapping where a policy is named.
     robot, lidar : config, mapping or preset name, optional
@@ -106,11 +121,12 @@ def make(
         For a name or key that is not known; the message lists the valid ones.
     """
     check(name)
-    if name.endswith(".safetensors"):
+    if is_policy(name):
         if not isinstance(config, Mapping | None):
             raise ValueError(f"config: with a policy's file {name} it must be a mapping, got {quoted(config)}")
-        config = {**(config or {}), "policy": name}
-        name = _reader(name)
+        policy = _file_of(name)
+        config = {**(config or {}), "policy": policy}
+        name = _reader(policy)
     module, _, attribute = _installed()[name].partition(":")
     agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)
     return agent

@@ -2,5 +2,5 @@
 
 ``choice`` with ``choice_network`` and ``chooser`` are those of ppo-frontier, ``drive_network`` and ``drive_plan``
 those of ppo, ``station_network`` that of learned-tour; ``layers`` is what they are made of, ``policy_files`` reads
-them all.
+them all, ``hub`` fetches and sends them.
 """

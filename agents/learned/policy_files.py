@@ -15,11 +15,12 @@ from safetensors.numpy import load, save
 from slam.files import quoted, read_bytes, read_json
 from slam.formats import atomic_write
 
-__all__ = ["policy_format", "read_policy", "write_policy"]
+__all__ = ["MOST_BYTES", "policy_format", "read_policy", "write_policy"]
 
 Made = TypeVar("Made")
 
-_MOST_BYTES = 256 * 2**20
+MOST_BYTES = 256 * 2**20
+"""Of a policy's file."""
 
 
 def policy_format(path: Path) -> str:
@@ -77,7 +78,7 @@ def _described(path: Path) -> dict[str, Any]:
 
 def _weights(path: Path) -> dict[str, NDArray[np.float32]]:
     try:
-        weights = load(read_bytes(path, what="policy", limit=_MOST_BYTES))
+        weights = load(read_bytes(path, what="policy", limit=MOST_BYTES))
     except (SafetensorError, LookupError, TypeError, ValueError) as error:
         raise ValueError(f"policy {path} cannot be read: {quoted(_words(error), 200)[1:-1]}") from error
     for name, value in weights.items():

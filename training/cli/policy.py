@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
@@ -13,19 +14,25 @@ __all__ = ["policy"]
 
 
 def policy(
-    source: Annotated[Path, typer.Argument(help="Folder of a run, .safetensors or .zip.")],
-    target: Annotated[Path, typer.Argument(help=".safetensors (a .json file is written beside it) or .zip.")],
+    source: Annotated[str, typer.Argument(help="Folder of a run, .safetensors, .zip or hf://USER/REPO.")],
+    target: Annotated[
+        str, typer.Argument(help=".safetensors (a .json file is written beside it), .zip or hf://USER/REPO.")
+    ],
     like: Annotated[
         Path | None,
         typer.Option(help="With a .zip for source: the .json file of the policy that it was trained on from."),
     ] = None,
+    private: Annotated[
+        bool, typer.Option("--private", help="To a hub: make the repository, if there is none, a private one.")
+    ] = False,
     member: Annotated[
         int | None, typer.Option(min=1, max=100, help="To a .zip: which of several networks that choose together.")
     ] = None,
 ) -> None:
     """Convert a policy: a run's best, the package's files, a zip of stable-baselines3 (ppo-frontier's only).
 
-    The package's files, .safetensors and .json, hold no code; of a zip the weights alone are read.
+    The package's files, .safetensors and .json, hold no code; of a zip the weights alone are read. A Hugging Face
+    hub, hf://USER/REPO[/NAME][@REVISION], is sent them or has them as they are; commit and SHA-256 are said.
 
     \b
     Examples:
@@ -33,7 +40,21 @@ def policy(
       mecanum policy mine.safetensors mine.zip
       mecanum policy three.safetensors mine.zip --member 2
       mecanum policy mine.zip other.safetensors --like mine.json
+      mecanum policy mine.safetensors hf://me/explorer
+      mecanum policy hf://me/explorer@v2 theirs.safetensors
     """  # noqa: D301
+    if any(name.startswith("hf://") for name in (source, target)):
+        if like is not None or member is not None:
+            raise BadInput("--like and --member are of a .zip; a hub has the package's files")
+        _over_the_hub(source, target, private)
+        return
+    if private:
+        raise BadInput("--private is of a hub, hf://USER/REPO; leave it out")
+    _convert(Path(source), Path(target), like, member)
+    print(f"wrote {target}")
+
+
+def _convert(source: Path, target: Path, like: Path | None, member: int | None) -> None:
     kinds = (_kind(source), target.suffix)
     if kinds not in ((".run", ".safetensors"), (".safetensors", ".zip"), (".zip", ".safetensors")):
         raise BadInput(
@@ -54,7 +75,39 @@ def policy(
         else:
             assert like is not None
             policies.export_policy(networks.read_zip(source), target, _read(like))
-    print(f"wrote {target}")
+
+
+def _over_the_hub(source: str, target: str, private: bool) -> None:
+    """Send a policy's files, or fetch them; of what is no policy of ours neither is done."""
+    import agents
+    from agents.learned import hub
+    from agents.learned.policy_files import MOST_BYTES
+    from slam.files import read_bytes
+    from slam.formats import atomic_write
+
+    if target.startswith(hub.PREFIX):
+        weights = Path(source)
+        if weights.suffix != ".safetensors":
+            raise BadInput(f"cannot send {source}; give a .safetensors file, its .json beside it")
+        with bad_input():
+            place = hub.parse(target)
+            agents.make(str(weights))  # it can be read
+            commit = hub.upload(weights, place, private=private)
+        print(f"sent to {place._replace(revision=commit)}")
+    else:
+        path = Path(target)
+        if path.suffix != ".safetensors":
+            raise BadInput(f"cannot write {target}; give the name of a .safetensors file")
+        check_writable(path.parent, (path.name,))
+        with bad_input():
+            place = hub.parse(source)
+            weights, commit = hub.download(place)
+            agents.make(str(weights))
+            for suffix in (".safetensors", ".json"):
+                atomic_write(path.with_suffix(suffix), read_bytes(weights.with_suffix(suffix), limit=MOST_BYTES))
+        print(f"wrote {target}, {place._replace(revision=commit)}")
+    for suffix in (".safetensors", ".json"):
+        print(f"sha256 {sha256(weights.with_suffix(suffix).read_bytes()).hexdigest()}  {suffix}")
 
 
 def _kind(path: Path) -> str:

