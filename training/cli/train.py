@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -41,6 +42,10 @@ def train(
     ] = None,
     ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
+    wandb: Annotated[
+        str | None,
+        typer.Option(metavar="PROJECT", help="Also follow it on Weights & Biases, in a project there."),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
 ) -> None:
     """Train a policy with PPO, in rehearsals or after imitation, as the configuration says.
@@ -55,6 +60,7 @@ def train(
       mecanum train --config ppo --out out/ppo
       mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
       mecanum train --config my.toml --out out/mine --resume
+      mecanum train --out out/frontier --wandb exploration
     """  # noqa: D301
     check_writable(out)
     settings = _read(config, seed)
@@ -63,12 +69,16 @@ def train(
         raise BadInput(f"{out} holds a run already; go on with it by --resume, or choose another --out")
     if resume and not begun:
         raise BadInput(f"{out} holds no run to go on with; leave out --resume")
+    if wandb is not None:
+        with needs_extra("wandb", "--wandb"):
+            import_module("wandb")
     with needs_extra("train", "training"):
         make_run = _runner(settings)
+        from training.learning.follow import Follow
     who = workers_of(workers, ray) or os.cpu_count() or 1
     with bad_input():
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
-        run = make_run(settings, out, workers=who, log=_say, command=command)
+        run = make_run(settings, out, workers=who, log=_say, command=command, follow=Follow(wandb))
     try:
         run.train()
     except KeyboardInterrupt as error:

@@ -16,6 +16,7 @@ from typing import Any
 from agents.learned.choice_network import joined
 from training.learning.config import TrainConfig
 from training.learning.folder import FolderRun, seed_of
+from training.learning.follow import Follow
 from training.learning.networks import read_zip
 from training.learning.ppo import Run, Weights, evaluate, trials_in_full
 from training.runs.campaign import Pool
@@ -40,7 +41,7 @@ class EnsembleRun(FolderRun):
             for number, folder in enumerate(folders):
                 config = replace(self.config, members=1, seed=seed_of(self.config.seed, number))
                 command = f"{self._progress['command']}: {folder.name}"
-                futures.append(pool.submit(_train_member, config, folder, command, said))
+                futures.append(pool.submit(_train_member, config, folder, command, said, self._follow))
             while not said.empty() or not all(future.done() for future in futures):
                 self._pass_on(said, futures)
         for future in futures:
@@ -64,7 +65,9 @@ class EnsembleRun(FolderRun):
                     future.result()
 
 
-def _train_member(config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]]) -> None:
+def _train_member(
+    config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]], follow: Follow
+) -> None:
     def log(text: str) -> None:
         said.put((out.name, text))
 
@@ -74,7 +77,7 @@ def _train_member(config: TrainConfig, out: Path, command: str, said: queue.Queu
             "that every node shares"
         )
 
-    Run(config, out, workers=1, log=log, command=command).train()
+    Run(config, out, workers=1, log=log, command=command, follow=follow).train()
 
 
 def best_weights(config: TrainConfig, out: Path) -> Weights:

@@ -7,6 +7,7 @@ alone, so that a run that was killed and resumed is the one that was not, bit fo
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,11 +25,13 @@ from slam.files import read_json
 from slam.formats import atomic_write, replacing
 from slam.settings import to_mapping
 from training.learning.config import PpoConfig
+from training.learning.follow import Follow, Sink
 from training.runs.campaign import Pool, Workers, worker_pool
 
 __all__ = ["FIRST_VALIDATION_SEED", "FolderRun", "save_model", "seed_of", "words"]
 
 FIRST_VALIDATION_SEED = 1000
+NOBODY = Follow()
 
 
 class FolderRun:
@@ -47,13 +50,14 @@ class FolderRun:
     """Number of the first chunk's seed."""
 
     def __init__(
-        self, config: Any, out: Path, *, workers: Workers, log: Callable[[str], None], command: str = ""
-    ) -> None:
-        self.config, self.out, self._workers, self._log = config, out, workers, log
+        self, config: Any, out: Path, *, workers: Workers, log: Callable[[str], None], command: str = "",
+        follow: Follow = NOBODY,
+    ) -> None:  # fmt: skip
+        self.config, self.out, self._workers, self._log, self._follow = config, out, workers, log, follow
         settings = json.loads(json.dumps(to_mapping(config)))
         self._progress: dict[str, Any] = {
             "config": settings, "command": command, "round": 0, "chunk": 0, "steps": 0, "best": None,
-            "best_in": "", "wall_s": 0.0, "done": False,
+            "best_in": "", "wall_s": 0.0, "done": False, "identity": secrets.token_hex(8),
         }  # fmt: skip
         path = out / "progress.json"
         if path.exists():
@@ -69,7 +73,12 @@ class FolderRun:
         self.out.mkdir(parents=True, exist_ok=True)
         self._began = time.perf_counter() - self._progress["wall_s"]
         self._keep()
-        with worker_pool(self._workers) as pool:
+        progress = self._progress
+        about = {**progress["config"], "command": progress["command"]}
+        with (
+            self._follow.noting(self.out, config=about, identity=progress["identity"]) as self._note,
+            worker_pool(self._workers) as pool,
+        ):
             self._train(pool)
         self._keep(done=True)
 
@@ -94,7 +103,9 @@ class FolderRun:
             Called with a chunk's number before it is learned; returns what stable-baselines3 calls back.
         """
         progress, checkpoint = self._progress, self.out / "checkpoint.zip"
-        model.set_logger(configure(str(self.out / "log"), ["tensorboard"]))
+        logger = configure(str(self.out / "log"), ["tensorboard"])
+        logger.output_formats.append(Sink(self._note))
+        model.set_logger(logger)
         model.num_timesteps = progress["steps"]
         if progress["chunk"] > first:
             model.set_parameters(str(checkpoint), device="cpu")
@@ -123,6 +134,8 @@ class FolderRun:
         line = at | result | {"wall_s": time.perf_counter() - self._began}
         atomic_write(path, "".join(json.dumps(each) + "\n" for each in [*kept, line]))
         self._say("evaluation: " + words(at | result))
+        noted = {f"evaluation/{name}": value for name, value in result.items()}
+        self._note({"steps": self._progress["steps"], **at, **noted})
         stage, best = at.get("stage", ""), self._progress["best"]
         # Seconds of a rehearsal are not those of the whole environment.
         if best is None or self._progress["best_in"] != stage or cost < best:
