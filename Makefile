@@ -19,7 +19,7 @@ export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium package rllib monte-carlo evaluate benchmark docs speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium package rllib online monte-carlo evaluate benchmark docs speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -81,6 +81,10 @@ package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and
 
 rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in CI: large)
 	$(RLLIB)/bin/python -m pytest tests/examples -k rllib
+
+online: $(VENV)/test.stamp ## the tests of --wandb and hf://, offline all the same (not in CI: large)
+	$(BIN)/python -m pip install --quiet -e '.[hub,wandb]'
+	$(BIN)/python -m pytest tests/agents/learned/test_hub.py tests/training/learning/test_follow.py
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo

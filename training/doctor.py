@@ -189,6 +189,13 @@ def _browser() -> Answers:
         yield {"works": False, "found": "none", "remedy": remedy}
 
 
+def _ros() -> Answers:
+    there = importlib.util.find_spec("rclpy") is not None
+    found = f"rclpy, {os.environ.get('ROS_DISTRO', 'of no named distribution')}" if there else "no rclpy"
+    remedy = "for `mecanum ros` alone: source /opt/ros/DISTRO/setup.bash"
+    yield {"works": there, "found": found, "remedy": remedy}
+
+
 def _gpu() -> Answers:
     remedy = "nothing to do: training runs on processor cores, and nothing else uses a GPU"
     if importlib.util.find_spec("torch") is None:
@@ -209,6 +216,7 @@ _CHECKS: tuple[tuple[str, bool, Callable[[], Answers]], ...] = (
     ("browser", False, _browser),
     ("window", False, _window),
     ("gpu", False, _gpu),
+    ("ros 2", False, _ros),
     ("extra", False, _extras),
 )
 
