@@ -39,7 +39,7 @@ def explore_refused(argv: list[str], capsys: pytest.CaptureFixture[str], out: Pa
             [
                 "unknown command 'explor'",
                 "did you mean explore?",
-                "valid: benchmark, complexity, consistency, doctor, explore, play, policy, replay, rooms, ros, speed",
+                "valid: benchmark, complexity, consistency, doctor, explore, play, policy, replay, rooms, ros, ",
             ],
         ),
         (["--sed", "3"], ["unknown option --sed", "--version"]),
