@@ -16,6 +16,7 @@ from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
+from slam.files import quoted
 from slam.settings import Within, argument, checked, from_mapping
 
 __all__ = ["ChoiceEnv", "ExploreFrontierEnv", "as_observation", "choice_space"]
@@ -183,9 +184,13 @@ class ExploreFrontierEnv(ChoiceEnv):
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Drive to a view point until the next choice is due; see the class."""
-        k = int(action)
-        if not self.action_space.contains(np.int64(k)):
-            raise ValueError(f"action must be 0 … {self.driver.choice.most - 1}, got {action}")
+        most = self.driver.choice.most
+        try:
+            k = int(action)
+        except (TypeError, ValueError, OverflowError):
+            k = most
+        if not 0 <= k < most:
+            raise ValueError(f"action must be 0 … {most - 1}, got {quoted(action)}")
         self._take(k)
         config, agent = self.config, self.agent
         patience = math.ceil(_DONE_AFTER_S / config.step_s)

@@ -64,7 +64,9 @@ class OdometrySlam(EkfSlam):
     @property
     def belief(self) -> Belief:
         """Pose, landmarks and grid; there is no joint covariance."""
-        return dataclasses.replace(super().belief, pose_cov=self.pose_cov, joint_cov=None, whole_cov=None)
+        return dataclasses.replace(
+            super().belief, pose_cov=self.pose_cov, joint_cov=None, whole_cov=None, _read=None
+        )
 
 
 class TruthSlam(OdometrySlam):

@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from mecanum_env.config import RobotConfig
+from slam.files import quoted
 from slam.types import Array
 
 __all__ = [
@@ -125,20 +126,22 @@ def _numbers(action: ArrayLike) -> NDArray[Any]:
     if type(action) is np.ndarray and action.dtype is _FLOAT32 and action.flags.c_contiguous:
         return action
     try:
-        return np.array(action, np.float64)
-    except (TypeError, ValueError):
+        numbers = np.asarray(action)
+        return np.empty(0) if numbers.dtype.kind == "c" else np.array(numbers, np.float64)
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)
 
 
 def _no_action(action: ArrayLike, size: int) -> ValueError:
-    return ValueError(f"an action must be {size} finite numbers in [-1, 1], got {action!r}")
+    return ValueError(f"an action must be {size} finite numbers in [-1, 1], got {quoted(action)}")
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _twist_to_wheels(fractions: NDArray[Any], limits: Array, wheels: Array) -> bool:
     """Write the wheel speeds of a twist; tell whether its numbers are finite (see :class:`WheelTargets`)."""
-    if not math.isfinite(fractions[0] + fractions[1] + fractions[2]):
-        return False
+    for i in range(3):  # each: large ones add up to infinity
+        if not math.isfinite(fractions[i]):
+            return False
     fx = min(max(fractions[0], -1.0), 1.0)
     fy = min(max(fractions[1], -1.0), 1.0)
     fw = min(max(fractions[2], -1.0), 1.0)
@@ -155,9 +158,9 @@ def _twist_to_wheels(fractions: NDArray[Any], limits: Array, wheels: Array) -> b
 @njit(cache=True, nogil=True, error_model="numpy")
 def _scale_wheels(fractions: NDArray[Any], limits: Array, wheels: Array) -> bool:
     """Write wheel speeds from fractions of the limit; tell whether these are finite."""
-    if not math.isfinite(fractions[0] + fractions[1] + fractions[2] + fractions[3]):
-        return False
     for i in range(4):
+        if not math.isfinite(fractions[i]):
+            return False
         wheels[i] = min(max(fractions[i], -1.0), 1.0) * limits[4]
     return True
 

@@ -22,6 +22,8 @@ _PERSISTENCE = 8.0
 # a robot that stands must not become certain of where it is.
 _FLOOR_M_S = 0.0001
 
+_LEAST_RANGE_SIGMA_M = 0.0001  # of a lidar that has no noise: no filter divides by zero
+
 
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
     """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
@@ -60,7 +62,7 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
         "body_radius_m": 0.5 * (config.robot.inscribed_radius_m + config.robot.circumscribed_radius_m),
         "grid_resolution_m": config.grid_resolution_m,
         "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
-        "features": {"range_sigma_m": config.noise.range_sigma_m},
+        "features": {"range_sigma_m": max(config.noise.range_sigma_m, _LEAST_RANGE_SIGMA_M)},
     }
     given = config.slam_config.get("odometry")
     whole = {"speed_share", "turn_share_rad_m"}

@@ -151,6 +151,8 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         board = self._board
         if np.shape(actions) != board.actions.shape:
             raise ValueError(f"actions must be {board.actions.shape}, got {np.shape(actions)}")
+        if not np.isfinite(actions).all():  # before any environment has stepped
+            raise ValueError(f"actions must be finite numbers in [-1, 1], got {quoted(actions)}")
         board.actions[:] = actions
         number = self._turn()
         page, infos = board.pages[number], self._infos(number, self._step(number))

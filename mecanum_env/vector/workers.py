@@ -246,7 +246,7 @@ def _work(number: int, pipe: Connection, due: Any, done: Any, make: Make, board:
     """Do as told until told to quit, or until the caller is no more."""
     for told in (signal.SIGINT, signal.SIGTERM):  # they reach every process of a job: it is the caller's affair
         signal.signal(told, signal.SIG_IGN)
-    np.seterr(all="warn")
+    np.seterr(divide="warn", over="warn", under="ignore", invalid="warn")  # NumPy's own, whatever the caller set
     caller, orders = multiprocessing.parent_process(), board.orders
     share: Share | None = None
     try:

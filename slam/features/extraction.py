@@ -28,7 +28,7 @@ __all__ = ["FeatureConfig", "FeatureExtractor"]
 class FeatureConfig(Config):
     """What counts as a straight surface and as a corner."""
 
-    range_sigma_m: Annotated[float, Within("[0, 10]")] = 0.01  # of one beam, along it
+    range_sigma_m: Sigma = 0.01  # of one beam, along it
     split_sigmas: NotNegative = 4.0  # a piece is split where it departs from its chord by more than this
     split_floor_m: Gap = 0.02  # … and by more than this
     min_points: Annotated[int, Within("[4, 10000]")] = 6

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 
 import gymnasium
@@ -198,8 +199,9 @@ def test_a_slippery_floor_is_driven_on_gently_once_the_wheels_have_told_of_it():
 def test_it_says_what_is_wrong():
     env = gymnasium.make(ID, rooms="rectangular").unwrapped
     env.reset(seed=0)
-    with pytest.raises(ValueError, match="action must be 0 … 23, got 24"):
-        env.step(24)
+    for nonsense in (24, -1, 10**30, math.nan, math.inf, None, "first", [0, 1], np.zeros((9, 9))):
+        with pytest.raises(ValueError, match=r"^action must be 0 … 23, got .*$"):
+            env.step(nonsense)
     with pytest.raises(ValueError, match="discount"):
         ExploreFrontierEnv(discount=0.0)
     with pytest.raises(ValueError, match="valid"):

@@ -263,12 +263,43 @@ def test_wrong_settings_are_named(kwargs: dict[str, Any], message: str) -> None:
             make(**kwargs)
 
 
-@pytest.mark.parametrize("action", [[math.nan, 0, 0], [0, 0], [0, 0, 0, 0], [math.inf, 0, 0]])
-def test_wrong_actions_are_refused(action: list[float]) -> None:
+@pytest.mark.parametrize(
+    "action",
+    [
+        [math.nan, 0, 0], [0, 0], [0, 0, 0, 0], [math.inf, 0, 0], [[0.0], [0.0], [0.0]], [1j, 0, 0], [10**400] * 3,
+        ["a", "b", "c"], None,
+    ],
+)  # fmt: skip
+def test_wrong_actions_are_refused(action: Any) -> None:
     env = make().unwrapped
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"an action must be 3 finite numbers in \[-1, 1\]"):
-        env.step(np.array(action, np.float32))
+    for given in (action, np.array(action)):
+        with pytest.raises(ValueError, match=r"^an action must be 3 finite numbers in \[-1, 1\], got .{1,60}$"):
+            env.step(given)
+
+
+def test_actions_beyond_the_limits_are_the_limits() -> None:
+    ends = []
+    for size in (1.0, 3e38):
+        env = make().unwrapped
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.full(3, size, np.float32))
+        ends.append(env.truth.world.pose)
+    assert np.array_equal(*ends)
+
+
+@pytest.mark.parametrize("backend", slam.names())
+def test_every_backend_works_with_sensors_that_have_no_noise(backend: str) -> None:
+    noise = dict.fromkeys(("range_sigma_m", "dropout", "encoder", "radius_error", "base_error"), 0.0)
+    env = make(slam=backend, noise=noise)
+    env.reset(seed=1)
+    for k in range(12):
+        observation, reward, *_ = env.step(np.array([0.5, 0.2 * (-1) ** k, 0.5], np.float32))
+    assert env.observation_space.contains(observation) and math.isfinite(reward)
+    belief = env.unwrapped.belief
+    assert np.isfinite(belief.landmarks).all() and np.linalg.eigvalsh(belief.pose_cov)[0] > 0.0
+    assert np.hypot(*(belief.pose - env.unwrapped.truth.pose)[:2]) < 0.05
 
 
 def test_mappings_presets_and_files_configure(tmp_path: Path) -> None:

@@ -54,6 +54,15 @@ def test_its_covariances_agree_with_one_another() -> None:
         _ = belief.covariance
 
 
+@pytest.mark.parametrize("name", ["odometry", "truth"])
+def test_in_a_team_too_it_has_no_covariance_that_the_backend_has_not(name: str) -> None:
+    backend = _backend(name)
+    belief = backend.belief.in_team(1, backend.grid, ())
+    for it in (backend.belief, belief):
+        assert it.whole_cov is None and it.joint_cov is None and not it.has_whole_cov
+    assert belief.robot == 1 and len(belief.landmarks) == len(belief.landmark_cov) == 3
+
+
 def test_copies_of_it_are_the_same() -> None:
     backend = _backend("ekf")
     replaced = dataclasses.replace(backend.belief, health=0.5)

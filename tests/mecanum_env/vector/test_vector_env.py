@@ -202,10 +202,28 @@ def test_what_one_raises_the_caller_raises_and_goes_on(envs: ExploreVectorEnv) -
     envs.reset(seed=0)
     with pytest.raises(FloorPlanError, match="start"):
         envs.reset(options={"start_pose": (99.0, 99.0, 0.0)})
-    with pytest.raises(ValueError, match="an action must be 3 finite numbers"):
+    with pytest.raises(ValueError, match="actions must be finite numbers"):
         envs.step(np.full((3, 3), np.nan, np.float32))
     envs.reset(seed=0)
     envs.step(np.zeros((3, 3), np.float32))
+
+
+def test_an_action_that_is_refused_has_moved_nobody(envs: ExploreVectorEnv) -> None:
+    theirs = like()
+    assert_same(envs.reset(seed=7), theirs.reset(seed=7))
+    bad = np.full((3, 3), 0.5, np.float32)
+    bad[2, 1] = np.inf
+    with pytest.raises(ValueError, match=r"actions must be finite numbers in \[-1, 1\], got"):
+        envs.step(bad)
+    assert_same(envs.step(np.full((3, 3), 0.5, np.float32)), theirs.step(np.full((3, 3), 0.5, np.float32)))
+    theirs.close()
+
+
+def test_other_processes_warn_of_no_more_than_this_one(capfd: pytest.CaptureFixture[str]) -> None:
+    envs = batch(2, workers=2, config={"rooms": "cave"})  # whose outlines underflow
+    envs.call("reset", options={"room_seed": 3})
+    envs.close()
+    assert "Warning" not in capfd.readouterr().err
 
 
 def test_bad_arguments_are_told_before_any_process_starts() -> None:

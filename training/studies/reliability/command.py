@@ -21,10 +21,11 @@ from training.runs.rows import resume
 from training.studies.reliability.files.part import FILES
 from training.studies.reliability.page import page
 from training.studies.reliability.parts import Part, Summary
+from training.studies.reliability.steps.part import STEPS
 
 __all__ = ["PARTS", "study"]
 
-PARTS: dict[str, Part] = {"files": FILES}
+PARTS: dict[str, Part] = {"files": FILES, "steps": STEPS}
 """Name → part; each has an option of its name, its size."""
 
 PAGE = "report.html"
@@ -33,6 +34,7 @@ PAGE = "report.html"
 def study(
     parts: Annotated[str, typer.Option(help=f"Of {', '.join(PARTS)}; separated by commas.")] = ",".join(PARTS),
     files: Annotated[int, typer.Option(min=1, max=10**9, help="Files for each reader.")] = FILES.size,
+    steps: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of all environments.")] = STEPS.size,
     seed: Seed = 0,
     workers: Workers = 1,
     ray: Ray = None,
@@ -50,7 +52,7 @@ def study(
         for name in chosen:
             if name not in PARTS:
                 raise unknown_name("part", name, PARTS)
-    sizes = {"files": files}
+    sizes = {"files": files, "steps": steps}
     who = workers_of(workers, ray)
     keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
     found: dict[str, Summary] = {}
@@ -62,7 +64,7 @@ def study(
     atomic_write(out / PAGE, page({name: (PARTS[name], summary) for name, summary in found.items()}))
     for name, summary in found.items():
         print(text_table(*PARTS[name].table(summary)))
-        print("\n".join([f"{name}: {summary['tried']} tried, {len(summary['failures'])} failed"]))
+        print(f"{name}: {summary['tried']} tried, {len(summary['failures'])} failed")
         print("\n".join(f"  {line}" for line in summary["failures"][:_SHOWN]))
     if any(summary["failures"] for summary in found.values()):
         raise typer.Exit(1)

@@ -89,7 +89,7 @@ def test_what_a_reader_does_wrong_is_found(error: Exception | None, end: str, tm
 
 
 def test_a_child_that_hangs_or_dies_is_noted_and_the_next_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard, "_MODULE", "tests.training.studies.bad_child")
+    monkeypatch.setattr(guard, "_MODULE", "tests.training.studies.reliability.bad_child")
     monkeypatch.setattr(guard, "BOUND_S", 0.5)
     monkeypatch.setattr(guard, "_PATIENCE_S", 2.0)
     monkeypatch.setattr(guard, "_LOOKS_S", 0.1)
