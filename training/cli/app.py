@@ -94,11 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    command = typer.main.get_command(app)
     name = "mecanum"
-    if arguments and arguments[0] in _commands():
-        name = f"mecanum {arguments[0]}"
     try:
+        command = typer.main.get_command(app)
+        if arguments and arguments[0] in _commands():
+            name = f"mecanum {arguments[0]}"
         code = command.main(args=arguments, prog_name="mecanum", standalone_mode=False)
         sys.stdout.flush()
         if code == INTERRUPTED:  # newer versions of typer hand KeyboardInterrupt back so

@@ -19,13 +19,14 @@ from training.runs.errors import bad_input
 from training.runs.options import Ray, Seed, Workers, workers_of
 from training.runs.rows import resume
 from training.studies.reliability.files.part import FILES
+from training.studies.reliability.kills.part import KILLS
 from training.studies.reliability.page import page
 from training.studies.reliability.parts import Part, Summary
 from training.studies.reliability.steps.part import STEPS
 
 __all__ = ["PARTS", "study"]
 
-PARTS: dict[str, Part] = {"files": FILES, "steps": STEPS}
+PARTS: dict[str, Part] = {"files": FILES, "steps": STEPS, "kills": KILLS}
 """Name → part; each has an option of its name, its size."""
 
 PAGE = "report.html"
@@ -35,6 +36,7 @@ def study(
     parts: Annotated[str, typer.Option(help=f"Of {', '.join(PARTS)}; separated by commas.")] = ",".join(PARTS),
     files: Annotated[int, typer.Option(min=1, max=10**9, help="Files for each reader.")] = FILES.size,
     steps: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of all environments.")] = STEPS.size,
+    kills: Annotated[int, typer.Option(min=1, max=10**6, help="Kills of running commands.")] = KILLS.size,
     seed: Seed = 0,
     workers: Workers = 1,
     ray: Ray = None,
@@ -52,7 +54,7 @@ def study(
         for name in chosen:
             if name not in PARTS:
                 raise unknown_name("part", name, PARTS)
-    sizes = {"files": files, "steps": steps}
+    sizes = {"files": files, "steps": steps, "kills": kills}
     who = workers_of(workers, ray)
     keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
     found: dict[str, Summary] = {}
