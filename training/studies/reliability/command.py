@@ -1,4 +1,4 @@
-"""``mecanum study reliability``: a campaign against everything that takes input; each part has a size of its own.
+"""``mecanum study reliability``: a campaign against the whole; each part has a size of its own.
 
 What is found is in ``<part>.json`` and on one page; ``docs/studies/reliability.md`` tells what was mended.
 """
@@ -22,11 +22,13 @@ from training.studies.reliability.files.part import FILES
 from training.studies.reliability.kills.part import KILLS
 from training.studies.reliability.page import page
 from training.studies.reliability.parts import Part, Summary
+from training.studies.reliability.places.part import PLACES
+from training.studies.reliability.soak.part import SOAK
 from training.studies.reliability.steps.part import STEPS
 
 __all__ = ["PARTS", "study"]
 
-PARTS: dict[str, Part] = {"files": FILES, "steps": STEPS, "kills": KILLS}
+PARTS: dict[str, Part] = {"files": FILES, "steps": STEPS, "kills": KILLS, "places": PLACES, "soak": SOAK}
 """Name → part; each has an option of its name, its size."""
 
 PAGE = "report.html"
@@ -34,27 +36,31 @@ PAGE = "report.html"
 
 def study(
     parts: Annotated[str, typer.Option(help=f"Of {', '.join(PARTS)}; separated by commas.")] = ",".join(PARTS),
-    files: Annotated[int, typer.Option(min=1, max=10**9, help="Files for each reader.")] = FILES.size,
-    steps: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of all environments.")] = STEPS.size,
-    kills: Annotated[int, typer.Option(min=1, max=10**6, help="Kills of running commands.")] = KILLS.size,
+    files: Annotated[int, typer.Option(min=1, max=10**9, help="Files for each reader.")] = int(FILES.size),
+    steps: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of all environments.")] = int(STEPS.size),
+    kills: Annotated[int, typer.Option(min=1, max=10**6, help="Kills of running commands.")] = int(KILLS.size),
+    places: Annotated[int, typer.Option(min=1, max=1000, help="Rounds of places.")] = int(PLACES.size),
+    soak: Annotated[float, typer.Option("--soak", "--hours", min=0.001, max=1000, help="Hours.")] = SOAK.size,
     seed: Seed = 0,
     workers: Workers = 1,
     ray: Ray = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/reliability"),
 ) -> None:
-    """Try to break what takes input: mutated and hostile files for every reader. Goes on where it was broken off.
+    """Try to break the whole: files, steps, kills, places, hours. Goes on where it was broken off.
+
+    Without sizes it is the whole campaign, of days.
 
     \b
     Examples:
-      mecanum study reliability
-      mecanum study reliability --parts files --files 10000 --out out/reliability
+      mecanum study reliability --files 60 --steps 3000 --kills 4 --places 1 --hours 0.1
+      mecanum study reliability --parts files,steps --files 1000 --steps 1000000 --workers 4
     """  # noqa: D301
     with bad_input():
         chosen = list(dict.fromkeys(name.strip() for name in parts.split(",")))
         for name in chosen:
             if name not in PARTS:
                 raise unknown_name("part", name, PARTS)
-    sizes = {"files": files, "steps": steps, "kills": kills}
+    sizes = {"files": files, "steps": steps, "kills": kills, "places": places, "soak": soak}
     who = workers_of(workers, ray)
     keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
     found: dict[str, Summary] = {}

@@ -24,8 +24,8 @@ class Part:
     """
 
     about: str  # a line
-    size: int  # how much is done where nothing is said: what takes seconds
-    jobs: Callable[[int, int], Sequence[Job]]  # of a size and a seed
+    size: float  # how much is done where nothing is said: the whole campaign
+    jobs: Callable[[Any, int], Sequence[Job]]  # of a size and a seed
     work: Callable[[Job], Row]
     sum_up: Callable[[Mapping[Job, Row]], Summary]
     table: Callable[[Summary], Table]

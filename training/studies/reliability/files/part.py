@@ -79,5 +79,5 @@ def _table(found: Summary) -> Table:
 
 FILES = Part(
     about="Mutated and hostile files: read as they are, or refused in one line, in bounded time and memory.",
-    size=60, jobs=_jobs, work=_work, sum_up=_sum_up, table=_table,
+    size=10_000, jobs=_jobs, work=_work, sum_up=_sum_up, table=_table,
 )  # fmt: skip

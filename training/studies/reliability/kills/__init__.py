@@ -1,4 +1,5 @@
 """The part ``kills``: commands killed at random moments and run again, until they have come to their end.
 
-``commands`` says which, ``results`` reads what they leave, ``killing`` starts and kills, ``part`` is the part.
+``commands`` says which, ``killing`` starts and kills, ``results`` reads what they leave, ``alone`` is a run that
+nobody disturbs, ``part`` is the campaign's part.
 """

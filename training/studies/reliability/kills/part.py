@@ -6,15 +6,14 @@ import shutil
 import signal
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from training.runs.signals import TERMINATED
-from training.studies.reliability.kills.commands import COMMANDS, inputs, installed
+from training.studies.reliability.kills.alone import argv_of, undisturbed
+from training.studies.reliability.kills.commands import COMMANDS, installed
 from training.studies.reliability.kills.killing import Moment, Run, run
 from training.studies.reliability.kills.results import damaged, differences, kept, results
 from training.studies.reliability.parts import Job, Part, Row, Summary, Table
@@ -32,27 +31,10 @@ def _jobs(size: int, seed: int) -> list[Job]:
     ]  # fmt: skip
 
 
-@cache
-def _undisturbed(name: str) -> tuple[dict[str, Any], Run]:
-    """Return the results of a run that nobody kills, and how it went."""
-    with tempfile.TemporaryDirectory(prefix="kills-") as place:
-        out = Path(place) / "out"
-        done = run(_argv(name, Path(place), again=False), out)
-        if done.code:
-            raise RuntimeError(f"{done.command} ends with {done.code}: {done.error[-300:]}")
-        return results(out), done
-
-
-def _argv(name: str, place: Path, *, again: bool) -> Sequence[str]:
-    command = COMMANDS[name]
-    words = [word.replace("{in}", str(inputs())) for word in command.argv]
-    return [*words, *(command.again if again else ()), "--out", str(place / "out")]
-
-
 def _work(job: Job) -> Row:
     """Kill a command some times, each time run again, and hold what it ends with against a run left alone."""
     name, seed, index, kills = job
-    whole, alone = _undisturbed(name)
+    whole, alone = undisturbed(name)
     rng = np.random.default_rng([seed, index])
     row: Row = {"kills": 0, "codes": [], "wrong": [], "rows_kept": 0, "seconds": 0.0}
     with tempfile.TemporaryDirectory(prefix="kills-") as folder:
@@ -60,7 +42,7 @@ def _work(job: Job) -> Row:
         before: set[str] = set()
         for k in range(kills):
             moment = _moment(rng, alone, k + index)
-            done = run(_argv(name, place, again=k > 0), place / "out", moment)
+            done = run(argv_of(name, place / "out", again=k > 0), place / "out", moment)
             row["seconds"] += done.seconds
             row["wrong"] += [f"kill {k} ({moment}): {line}" for line in _judged(done, moment)]
             if done.code == 0:
@@ -69,7 +51,7 @@ def _work(job: Job) -> Row:
             row["codes"].append(done.code)
             before = _left(place, COMMANDS[name].goes_on, before, row["wrong"])
         else:
-            done = run(_argv(name, place, again=kills > 0), place / "out")
+            done = run(argv_of(name, place / "out", again=kills > 0), place / "out")
             row["seconds"] += done.seconds
             row["wrong"] += [f"at last: {line}" for line in _judged(done, None)]
         row["rows_kept"] = len(before)
