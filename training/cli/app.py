@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import traceback
@@ -90,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; what goes wrong is one line on standard error."""
     with heed_sigterm() as ended:
         code = _run(list(sys.argv[1:] if argv is None else argv))
-    return TERMINATED if ended.is_set() and code == INTERRUPTED else code
+    # Amid an import it may come out as any error.
+    return TERMINATED if ended.is_set() and code in (1, INTERRUPTED) else code
 
 
 def _run(arguments: list[str]) -> int:
@@ -124,9 +126,11 @@ def _run(arguments: list[str]) -> int:
 
 
 def _fail(name: str, message: str, code: int) -> int:
-    from slam.files import plain_name  # not before something is wrong: --help is quick
+    with contextlib.suppress(Exception):  # what Ctrl-C breaks off while it is imported stays half there
+        from slam.files import plain_name  # not before something is wrong: --help is quick
 
-    print(f"{name}: {plain_name(message, _LONGEST)}", file=sys.stderr)
+        message = plain_name(message, _LONGEST)
+    print(f"{name}: {message}", file=sys.stderr)
     return code
 
 

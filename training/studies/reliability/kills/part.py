@@ -21,6 +21,7 @@ from training.studies.reliability.parts import Job, Part, Row, Summary, Table
 __all__ = ["KILLS"]
 
 _KILLS = 4  # of a work item, then it is let go on to its end
+_LATEST = 0.7  # of a run: where it goes on, it has less to do
 _SIGNALS = (signal.SIGKILL, signal.SIGTERM)
 
 
@@ -68,8 +69,8 @@ def _moment(rng: np.random.Generator, alone: Run, k: int) -> Moment:
     """Draw a moment: of the time that a run takes, or of the writing that it does."""
     how = int(_SIGNALS[k % 2])
     if rng.random() < 0.4:
-        return Moment(signal=how, after_s=float(rng.uniform(0.02, alone.seconds)))
-    return Moment(signal=how, changes=int(rng.integers(1, max(alone.changes, 1) + 1)))
+        return Moment(signal=how, after_s=float(rng.uniform(0.02, _LATEST * alone.seconds)))
+    return Moment(signal=how, changes=int(rng.integers(1, max(_LATEST * alone.changes, 1) + 1)))
 
 
 def _judged(done: Run, moment: Moment | None) -> list[str]:
