@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import secrets
 import signal
@@ -42,7 +43,7 @@ class Run:
     seconds: float
     changes: int  # of its folder
     error: str  # what it said
-    left: int  # processes that it started and that did not end
+    left: tuple[str, ...]  # processes that it started and that did not end
     command: str = ""
 
 
@@ -91,17 +92,17 @@ def _look(folder: Path) -> tuple[tuple[str, int, int], ...]:
     return tuple(sorted(found))
 
 
-def _wait_for(mark: str) -> int:
-    """Wait for the processes that bear a mark in their environment; end and count those that stay."""
+def _wait_for(mark: str) -> tuple[str, ...]:
+    """Wait for the processes that bear a mark in their environment; end and name those that stay."""
     began = time.monotonic()
     while (pids := _marked(mark)) and time.monotonic() - began < _LEAVE_S:
         time.sleep(0.05)
+    names = []
     for pid in pids:
-        try:
+        with contextlib.suppress(OSError):
+            names.append(Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()[:80])
             os.kill(pid, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-    return len(pids)
+    return tuple(names)
 
 
 def _marked(mark: str) -> list[int]:

@@ -70,7 +70,7 @@ def _moment(rng: np.random.Generator, alone: Run, k: int) -> Moment:
     how = int(_SIGNALS[k % 2])
     if rng.random() < 0.4:
         return Moment(signal=how, after_s=float(rng.uniform(0.02, _LATEST * alone.seconds)))
-    return Moment(signal=how, changes=int(rng.integers(1, max(_LATEST * alone.changes, 1) + 1)))
+    return Moment(signal=how, changes=1 + int(rng.uniform() * _LATEST * alone.changes))
 
 
 def _judged(done: Run, moment: Moment | None) -> list[str]:
@@ -85,7 +85,7 @@ def _judged(done: Run, moment: Moment | None) -> list[str]:
     if "Traceback" in done.error:
         wrong.append(f"a traceback: {done.error[-600:]}")
     if done.left:
-        wrong.append(f"{done.left} processes went on")
+        wrong.append(f"{len(done.left)} processes went on: {', '.join(done.left)}")
     return wrong
 
 

@@ -114,7 +114,7 @@ def _sum_up(rows: Mapping[Job, Row]) -> Summary:
 
 
 def _told(samples: Any) -> dict[str, Any]:
-    """Return of a life's samples (time [s], MB, handles, threads) what they amount to but for its first minutes."""
+    """Return of a life's samples (time [s], MB, handles, threads) what they amount to, after its first minutes."""
     hours = (samples[:, 0] - samples[0, 0]) / 3600.0
     warm = samples[hours >= _WARM_S / 3600.0]
     measured = warm if len(warm) >= _SAMPLES else samples
