@@ -178,10 +178,11 @@ def _agreeing(joint: Joint, config: AlignmentConfig) -> NDArray[np.bool_]:
 
 
 def _believable(fit: _Fit, fewest: tuple[int, int], config: AlignmentConfig) -> bool:
-    sigmas = np.sqrt(np.diag(fit.joint.cov[-3:, -3:]))
+    variances = np.diag(fit.joint.cov[-3:, -3:])  # of landmarks without noise one may round to below zero
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
     return bool(
         len(fit.points) >= fewest[0] and fit.matches >= fewest[1] and fit.refused <= config.most_refused
-        and sigmas[:2].max() <= config.sigma_m and sigmas[2] <= config.sigma_rad
+        and variances.min() > 0.0 and sigmas[:2].max() <= config.sigma_m and sigmas[2] <= config.sigma_rad
     )  # fmt: skip
 
 

@@ -41,7 +41,7 @@ STUDIES = {
     ),
     "reliability": (
         "training.studies.reliability.command",
-        "a campaign against what takes input: mutated and hostile files for every reader",
+        "a campaign against the whole: hostile files, steps, kills, full disks, hours",
     ),
     "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
     "team-cost": ("training.studies.teams.cost", "what a step takes against the number of robots"),

@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from slam.geometry import compose, inverse, wrap
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.metrics.measures import nees_band
-from slam.teams.alignment import AlignmentConfig, align
+from slam.teams.alignment import AlignmentConfig, _believable, _Fit, align
 from slam.teams.contradiction import contradiction
-from slam.teams.joint import SameConfig
+from slam.teams.joint import Joint, SameConfig
 from slam.types import CONVEX
 from tests.slam.teams.worlds import World
 
@@ -107,3 +107,14 @@ def test_walls_in_free_space_contradict() -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(ValueError, match="gate"):
         AlignmentConfig(gate=1.0)
+
+
+def test_a_variance_that_rounds_below_zero_is_not_believed_and_warns_of_nothing() -> None:
+    pairs = np.zeros((9, 2), np.int64)
+    for least, believed in ((1e-9, True), (-1e-18, False)):
+        joint = Joint(
+            x=np.zeros(0), frames=np.zeros((2, 3)), cov=np.diag([1e-6, 1e-6, least]), starts=np.zeros(2, np.int64),
+            chi_square=0.0, dof=1, outlying=np.zeros(1),
+        )  # fmt: skip
+        with np.errstate(all="raise"):
+            assert _believable(_Fit(joint, pairs, pairs, 0.0, 0.0), (2, 2), AlignmentConfig()) is believed

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
+from training.cli import main
 from training.runs.signals import heed_sigterm, interrupt_flag
 
 
@@ -36,3 +38,29 @@ def test_sigterm_takes_effect_between_two_steps() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
         assert came.is_set() and interrupted.is_set()
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_ctrl_c_before_a_command_begins_is_a_line(
+    broken: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("typer.main.get_command", interrupted)
+    if broken:  # what was imported as it came
+        monkeypatch.setitem(sys.modules, "slam.files", None)
+    assert main(["study"]) == 130
+    assert capsys.readouterr().err == "mecanum: interrupted before the results were written\n"
+
+
+def test_sigterm_amid_an_import_that_fails_of_it_is_sigterm(monkeypatch: pytest.MonkeyPatch) -> None:
+    def half_imported(*_: Any) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(1.0)
+        except KeyboardInterrupt:
+            raise AttributeError("partially initialized module") from None
+
+    monkeypatch.setattr("typer.main.get_command", half_imported)
+    assert main(["study"]) == 143

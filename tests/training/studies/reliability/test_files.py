@@ -106,7 +106,7 @@ def test_the_command_goes_on_and_writes_what_it_found(
     quick = {name: READERS[name] for name in ("rows", "landmarks")}
     for module in ("part", "readers"):
         monkeypatch.setattr(f"training.studies.reliability.files.{module}.READERS", quick)
-    argv = ["study", "reliability", "--files", "6", "--out", str(tmp_path)]
+    argv = ["study", "reliability", "--parts", "files", "--files", "6", "--out", str(tmp_path)]
     assert main(argv) == 0
     found = json.loads((tmp_path / "files.json").read_text())
     assert found["tried"] == 12 and found["failures"] == [] and found["readers"]["rows"]["files"] == 6

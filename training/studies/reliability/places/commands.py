@@ -21,7 +21,9 @@ from training.studies.reliability.kills.results import damaged, differences, res
 
 __all__ = ["PLACES", "Skipped"]
 
-_COMMANDS = ("benchmark", "explore", "replay", "study")
+_COMMANDS = {"benchmark": FILE, "explore": "metrics.json", "replay": "metrics.json", "study": "episodes.jsonl"}
+"""What is run, and a file that it writes."""
+
 _PATIENCE_S = 900.0
 _TEN_YEARS_S = 10 * 365 * 86400.0
 
@@ -151,8 +153,7 @@ def read_only(seed: int) -> list[str]:
 def in_the_way(seed: int) -> list[str]:
     """Run commands that find a file where their folder should be, folders where their files should be."""
     wrong = []
-    files = {"benchmark": FILE, "explore": "metrics.json", "replay": "metrics.json", "study": "episodes.jsonl"}
-    for name, file in files.items():
+    for name, file in _COMMANDS.items():
         with _folder() as folder:
             (folder / "out").write_text("mine")
             wrong += _judged(f"{name}, a file for a folder", _end(_start(argv_of(name, folder / "out"))))
