@@ -1,1 +1,4 @@
-"""The part ``soak``: environments that live for hours, reset over mixed rooms, and what memory and handles do."""
+"""A soak: environments that live for hours, reset over mixed rooms, and what memory and handles do.
+
+``part`` is the campaign's part, all of it.
+"""
