@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import hashlib
+import io
 import json
 import re
 import sqlite3
@@ -119,10 +120,22 @@ def _lines(path: Path) -> list[Any]:
 
 
 def _zip(path: Path) -> Any:
+    """Return the numbers in a zip of stable-baselines3: their bytes differ with how they came to be."""
+    import torch
+
     with zipfile.ZipFile(path) as archive:
         return {
-            name: _of(archive.read(name)) for name in archive.namelist() if name.endswith((".pth", ".safetensors"))
+            name: _numbers(torch.load(io.BytesIO(archive.read(name)), weights_only=True, map_location="cpu"))
+            for name in ("policy.pth", "policy.optimizer.pth")
         }
+
+
+def _numbers(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _numbers(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_numbers(inner) for inner in value]
+    return _of(value.numpy().tobytes()) if hasattr(value, "numpy") else value
 
 
 def _of(data: bytes) -> str:

@@ -84,22 +84,16 @@ def _growth(rows: list[Row]) -> dict[str, Any]:
 
 def _table(found: Summary) -> Table:
     rows = [
-        [factor, name, f"{one['steps']:,}", str(one["wrong"])]
-        for factor, names in found["factors"].items() for name, one in names.items()
-    ]  # fmt: skip
-    rows += [
         ["all", f"{found['items']} items", f"{found['tried']:,}", str(len(found["failures"]))],
         ["", "episodes; contacts", f"{found['episodes']:,}; {found['collisions']:,}", ""],
         ["", "nonsense refused", f"{found['refused']:,}", ""],
         ["", "items repeated in another process", str(found["again"]), ""],
         ["", "deepest in a body [mm]", f"{found['deepest_mm']:.2f}", ""],
-        [
-            "",
-            "memory [MB], handles over a process",
-            f"{found['growth']['mb']:+.1f}, {found['growth']['handles']:+.0f}",
-            "",
-        ],
+        ["", "memory [MB], handles", f"{found['growth']['mb']:+.1f}, {found['growth']['handles']:+.0f}", ""],
     ]
+    for factor, names in found["factors"].items():
+        for k, (name, one) in enumerate(names.items()):
+            rows.append(["" if k else factor, name, f"{one['steps']:,}", str(one["wrong"])])
     return ["factor", "", "steps", "wrong"], rows
 
 
