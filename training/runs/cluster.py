@@ -246,6 +246,10 @@ def _connected(cluster: Cluster) -> Iterator[None]:
             cluster.address, runtime_env={"env_vars": ONE_THREAD}, log_to_driver=False, logging_level="ERROR",
             **settings,
         )  # fmt: skip
+    except SystemExit:  # SIGTERM, which Ray has taken for itself already
+        signal.signal(signal.SIGTERM, before)
+        signal.raise_signal(signal.SIGTERM)
+        raise
     except Exception as error:
         raise BadInput(
             f"--ray {cluster.address}: cannot use it ({one_line(error)[:300]}); it needs a node on this machine "

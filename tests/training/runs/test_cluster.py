@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import sys
 import time
@@ -21,6 +22,7 @@ from training.cli.study import STUDIES, study_command
 from training.runs import cluster
 from training.runs.campaign import run_all
 from training.runs.errors import BadInput
+from training.runs.signals import heed_sigterm
 
 ROOT = Path(__file__).resolve().parents[3]
 SETTINGS = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "RAY_USAGE_STATS_ENABLED": "0"}
@@ -153,3 +155,16 @@ def test_items_on_a_ray_of_this_machine(tmp_path: Path, monkeypatch: pytest.Monk
 def test_one_item_that_fails_ends_the_run_as_it_does_without_ray() -> None:
     with pytest.raises(ZeroDivisionError):
         run_all(["raise"], behaves, workers=1, keep=lambda _job, _result: None, apart=True)
+
+
+def test_sigterm_while_ray_connects_is_sigterm(monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray", reason="needs the extra `ray`")
+
+    def init(*_: Any, **__: Any) -> None:  # as Ray does: it takes the signal for itself, and quits on it
+        signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(number))
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(ray, "init", init)
+    with heed_sigterm() as came, pytest.raises(KeyboardInterrupt), cluster.ray_pool(cluster.Cluster("local", 1)):
+        pass
+    assert came.is_set()

@@ -38,7 +38,13 @@ def ended(code: int, error: str = "", left: tuple[str, ...] = ()) -> Run:
 
 def test_how_a_killed_run_ends_is_judged() -> None:
     term, hard = Moment(signal=signal.SIGTERM, after_s=1.0), Moment(signal=signal.SIGKILL, changes=1)
-    for done, moment in ((ended(143), term), (ended(-15), term), (ended(-9), hard), (ended(0), None)):
+    for done, moment in (
+        (ended(143), term),
+        (ended(-15), term),
+        (ended(-9), hard),
+        (ended(0), None),
+        (ended(-9, left=("ray::Agent",)), hard),
+    ):
         assert _judged(done, moment) == []
     for done, moment in (
         (ended(1), term), (ended(143, "Traceback (most recent call last):"), term), (ended(-9, left=("x",)), hard),
