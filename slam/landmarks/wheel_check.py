@@ -28,6 +28,7 @@ Ids = NDArray[np.int64]
 
 _FEWEST = 3  # landmarks that must agree on another motion
 _EVERY = 2  # scans between two comparisons
+_USUAL, _PRIOR = 0.35, 8  # share of the covariances that is new in a scan; residuals that this counts for
 _LEAST_WAY_M, _LEAST_TURN_RAD = 1e-3, 1e-3
 
 
@@ -130,7 +131,8 @@ def _contradiction(
 
     With A = Σ Hᵀ R⁻¹ H, b = Σ Hᵀ R⁻¹ ν, and W of wheels that may have turned in vain (all that they claim), the
     error of the motion is e = C b / s, C = (A / s + W⁻¹)⁻¹. s is the share of R that is not the same in both
-    scans, by the residuals. They contradict where eᵀ (P + C)⁻¹ e exceeds the gate; what lacks is C + e eᵀ.
+    scans, by the residuals and what it usually is. They contradict where eᵀ (P + C)⁻¹ e exceeds the gate; what
+    lacks is C + e eᵀ.
     """
     info, b = np.zeros((3, 3)), np.zeros(3)
     state, h = np.empty(5), np.empty((2, 5))
@@ -171,7 +173,7 @@ def _contradiction(
                 )
             if left > limits[count]:
                 return False  # no motion explains them all: another landmark was taken for one of them
-            share = max(left / (2 * count - 3), white)
+            share = max((left + _PRIOR * _USUAL) / (2 * count - 3 + _PRIOR), white)
         for q in range(3):
             for j in range(3):
                 cov[q, j] = info[q, j] / share
