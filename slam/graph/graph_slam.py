@@ -21,6 +21,7 @@ from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
 from slam.motion import predict_robot
+from slam.odometry.mount import Mount
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["GraphSlam"]
@@ -46,6 +47,7 @@ class GraphSlam(SurfaceBackend):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         del seed
         self.atlas = Atlas(self.config, pose, pose_cov)
+        self.mount = Mount(self.config.odometry.mount_sigma_m)
         self._begun = False
         self._motion, self._upper = np.zeros(3), np.zeros((3, 3))  # since the key scan, in its frame
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
@@ -65,6 +67,7 @@ class GraphSlam(SurfaceBackend):
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
         (vx, vy, omega), var_v, var_w, self._body = self.config.odometry.of_step(odometry, self._body)
+        vx, vy = self.mount.velocity(vx, vy, omega)
         dt = odometry.dt
         predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
@@ -100,10 +103,13 @@ class GraphSlam(SurfaceBackend):
         window = self.atlas.window
         seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
         self._correct(found, seen)
+        info = self._information(found, seen)
+        if self.mount.unknown:
+            self._learn_mount(found, info)
         if self._moved_on(found.share):
             motion_cov = self._motion_cov()
             way, turn = self._claimed
-            blind = self._is_blind(motion_cov, found, seen)
+            blind = self._is_blind(motion_cov, info)
             self.atlas.add_key(self._motion, motion_cov, ends, found, seen, reach_m)
             self._blind = (self._blind[0] + way, self._blind[1] + turn) if blind else (0.0, 0.0)
             self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
@@ -113,19 +119,36 @@ class GraphSlam(SurfaceBackend):
             self._last = found.pose
 
     def _aligned(self, ends: BeamEnds, reach_m: float) -> Alignment:
-        """Return where the scan fits the patches in reach, near to where the wheels say."""
+        """Return where the scan fits the patches in reach: near to where the wheels say, unless they spun."""
         config, surfaces = self.config, self.atlas.surfaces
         guess = compose(self._last, self._step)
         turn = about_z(float(self._last[2]))
-        cov = turn @ _full(self._step_upper) @ turn.T + _ALIGNED
-        info = np.asarray(np.linalg.inv(cov), np.float64)
-        start = guess
-        if max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2:
-            near = np.hypot(*(surfaces.points - guess[:2]).T) < reach_m
-            field = LikelihoodField(config.matching, surfaces.points[near])
-            points = ends.points[:: max(1, len(ends) // config.matching.beams)]
-            start = search(field, points, guess, config.matching, prior_info=info)
-        return align(surfaces, ends, start, prior=guess, prior_info=info, gate_m=config.gate_m)
+        cov = turn @ self._step_cov() @ turn.T
+        near = np.hypot(*(surfaces.points - guess[:2]).T) < reach_m
+
+        def aligned(cov: Array) -> Alignment:
+            info, start = np.asarray(np.linalg.inv(cov), np.float64), guess
+            if max(cov[0, 0], cov[1, 1]) > config.search_sigma_m**2 or cov[2, 2] > config.search_sigma_rad**2:
+                field = LikelihoodField(config.matching, surfaces.points[near])
+                points = ends.points[:: max(1, len(ends) // config.matching.beams)]
+                start = search(field, points, guess, config.matching, prior_info=info)
+            return align(surfaces, ends, start, prior=guess, prior_info=info, gate_m=config.gate_m)
+
+        found = aligned(cov)
+        # Surfaces are near, and yet the scan does not lie on them: as where an old place is held against a scan.
+        if found.in_sight < config.closing.in_sight:
+            other = aligned(cov + self._spun())
+            return other if other.in_sight > found.in_sight and other.share > found.share else found
+        return found
+
+    def _step_cov(self) -> Array:
+        """Return the covariance ``(3, 3)`` of the motion since the last scan, in the frame of then."""
+        return _full(self._step_upper) + self.mount.motion_cov(float(self._step[2])) + _ALIGNED
+
+    def _spun(self) -> Array:
+        """Return what wheels that may have spun add to a motion's covariance ``(3, 3)``: all that they claim."""
+        way, turn = self._claimed
+        return np.diag(np.square([way, way, max(turn, way / self.config.odometry.lever_m)]))
 
     def _correct(self, found: Alignment, seen: Links) -> None:
         """Set the belief to that of the window and this scan; wheels that contradict it are not believed."""
@@ -137,8 +160,7 @@ class GraphSlam(SurfaceBackend):
             change[2] = float(wrap(change[2]))
             if float(change @ np.linalg.solve(rows[:, :3] - self._cov + _EXACT * np.eye(3), change)) <= _SPUN:
                 break
-            way, turn = self._claimed
-            self._upper += np.diag(np.square([way, way, max(turn, way / self.config.odometry.lever_m)]))
+            self._upper += self._spun()
 
     def _motion_cov(self) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the key scan, in its frame.
@@ -146,7 +168,7 @@ class GraphSlam(SurfaceBackend):
         Where nothing but the wheels has told the motion for a way L, their lasting errors add up along all of it:
         after d more, (L + d)² - L² = 2 L d + d² times their variance. The noise that is taken for white has d².
         """
-        cov = _full(self._upper) + _EXACT * np.eye(3)
+        cov = _full(self._upper) + _EXACT * np.eye(3) + self.mount.motion_cov(float(self._motion[2]))
         lasting, lever = self.config.odometry.lasting, self.config.odometry.lever_m
         if lasting is not None:
             (before, turned), (way, turn) = self._blind, self._claimed
@@ -159,13 +181,26 @@ class GraphSlam(SurfaceBackend):
             cov += np.diag([linear, linear, angular])
         return cov
 
-    def _is_blind(self, motion_cov: Array, found: Alignment, seen: Links) -> bool:
-        """Tell whether there is a direction in which the scan tells less of the motion than the wheels do."""
+    def _information(self, found: Alignment, seen: Links) -> Array:
+        """Return what a scan tells ``(3, 3)`` of its pose on the patches as they are, in the body's directions."""
         frames = self.atlas.window.frames[seen.patches]
         info = np.zeros((3, 3))
         for frame, h in zip(frames, seen.info, strict=True):
             turn = about_z(float(found.pose[2] - frame[2]))
             info += turn.T @ h @ turn
+        return info
+
+    def _learn_mount(self, found: Alignment, info: Array) -> None:
+        """Learn where the frame of the poses sits on the base, by what a scan made of the motion since the last."""
+        moved, prior = relative(self._last[None], found.pose[None])[0], self._step_cov()
+        turn = about_z(float(moved[2]))  # from the body's directions now to those of the last scan
+        cov = np.linalg.inv(np.linalg.inv(prior) + turn @ info @ turn.T)
+        change = moved - self._step
+        change[2] = float(wrap(change[2]))
+        self.mount.learn(float(self._step[2]), prior, change, cov)
+
+    def _is_blind(self, motion_cov: Array, info: Array) -> bool:
+        """Tell whether there is a direction in which the scan tells less of the motion than the wheels do."""
         left = np.linalg.eigvals(np.eye(3) + motion_cov @ info).real
         return bool(left.min() < 2.0)
 
