@@ -52,8 +52,8 @@ class OdometryNoise(Config):
     grip_m_s2: Positive = 1.5  # change of the wheels' speed over time from which they slip
     slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may have slipped
     slide_m_s2: Positive = 1.5  # by which the floor lets the body follow wheels that slip
-    # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: dp-slam and
-    # graph-slam learn it (slam.odometry.mount). 0: that is where it sits.
+    # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: graph-slam
+    # learns it (slam.odometry.mount). 0: that is where it sits.
     mount_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0
     lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
 

@@ -103,13 +103,12 @@ class GraphSlam(SurfaceBackend):
         window = self.atlas.window
         seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
         self._correct(found, seen)
-        info = self._information(found, seen)
         if self.mount.unknown:
-            self._learn_mount(found, info)
+            self._learn_mount(found, self._information(found, seen))
         if self._moved_on(found.share):
             motion_cov = self._motion_cov()
             way, turn = self._claimed
-            blind = self._is_blind(motion_cov, info)
+            blind = self._is_blind(motion_cov, self._information(found, seen))
             self.atlas.add_key(self._motion, motion_cov, ends, found, seen, reach_m)
             self._blind = (self._blind[0] + way, self._blind[1] + turn) if blind else (0.0, 0.0)
             self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
@@ -123,7 +122,7 @@ class GraphSlam(SurfaceBackend):
         config, surfaces = self.config, self.atlas.surfaces
         guess = compose(self._last, self._step)
         turn = about_z(float(self._last[2]))
-        cov = turn @ self._step_cov() @ turn.T
+        cov = turn @ self._step_cov() @ turn.T + _ALIGNED
         near = np.hypot(*(surfaces.points - guess[:2]).T) < reach_m
 
         def aligned(cov: Array) -> Alignment:
@@ -143,7 +142,7 @@ class GraphSlam(SurfaceBackend):
 
     def _step_cov(self) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the last scan, in the frame of then."""
-        return _full(self._step_upper) + self.mount.motion_cov(float(self._step[2])) + _ALIGNED
+        return _full(self._step_upper) + self.mount.motion_cov(float(self._step[2]))
 
     def _spun(self) -> Array:
         """Return what wheels that may have spun add to a motion's covariance ``(3, 3)``: all that they claim."""
@@ -192,9 +191,9 @@ class GraphSlam(SurfaceBackend):
 
     def _learn_mount(self, found: Alignment, info: Array) -> None:
         """Learn where the frame of the poses sits on the base, by what a scan made of the motion since the last."""
-        moved, prior = relative(self._last[None], found.pose[None])[0], self._step_cov()
+        moved, prior = relative(self._last[None], found.pose[None])[0], self._step_cov() + _ALIGNED
         turn = about_z(float(moved[2]))  # from the body's directions now to those of the last scan
-        cov = np.linalg.inv(np.linalg.inv(prior) + turn @ info @ turn.T)
+        cov = np.asarray(np.linalg.inv(np.linalg.inv(prior) + turn @ info @ turn.T), np.float64)
         change = moved - self._step
         change[2] = float(wrap(change[2]))
         self.mount.learn(float(self._step[2]), prior, change, cov)

@@ -12,10 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.geometry import about_z, transform_points, wrap
+from slam.geometry import transform_points
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
-from slam.odometry.mount import Mount
 from slam.settings import Config, Count, Few, Gap, NotNegative, Positive, Share
 from slam.types import Array, Odometry
 
@@ -56,23 +55,17 @@ class ScanOdometry:
         self._scans: deque[tuple[Array, Array]] = deque(maxlen=config.scans)
         self._field: LikelihoodField | None = None
         self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
-        self.mount, self._matched = Mount(noise.mount_sigma_m), 0.0  # the heading at the last believed match
         self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since a scan was last believed
         self.settled = np.zeros(3)  # the pose at the last :meth:`settle`
 
     @property
     def cov(self) -> Array:
         """Covariance ``(3, 3)`` of the motion since :meth:`settle`."""
-        cov = np.triu(self._upper) + np.triu(self._upper, 1).T
-        if self.mount.unknown:
-            turn = about_z(self._matched)
-            cov += turn @ self.mount.motion_cov(float(self.pose[2]) - self._matched) @ turn.T
-        return cov
+        return np.triu(self._upper) + np.triu(self._upper, 1).T
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
         (vx, vy, omega), var_v, var_w, self._body = self.noise.of_step(odometry, self._body)
-        vx, vy = self.mount.velocity(vx, vy, omega)
         dt = odometry.dt
         predict_robot(self.pose, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
         way, turn = self._claimed
@@ -86,10 +79,7 @@ class ScanOdometry:
             found = self._match(self._field, points)
             believed = found.score >= config.least_score
             if believed:
-                if self.mount.unknown:
-                    self._learn_mount(found)
                 self.pose, self._upper = found.pose.copy(), found.cov
-                self._matched = float(found.pose[2])
                 self._claimed = (0.0, 0.0)
         if len(points) >= config.fewest_points and (believed or not self._scans) and self._moved_on():
             self._keep(points)
@@ -112,15 +102,6 @@ class ScanOdometry:
         other = refine(field, points, found.pose, self.matching, prior=self.pose, prior_info=spun)
         better = 2.0 * (other.log_likelihood - found.log_likelihood) > config.spin_gate
         return other if better else found
-
-    def _learn_mount(self, found: Match) -> None:
-        """Learn where the frame of the poses sits on the base, by the motion since the last believed match."""
-        back = about_z(-self._matched)
-        change = found.pose - self.pose
-        change[2] = float(wrap(change[2]))
-        turn = float(self.pose[2]) - self._matched
-        prior = self.cov + np.eye(3) * 1e-8
-        self.mount.learn(turn, back @ prior @ back.T, back @ change, back @ found.cov @ back.T)
 
     def settle(self) -> None:
         """Begin to count motion and its covariance from here."""

@@ -22,7 +22,10 @@ from slam.metrics.measures import nees_pose
 from slam.settings import from_mapping
 from slam.types import Array
 
-__all__ = ["MatchedRelations", "error_of_reference", "matched_relations", "nees_with_reference", "start_as_matched"]
+__all__ = [
+    "MatchedRelations", "error_of_reference", "errors", "matched_relations", "nees_with_reference",
+    "start_as_matched",
+]  # fmt: skip
 
 _REACH_M, _ROUGH_M = 20.0, 0.02  # as of the logs' graph-slam
 _GATE_M = 0.3  # farthest that a beam may end from its surface, from where the reference has it
@@ -37,18 +40,27 @@ _MEDIAN_NORM = 1.1774  # of the length of a vector of two normal numbers, in 1σ
 class MatchedRelations:
     """Relations as scans have them."""
 
-    pairs: NDArray[np.int64]  # (m, 2) of scans
+    pairs: NDArray[np.int64]  # (m, 2) rows of the reference
     seen: Array  # (m, 3) the second's pose as seen from the first [m, rad]
 
 
-def matched_relations(log: ScanLog, reference: Array, pairs: NDArray[np.int64]) -> MatchedRelations:
-    """Match the scans of pairs ``(k, 2)``, beginning where the reference poses ``(n, 3)`` have them."""
-    known = {**log.settings["features"]}
-    config = from_mapping(FeatureConfig, known)
+def matched_relations(
+    log: ScanLog, scans: NDArray[np.int64], reference: Array, pairs: NDArray[np.int64]
+) -> MatchedRelations:
+    """Match scans with each other.
+
+    Parameters
+    ----------
+    scans, reference
+        Numbers ``(n,)`` of scans and their reference poses ``(n, 3)``, where each match begins.
+    pairs
+        ``(k, 2)`` rows of them. Kept are those that are matched beyond doubt.
+    """
+    config = from_mapping(FeatureConfig, log.settings["features"])
     extractor = FeatureExtractor(config)
     ends: list[BeamEnds] = []
     maps: list[SurfaceMap] = []
-    for k in range(len(reference)):
+    for k in scans.tolist():
         scan = log.scan(k)
         extractor.extract(scan)
         seen = beam_ends(

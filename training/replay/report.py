@@ -160,11 +160,19 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
 
     speed = f"{found['wall_s']:.1f} s, {found['realtime_factor']:.0f} times real time"
     scan_rows: list[tuple[str, str]] = []
+    nees_rows: list[tuple[str, str]] = []
     sensed = f"{found['observations']} observations"
     if "scans" in found:
         error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
         local = shown("relations_local_trans_m", "m", 3)
-        scan_rows.append(("relations", f"{error}, {local} along the way"))
+        scan_rows.append(("relations", f"{found['relations_of']}: {error}, {local} along the way"))
+        online = shown("online_relations_trans_m", "m", 3)
+        scan_rows.append(("", f"online: {online}, of the poses believed at the time"))
+        own, other = (shown(f"matched_relations{kind}_trans_m", "m", 3) for kind in ("", "_reference"))
+        count = found["matched_relations_count"]
+        scan_rows.append(("matched", f"{own} off the {count} that scans bear witness to; the reference {other}"))
+        own, other = shown("anees_reference", ""), shown("anees_reference_matched", "")
+        nees_rows.append(("", f"{own} with the reference's own error; {other} from the start that scans have"))
         sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
     rows = (
         ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
@@ -173,6 +181,7 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
         ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
         ("landmarks", f"{found['landmarks']}, {shown('landmark_rmse_m', 'm')} off"),
         ("NEES / 3", shown("anees", "")),
+        *nees_rows,
         *scan_rows,
         ("took", speed),
         ("files", f"{out}/: {', '.join(files)}"),

@@ -73,6 +73,7 @@ class Replay:
     sample_times: Array  # (s,) [s]
     sample_rows: NDArray[np.int64]  # (s,) row of the reference, -1 in its gaps
     estimates: list[Array] = field(default_factory=list)  # (3,) each
+    covs: list[Array] = field(default_factory=list)  # (3, 3) each, of those
     nees: list[float] = field(default_factory=list)  # nan without a reference pose
     health: list[float] = field(default_factory=list)
     time_s: float = 0.0  # how far it came
@@ -246,6 +247,7 @@ def _sample(replay: Replay, before: float, twist: Any) -> None:
     while (k := len(replay.estimates)) < len(replay.sample_times) and replay.sample_times[k] < before:
         # Moved on to the very time, beside the filter: a step of its own would change V's share.
         replay.estimates.append(move(backend.pose, twist, float(replay.sample_times[k]) - now))
+        replay.covs.append(backend.pose_cov)
         replay.health.append(backend.health)
         true_pose = log.reference_at(now) if replay.headings and replay.sample_rows[k] >= 0 else None
         replay.nees.append(math.nan if true_pose is None else _pose_nees(backend, true_pose))
