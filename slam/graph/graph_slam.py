@@ -190,7 +190,7 @@ class GraphSlam(SurfaceBackend):
         return info
 
     def _learn_mount(self, found: Alignment, info: Array) -> None:
-        """Learn where the frame of the poses sits on the base, by what a scan made of the motion since the last."""
+        """Learn where the frame of the poses sits on the base, by what a scan made of the last motion."""
         moved, prior = relative(self._last[None], found.pose[None])[0], self._step_cov() + _ALIGNED
         turn = about_z(float(moved[2]))  # from the body's directions now to those of the last scan
         cov = np.asarray(np.linalg.inv(np.linalg.inv(prior) + turn @ info @ turn.T), np.float64)

@@ -32,8 +32,8 @@ SETTINGS = {
     "features": {"range_sigma_m": 0.02, "split_floor_m": 0.05, "sigma_floor_m": 0.02, "wall_sigma_m": 0.01,
                  "wall_sigma_rad": 0.005},
     "rough_m": 0.02, "common_m": 0.02, "straight_m": 0.02,
-    # Nobody carries a robot away while it records, and among chairs, which beams pass between the legs of, a scan of
-    # a robot that is where it is believed to be speaks against the map (docs/studies/real-logs.md).
+    # Nobody carries a robot away while it records. Among chairs, between whose legs beams pass, scans speak against
+    # the map though the robot is where it is believed to be (docs/studies/real-logs.md).
     "health": {"recover": False},
     "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.4},
 }  # fmt: skip

@@ -266,3 +266,32 @@ def test_landmark_observations_are_refused_and_settings_checked() -> None:
             GraphSlamConfig(**bad)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="share"):
         ClosingConfig(share=0.0)
+
+
+def test_a_turn_that_the_wheels_made_up_is_not_believed() -> None:
+    segments, rng, pose = ring(), np.random.default_rng(3), np.array([0.0, 0.0, 0.3])
+    backend = GraphSlam(replace(GraphSlamConfig(), odometry=WHEELS, lidar_offset_m=OFFSET))
+    backend.reset(pose)
+    for _ in range(3):
+        backend.update(scan_of(segments, pose, rng))
+        backend.predict(Odometry((0.0, 0.0, 0.35), 0.4))  # 0.14 rad, of which there was nothing
+        backend.update(scan_of(segments, pose, rng))
+    assert abs(float(wrap(backend.pose[2] - pose[2]))) < 0.01
+    assert np.hypot(*(backend.pose - pose)[:2]) < 0.02
+
+
+def test_it_learns_where_the_laser_sits_on_the_base() -> None:
+    segments, rng, at = ring(), np.random.default_rng(4), np.array([0.12, -0.04, 0.0])
+    wheels = replace(WHEELS, mount_sigma_m=0.1)
+    backend = GraphSlam(replace(GraphSlamConfig(), odometry=wheels, lidar_offset_m=OFFSET))
+    base = np.array([0.0, 0.0, 0.3])
+    backend.reset(compose(base, at))
+    backend.update(scan_of(segments, compose(base, at), rng))
+    for k in range(12):
+        twist = np.array([0.3, 0.0, 0.9 if k % 2 else -0.7])
+        base = compose(base, exp(twist * 0.4))
+        backend.predict(Odometry(twist, 0.4))
+        backend.update(scan_of(segments, compose(base, at), rng))
+    sigma = np.sqrt(np.diag(backend.mount.cov))
+    assert sigma.max() < 0.03 and np.all(np.abs(backend.mount.mean - at[:2]) < 3.0 * sigma)
+    assert backend.pose_nees(compose(base, at)) < 14.16

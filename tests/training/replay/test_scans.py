@@ -100,6 +100,7 @@ def test_a_backends_final_trajectory_is_what_relations_are_of(
     monkeypatch.setattr(type(prepared.backend), "scan_poses", drive(21)[0], raising=False)
     found = replay_report.metrics(prepared)
     assert found["relations_trans_m"] < 1e-6 and found["relations_of"] == "final"
+    assert found["online_relations_trans_m"] > 1e-4
     monkeypatch.setattr(type(prepared.backend), "scan_poses", drive(20)[0], raising=False)  # one short
     found = replay_report.metrics(prepared)
     assert found["relations_trans_m"] > 1e-4 and found["relations_of"] == "online"
@@ -109,6 +110,8 @@ def test_the_summary_speaks_of_scans(logs: Path, tmp_path: Path, capsys: pytest.
     assert main(["replay", *argv(logs, "--limit-s", "5", "--out", str(tmp_path))]) == 0
     shown = capsys.readouterr().out
     assert "relations" in shown and "11 scans, " in shown and "map.png" in shown
+    assert "of the poses believed at the time" in shown and "that scans bear witness to" in shown
+    assert "with the reference's own error" in shown
 
 
 @pytest.mark.parametrize(
