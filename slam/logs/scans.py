@@ -32,7 +32,7 @@ SETTINGS = {
     "features": {"range_sigma_m": 0.02, "split_floor_m": 0.05, "sigma_floor_m": 0.02, "wall_sigma_m": 0.01,
                  "wall_sigma_rad": 0.005},
     "rough_m": 0.02, "common_m": 0.02, "straight_m": 0.02,
-    # Nobody carries a robot away while it records. Among chairs, between whose legs beams pass, scans speak against
+    # Nobody carries a robot away while it records. Among chairs, between whose legs beams pass, scans contradict
     # the map though the robot is where it is believed to be (docs/studies/real-logs.md).
     "health": {"recover": False},
     "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.4},
