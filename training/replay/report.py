@@ -163,6 +163,8 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
     nees_rows: list[tuple[str, str]] = []
     sensed = f"{found['observations']} observations"
     if "scans" in found:
+        sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
+    if found.get("relations_count"):
         error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
         local = shown("relations_local_trans_m", "m", 3)
         scan_rows.append(("relations", f"{found['relations_of']}: {error}, {local} along the way"))
@@ -173,7 +175,6 @@ def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -
         scan_rows.append(("matched", f"{own} off the {count} that scans bear witness to; the reference {other}"))
         own, other = shown("anees_reference", ""), shown("anees_reference_matched", "")
         nees_rows.append(("", f"{own} with the reference's own error; {other} from the start that scans have"))
-        sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
     rows = (
         ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
         ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {sensed}"),
