@@ -57,14 +57,14 @@ def matched_relations(
         ``(k, 2)`` rows of them. Kept are those that are matched beyond doubt.
     """
     config = from_mapping(FeatureConfig, log.settings["features"])
-    extractor = FeatureExtractor(config)
+    extractor, offset_m = FeatureExtractor(config), float(log.settings.get("lidar_offset_m", 0.0))
     ends: list[BeamEnds] = []
     maps: list[SurfaceMap] = []
     for k in scans.tolist():
         scan = log.scan(k)
         extractor.extract(scan)
         seen = beam_ends(
-            scan, extractor, offset_m=0.0, reach_m=_REACH_M, sigma_m=config.range_sigma_m, rough_m=_ROUGH_M
+            scan, extractor, offset_m=offset_m, reach_m=_REACH_M, sigma_m=config.range_sigma_m, rough_m=_ROUGH_M
         )
         ends.append(seen)
         maps.append(SurfaceMap(seen.on, seen.normals, 0.6 * seen.spacing, np.zeros(len(seen), np.int64)))
