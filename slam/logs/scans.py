@@ -35,7 +35,7 @@ SETTINGS = {
     "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.4},
 }  # fmt: skip
 
-# CARMEN and DP-SLAM do not say where the laser sits on the robot. And nobody carries a robot away while it records;
+# CARMEN and DP-SLAM do not say where the laser sits on the robot. Nobody carries a robot away while it records;
 # among chairs, between whose legs beams pass, scans contradict the map though the robot is where it is believed
 # to be (docs/studies/real-logs.md).
 _UNTOLD = {"odometry": _ODOMETRY | {"mount_sigma_m": 0.1}, "health": {"recover": False}}
