@@ -33,9 +33,10 @@ class EkfConfig(BackendConfig):
         math.inf
     )  # old landmarks expected no better than to this count only together
     # The wheels are not believed where landmarks seen twice, so many scans apart at most, contradict them: squared
-    # Mahalanobis. In halls wheels that are right are doubted once in 1500 scans so, and at 16.3 once in 200.
-    wheel_scans: Count = 20
-    wheel_gate: Annotated[float, Within("(0, inf]")] = 30.0
+    # Mahalanobis, 99.9 % of chi-square with three degrees of freedom. Over more scans the view changes, and with it
+    # what lasts of a landmark's error: over 20, wheels that were right were doubted in halls, and the heading lost.
+    wheel_scans: Count = 8
+    wheel_gate: Annotated[float, Within("(0, inf]")] = 16.27
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 

@@ -58,7 +58,7 @@ def drive(
 
 
 def made(**changes: float) -> WheelCheck:
-    return WheelCheck(OFFSET_M, **{"scans": 20, "gate": 30.0, "white_share": 1.0 / 16.0} | changes)  # type: ignore[arg-type]
+    return WheelCheck(OFFSET_M, **{"scans": 20, "gate": 16.27, "white_share": 1.0 / 16.0} | changes)  # type: ignore[arg-type]
 
 
 def test_wheels_that_err_as_they_declare_are_believed() -> None:
