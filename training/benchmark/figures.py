@@ -23,7 +23,19 @@ from training.figures.statistics import (
     ratio_of_sums,
 )
 
-__all__ = ["COMPARED", "METRICS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows", "merged"]
+__all__ = [
+    "COMPARED",
+    "METRICS",
+    "REGRETS",
+    "Figure",
+    "Group",
+    "Metric",
+    "comparisons",
+    "figures",
+    "group_rows",
+    "merged",
+    "with_regrets",
+]
 
 Row = dict[str, Any]  # an episode's metrics
 
@@ -60,6 +72,10 @@ METRICS: tuple[Metric, ...] = (
         Metric(key=f"time_to_{share}_s", label=f"time to {share} %", unit="s", digits=1, may_be_missed=True)
         for share in (50, 90, 95, 99)
     ),
+    *(
+        Metric(key=f"regret_{share}", label=f"regret to {share} %", unit="%", scale=100, digits=0)
+        for share in (95, 99)
+    ),
     Metric(key="time_s", label="time", unit="s", digits=1),
     Metric(key="path_length_m", label="path", unit="m", digits=1),
     Metric(
@@ -82,7 +98,10 @@ METRICS: tuple[Metric, ...] = (
 )  # fmt: skip
 """Every metric that is reported, in the order of the tables."""
 
-COMPARED = tuple(m for m in METRICS if m.centre == "iqm" and m.better)
+REGRETS = {"regret_95": ("time_to_95_s", "known-map"), "regret_99": ("time_to_99_s", "known-map-99")}
+"""Metric → the time that it is of, and whose must be there for there to be a bound."""
+
+COMPARED = tuple(m for m in METRICS if m.centre == "iqm" and m.better and m.key not in REGRETS)
 """The metrics that an agent is compared with the baseline in."""
 
 
@@ -142,6 +161,40 @@ def group_rows(rows: Sequence[tuple[Key, EpisodeRow]]) -> list[Group]:
             robots=robots, communication=communication,
         ))  # fmt: skip
     return groups
+
+
+def with_regrets(groups: Sequence[Group]) -> list[Group]:
+    """Return the groups with the metrics of :data:`REGRETS` in every episode whose bound is there.
+
+    The bound is the least time in the same room under the same seed, on the same backend: that of the planner that
+    knows the map or, where an agent was sooner, that agent's. A time that was never reached counts as the limit.
+    """
+    times: dict[str, dict[tuple[Any, ...], float]] = {name: {} for name in REGRETS}
+    known: set[tuple[Any, ...]] = set()
+    for group in groups:
+        for key, row in zip(group.keys, group.rows, strict=True):
+            room = (*key[:3], *group.who[1:])
+            for name, (time, planner) in REGRETS.items():
+                if (found := row.metrics.get(time)) is not None:
+                    times[name][room] = min(found, times[name].get(room, math.inf))
+                    known |= {(name, *room)} if group.agent == planner else set()
+
+    def regrets(group: Group, key: Key, row: EpisodeRow) -> Row:
+        room, metrics = (*key[:3], *group.who[1:]), row.metrics
+        taken = {name: metrics[time] or metrics["limit_s"] for name, (time, _) in REGRETS.items()}
+        return {
+            name: float(taken[name] / times[name][room] - 1.0)
+            for name in REGRETS
+            if (name, *room) in known and times[name][room] > 0.0
+        }
+
+    return [
+        replace(group, rows=tuple(
+            replace(row, metrics=row.metrics | regrets(group, key, row))
+            for key, row in zip(group.keys, group.rows, strict=True)
+        ))
+        for group in groups
+    ]  # fmt: skip
 
 
 def merged(groups: Sequence[Group], *, suite: str) -> Group:

@@ -26,10 +26,10 @@ BEGIN, END = "<!-- leaderboard -->", "<!-- end of the leaderboard -->"
 
 _NOT_SUITES = ("comparison", "ends", "consistency", "config", "teams")
 _COLUMNS = (
-    "time_to_95_s", "reached_95", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
+    "time_to_95_s", "regret_95", "reached_95", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
     "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
 )  # fmt: skip
-_WITH_LIMITS = ("time_to_95_s", "corner_mean_m", "ate_rmse_m")
+_WITH_LIMITS = ("time_to_95_s", "regret_95", "corner_mean_m", "ate_rmse_m")
 _OWN = ("baseline", "split")  # of the settings, no library's version
 
 Summary = Mapping[str, Any]

@@ -38,7 +38,7 @@ KEY_COLUMNS = ("suite", "place", "seed", "agent", "slam")
 TEAM_COLUMNS = ("robots", "communication")  # behind those, where there are teams
 # What a terminal has room for.
 _COLUMNS = (
-    "reached_95", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
+    "reached_95", "time_to_95_s", "regret_95", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
     "ate_rmse_m", "anees", "decision_ms_median",
 )  # fmt: skip
 _WITH_LIMITS = ("time_to_95_s", "ate_rmse_m")

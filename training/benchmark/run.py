@@ -21,18 +21,17 @@ from slam.settings import check_name, to_mapping
 from training.benchmark import store as benchmark_store
 from training.benchmark import suites
 from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
-from training.benchmark.figures import Group, group_rows
+from training.benchmark.figures import Group, group_rows, with_regrets
 from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import SPLITS, Place, Suite
 from training.benchmark.team_episode import TeamJob, run_job
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
-from training.episodes.known_map import NAME as KNOWN_MAP
-from training.episodes.known_map import KnownMap
 from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
 from training.runs.running import versions
+from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = ["BenchmarkPlan", "EpisodesFailed", "benchmark"]
 
@@ -222,7 +221,7 @@ def _missing(
 def _groups(plan: BenchmarkPlan, store: benchmark_store.Store) -> list[Group]:
     order = {s.name: k for k, s in enumerate(plan.suites)}
     jobs = sorted(plan.jobs, key=lambda job: order[job.suite])  # stable: agents as they were given, then seeds
-    return group_rows(list(store.rows(job.key for job in jobs)))
+    return with_regrets(group_rows(list(store.rows(job.key for job in jobs))))
 
 
 def _job(team: TeamConfig | None, **about: Any) -> EpisodeJob:
@@ -232,13 +231,13 @@ def _job(team: TeamConfig | None, **about: Any) -> EpisodeJob:
 def _agent_names(text: str) -> tuple[str, ...]:
     chosen = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
     for name in chosen:
-        agents.check(name, KNOWN_MAP)
+        agents.check(name, *KNOWN_MAPS)
     return chosen
 
 
 def _behind_agent(name: str) -> tuple[str, str]:
     """Return an agent's module, and a digest of the trained policy that it reads, if it does."""
-    if name == KNOWN_MAP:
+    if name in KNOWN_MAPS:
         return KnownMap.__module__, ""
     try:
         with bad_input():

@@ -10,11 +10,11 @@ from html import escape
 from typing import Literal
 
 from slam.files import plain_name
-from training.benchmark.figures import METRICS, Metric
+from training.benchmark.figures import METRICS, REGRETS, Metric
 from training.benchmark.suites import SLIPPERY
-from training.episodes.known_map import NAME as KNOWN_MAP
 from training.figures.statistics import NONE, Comparison, Interval
 from training.figures.tables import markdown_name, markdown_table, text_table
+from training.truth.known_map import KNOWN_MAPS
 
 __all__ = [
     "AGAINST", "BY_KEY", "HEADLINE", "Cell", "Table", "against_table", "change", "figure", "figures_table", "html",
@@ -24,8 +24,8 @@ __all__ = [
 BY_KEY = {metric.key: metric for metric in METRICS}
 
 HEADLINE = (
-    "reached_95", "coverage", "time_to_95_s", "path_length_m", "collisions_per_100_m", "map_iou", "corner_mean_m",
-    "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
+    "reached_95", "coverage", "time_to_95_s", "regret_95", "path_length_m", "collisions_per_100_m", "map_iou",
+    "corner_mean_m", "ate_rmse_m", "final_heading_error_rad", "anees", "decision_ms_median",
 )  # fmt: skip
 """The metrics of the main table."""
 
@@ -116,7 +116,7 @@ def figures_table(
     found
         Name → metric → figure; a metric may be missing.
     metrics
-        Keys of :data:`METRICS`.
+        Keys of :data:`METRICS`; of regrets those that there are any of.
     limits
         The metrics that show their intervals; None: all.
     notes
@@ -124,7 +124,7 @@ def figures_table(
     episodes
         Name → how many, in a column of their own.
     """
-    shown_metrics = [BY_KEY[key] for key in metrics]
+    shown_metrics = [BY_KEY[key] for key in metrics if key not in REGRETS or _has(key, found)]
     best = {metric.key: _best(metric, found) for metric in shown_metrics}
     rows = []
     for name, figures in found.items():
@@ -135,6 +135,11 @@ def figures_table(
             cells.append(_toned(replace(cell, note=notes[name][key] if notes else ""), name, best[key]))
         rows.append((name, tuple(cells)))
     return Table(("agent", *(["episodes"] if episodes else []), *map(_heading, shown_metrics)), tuple(rows))
+
+
+def _has(key: str, found: Mapping[str, Intervals]) -> bool:
+    """Whether any has a value of a metric: there is a bound only where the planner that knows the map was run."""
+    return any(not math.isnan(figures.get(key, NONE).value) for figures in found.values())
 
 
 def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None) -> Table:
@@ -209,7 +214,7 @@ def _toned(cell: Cell, name: str, best: str | None) -> Cell:
 
 
 def _is_bound(name: str) -> bool:
-    return name.replace("@", " ").split(" ")[0] == KNOWN_MAP
+    return name.replace("@", " ").split(" ")[0] in KNOWN_MAPS
 
 
 # ---- printers --------------------------------------------------------------------------------------------------

@@ -20,12 +20,11 @@ from mecanum_env.arguments import make_config, make_plan
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
-from training.episodes.known_map import NAME as KNOWN_MAP
-from training.episodes.known_map import KnownMap
 from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input, check_writable
 from training.runs.running import plain
 from training.runs.signals import interrupt_flag
+from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
@@ -119,6 +118,8 @@ class Episode(Course):
         metrics: dict[str, Any] = dict(self.env.episode_metrics())
         metrics["decision_ms_median"] = self.decision_ms
         metrics["return_error_m"] = float(np.hypot(*self.env.truth.pose[:2])) if self.end == "returned" else None
+        if isinstance(self.agent, KnownMap):
+            metrics["lower_bound_s"] = self.agent.lower_bound_s
         metrics["success"] = bool(metrics["coverage"] >= self.config.coverage_target)
         metrics |= self.about()
         return {key: plain(value) for key, value in metrics.items()}
@@ -179,7 +180,7 @@ def asked_for(
         past = {name: value for name, value in past.items() if name in _DEFAULTS}
     given |= {"seed": seed}
     run = _DEFAULTS | past | {name: value for name, value in given.items() if value is not None}
-    agents.check(run["agent"], KNOWN_MAP)
+    agents.check(run["agent"], *KNOWN_MAPS)
     if run["agent"].endswith(".safetensors"):
         run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
     world = make_config(config=config, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan)
@@ -196,10 +197,12 @@ def asked_for(
 
 
 def make_agent(name: str, env: ExploreEnv) -> Agent:
-    """Return an agent for an environment's robot, the planner that knows the map among them."""
+    """Return an agent for an environment's robot, the bounds that know the map among them."""
+    if name in KNOWN_MAPS:
+        return KnownMap(env, KNOWN_MAPS[name])
     config = env.config
     body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
-    return KnownMap(env.truth.ground, **body) if name == KNOWN_MAP else agents.make(name, **body)
+    return agents.make(name, **body)
 
 
 def _read_run_table(path: Path) -> dict[str, Any]:

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from agents.frontier_env import ExploreFrontierEnv
 from agents.learned.choice import SIDEWAYS
 from mecanum_env import rooms as room_registry
-from training.episodes.true_places import TruePlaces
 from training.learning.config import RehearsalConfig, RoomsConfig, WorldConfig
 from training.learning.hindsight import Hindsight
 from training.learning.jump_world import JumpWorld
 from training.runs.processes import start_worker
+from training.truth.places import TruePlaces
 
 __all__ = ["Families", "Rehearsal", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
 

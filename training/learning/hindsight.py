@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agents.ways.routing import improve
 from slam.belief import Belief
 from slam.types import Array
-from training.episodes.true_places import TruePlaces, greedy_tour, see_from
+from training.truth.places import TruePlaces, greedy_tour, see_from
 
 __all__ = ["Hindsight"]
 

@@ -20,7 +20,6 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.views.render import render_frame
 from slam.files import plain_name
 from training.episodes.explore import make_agent
-from training.episodes.known_map import NAME as KNOWN_MAP
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 
@@ -64,7 +63,7 @@ class Session:
     def __init__(self, *, agent: str = "nearest-frontier", seed: int = 0, **where: Any) -> None:
         self.agent_name = agent
         with bad_input():
-            agents.check(agent, KNOWN_MAP)
+            agents.check(agent)
             config = make_config(**where)
             # A plan from a file is a kind of rooms of its own.
             self._kinds: list[tuple[str, str | None]] = [(name, None) for name in room_registry.names()]

@@ -15,7 +15,7 @@ _PROJECT = ("slam", "mecanum_env", "agents", "training")
 _READ = frozenset({".py", ".safetensors", ".json", ".toml"})
 # Who explores is asked for by its own module: neither the registry of the agents nor the bound that knows the map,
 # which stand beside what runs an episode, changes what another agent does.
-_ONLY_IF_ASKED = frozenset({"agents", "training.episodes.known_map"})
+_ONLY_IF_ASKED = frozenset({"agents", "training.truth.known_map"})
 
 
 def short_digest(parts: Iterable[bytes]) -> str:

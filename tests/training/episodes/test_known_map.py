@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from training.episodes.known_map import NAME, _way_until
 
 import agents
 from agents.ways.cost_map import PlannerConfig
@@ -11,8 +12,7 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
 from training.episodes.explore import prepare, run
-from training.episodes.known_map import NAME, _way_until
-from training.episodes.true_places import TruePlaces, cells_per_tile, greedy_tour
+from training.truth.places import TruePlaces, cells_per_tile, greedy_tour
 
 
 def episode(tmp_path, agent, rooms="apartment", seed=5):

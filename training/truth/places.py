@@ -21,7 +21,7 @@ from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.types import Array
 
-__all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from"]
+__all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from", "true_cost_map", "true_grid"]
 
 Cells = NDArray[np.int64]
 
@@ -62,7 +62,7 @@ class TruePlaces:
     ) -> None:
         self.ground = ground
         self._whole = cells_per_tile(ground.mappable)
-        self.map = _true_cost_map(ground, planner, robot)
+        self.map = true_cost_map(ground, planner, robot)
         reached = np.isfinite(travel_costs(self.map).cost)
         self.stride = max(1, round(_PLACES_M / self.map.resolution))
         self.cells = np.argwhere(reached[:: self.stride, :: self.stride]) * self.stride
@@ -91,14 +91,20 @@ class TruePlaces:
         return (part > _MOST * whole.ravel()) & (whole.ravel() >= TILE)
 
 
-def _true_cost_map(ground: GroundTruth, planner: PlannerConfig, robot: RobotConfig) -> CostMap:
+def true_grid(ground: GroundTruth) -> OccupancyGrid:
+    """Return the map that a belief would have that knew all, in the start frame."""
     classes = np.full(ground.mappable.shape, UNKNOWN, dtype=np.int8)
     classes[ground.mappable] = FREE
     classes[ground.walls] = OCCUPIED
     row, col = ground.lattice_origin
     size = ground.resolution
-    grid = OccupancyGrid.from_classes(classes, size, (col * size, row * size))
-    return cost_maps.build(Belief.without_landmarks(np.zeros(3), np.zeros((3, 3)), grid), planner, robot)
+    return OccupancyGrid.from_classes(classes, size, (col * size, row * size))
+
+
+def true_cost_map(ground: GroundTruth, planner: PlannerConfig, robot: RobotConfig) -> CostMap:
+    """Return the planning grid of :func:`true_grid`, with the robot at its start."""
+    belief = Belief.without_landmarks(np.zeros(3), np.zeros((3, 3)), true_grid(ground))
+    return cost_maps.build(belief, planner, robot)
 
 
 def cells_per_tile(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
