@@ -1,36 +1,14 @@
-"""The planner that knows the truth: what it takes for visible is so, and it covers what there is."""
+"""Places over the true map: what they take for visible is so."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from training.episodes.known_map import NAME, _way_until
 
-import agents
 from agents.ways.cost_map import PlannerConfig
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms import make
-from training.episodes.explore import prepare, run
 from training.truth.places import TruePlaces, cells_per_tile, greedy_tour
-
-
-def episode(tmp_path, agent, rooms="apartment", seed=5):
-    it = prepare(out=tmp_path, agent=agent, rooms=rooms, seed=seed, slam="truth")
-    run(it, lambda **_: None)
-    return it.metrics()
-
-
-def test_it_is_no_agent():
-    assert NAME not in agents.names()
-
-
-def test_it_covers_all_and_sooner_than_the_nearest_frontier(tmp_path):
-    known, nearest = episode(tmp_path, NAME), episode(tmp_path, "nearest-frontier")
-    assert known["end"] == "covered" and known["coverage"] > 0.99 and known["collisions"] == 0
-    assert known["time_to_95_s"] < nearest["time_to_95_s"]
-    again = episode(tmp_path, NAME)
-    assert (again["path_length_m"], again["time_s"]) == (known["path_length_m"], known["time_s"])
 
 
 def test_tiles_seen_are_in_the_line_of_sight():
@@ -58,7 +36,7 @@ def is_clear(walls, a, b):
     return not walls[cells[:, 1], cells[:, 0]].any()
 
 
-def test_ways_and_greedy_tours_by_hand():
+def test_greedy_tours_by_hand():
     # On a line: robot at 0, places at 1, 2 and 10; the one at 2 sees what the one at 1 sees, and more.
     at = np.array([0.0, 1.0, 2.0, 10.0])
     distance = np.abs(at[:, None] - at)
@@ -71,7 +49,3 @@ def test_ways_and_greedy_tours_by_hand():
 
     np.testing.assert_array_equal(greedy(0.5), [0, 1, 2, 3])
     np.testing.assert_array_equal(greedy(5.0), [0, 2, 3])
-    tour = np.array([0, 2, 3])
-    assert _way_until(seen, distance, cells, tour, 5.0) == pytest.approx(2.0)
-    assert _way_until(seen, distance, cells, tour, 0.0) == pytest.approx(10.0)
-    assert _way_until(seen, distance, cells, np.array([0, 2]), 0.0) == np.inf
