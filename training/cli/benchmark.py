@@ -23,7 +23,10 @@ def benchmark(
         ),
     ] = None,
     agents: Annotated[
-        str, typer.Option(help="Agents or policy files, separated by commas; known-map knows the plan.")
+        str,
+        typer.Option(
+            help="Agents or policy files, separated by commas; known-map is the bound that knows the plan."
+        ),
     ] = "nearest-frontier",
     slam: Annotated[
         str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")

@@ -35,12 +35,13 @@ from training.benchmark.episode import (
     resampled,
     run_job,
 )
-from training.benchmark.figures import METRICS, Group, comparisons, figures
+from training.benchmark.figures import METRICS, Group, comparisons, figures, with_regrets
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import SPLITS
 from training.cli import main
 from training.runs.campaign import run_all
 from training.runs.provenance import code_digest, modules_behind
+from training.truth import known_map
 
 STEPS = 25
 
@@ -166,10 +167,14 @@ def test_json_has_the_contract_s_keys_and_the_files_are_there(
 
 @pytest.mark.usefixtures("here")
 def test_the_planner_that_knows_the_map_stands_beside_the_agents(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = measure(small(tmp_path, "--agents", "nearest-frontier,known-map", "--report", seeds="0:1"), capsys)
+    monkeypatch.setattr(known_map, "_TRIES", 1000)
+    monkeypatch.setattr(known_map, "_TIMED", 10)
+    result = measure(small(tmp_path, "--agents", "nearest-frontier,known-map", "--report", seeds="0:0"), capsys)
     assert result["rooms"].keys() == {"nearest-frontier", "known-map"}
+    regrets = {name: found["regret_95"]["value"] for name, found in result["rooms"].items()}
+    assert min(regrets.values()) == 0.0 < max(regrets.values())
     assert "is no agent" in (tmp_path / "report.html").read_text("utf-8")
 
 
@@ -493,8 +498,8 @@ def test_a_digest_follows_imports_and_nothing_else(tmp_path: Path, monkeypatch: 
     for name, text in (("__init__", ""), ("agent", "from .parts import x"), ("parts", "x = 1"), ("rest", "")):
         (package / f"{name}.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
-    bound = modules_behind("training.benchmark.episode", "training.episodes.known_map").keys()
-    assert "training.episodes.known_map" in bound - behind and "agents.ways.routing" in bound - behind
+    bound = modules_behind("training.benchmark.episode", "training.truth.known_map").keys()
+    assert "training.truth.known_map" in bound - behind and "training.truth.search" in bound - behind
     assert modules_behind("an_agent_of_mine.agent").keys() == {
         "an_agent_of_mine", "an_agent_of_mine.agent", "an_agent_of_mine.parts",
     }  # fmt: skip
@@ -503,6 +508,18 @@ def test_a_digest_follows_imports_and_nothing_else(tmp_path: Path, monkeypatch: 
     assert code_digest("an_agent_of_mine.agent") == before
     (package / "parts.py").write_text("x = 2")
     assert code_digest("an_agent_of_mine.agent") != before
+
+
+def test_regret_is_over_the_least_time_in_the_same_room_whoever_had_it() -> None:
+    agent = made_up_group("a", time_to_95_s=[40.0, 18.0, None, 50.0])
+    known = made_up_group("known-map", time_to_95_s=[20.0, 20.0, 30.0, 40.0])
+    ours, theirs = with_regrets([agent, known])
+    assert [row.metrics["regret_95"] for row in ours.rows] == pytest.approx([1.0, 0.0, 9.0, 0.25])
+    assert [row.metrics["regret_95"] for row in theirs.rows] == pytest.approx([0.0, 20.0 / 18.0 - 1.0, 0.0, 0.0])
+    assert figures(ours)["regret_95"].averages.median.value == pytest.approx(0.625)
+    # Without the planner that knows the map there is no bound: none of 99 % here, none at all there.
+    assert np.isnan(figures(ours)["regret_99"].centre.value)
+    assert np.isnan(figures(with_regrets([agent])[0])["regret_95"].centre.value)
 
 
 def test_what_was_never_reached_counts_as_the_limit_and_loses() -> None:

@@ -104,7 +104,7 @@ def test_an_agent_drives_and_hands_back() -> None:
     [
         ({"rooms": "rectangle"}, ["unknown rooms", "rectangular"]),
         ({"slam": "efk"}, ["unknown SLAM backend", "ekf"]),
-        ({"agent": "nearest"}, ["unknown agent", "nearest-frontier", "known-map"]),
+        ({"agent": "nearest"}, ["unknown agent", "nearest-frontier"]),
         ({"robot": "yubot"}, ["unknown robot", "youbot"]),
         ({"noise": "none"}, ["unknown noise preset", "nominal"]),
         ({"rooms": None, "floor_plan": Path("no/such.png")}, ["no/such.png"]),
