@@ -25,7 +25,7 @@ def benchmark(
     agents: Annotated[
         str,
         typer.Option(
-            help="Agents or policy files, separated by commas; known-map is the bound that knows the plan."
+            help="Agents or policy files, separated by commas; known-map is a bound."
         ),
     ] = "nearest-frontier",
     slam: Annotated[

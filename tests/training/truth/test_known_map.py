@@ -14,7 +14,8 @@ from training.truth.known_map import KNOWN_MAPS
 def _short(monkeypatch):
     monkeypatch.setattr(known_map, "_STARTS", 2)
     monkeypatch.setattr(known_map, "_TRIES", 3000)
-    monkeypatch.setattr(known_map, "_TIMED", 24)
+    monkeypatch.setattr(known_map, "_TIMED", 20)
+    monkeypatch.setattr(known_map, "_MARGINS", (0.001, 0.01))
 
 
 def episode(tmp_path, agent, rooms, seed):
