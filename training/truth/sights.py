@@ -72,7 +72,8 @@ class Sights:
         self.map = true_cost_map(ground, PlannerConfig(), robot)
         reached = np.isfinite(travel_costs(self.map).cost)
         lattice = np.argwhere(reached[::_STOP, ::_STOP]) * _STOP
-        self._cells = np.vstack([np.array([self.map.start]), lattice])
+        elsewhere = (lattice != np.array(self.map.start)).any(axis=1)
+        self._cells = np.vstack([np.array([self.map.start]), lattice[elsewhere]])
         self._maps = [replace(self.map, start=(row, col)) for row, col in self._cells.tolist()]
         self._travels = [travel_costs(at) for at in self._maps]
         apart = ((self._cells[:, None] - self._cells[None]) ** 2).sum(axis=2)
