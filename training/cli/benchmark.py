@@ -24,9 +24,7 @@ def benchmark(
     ] = None,
     agents: Annotated[
         str,
-        typer.Option(
-            help="Agents or policy files, separated by commas; known-map is a bound."
-        ),
+        typer.Option(help="Agents or policy files, separated by commas; known-map is a bound."),
     ] = "nearest-frontier",
     slam: Annotated[
         str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")

@@ -74,6 +74,15 @@ def test_the_way_found_sees_what_it_is_to_see_and_no_stop_is_for_nothing():
     np.testing.assert_array_equal(order, again)
 
 
+def test_a_start_on_the_lattice_of_stops_is_one_stop():
+    env = ExploreEnv(rooms="rectangular")
+    env.reset(seed=13)
+    own = Sights(env.truth.ground, robot=ROBOT, lidar=LIDAR)
+    assert (np.array(own.map.start) % 3 == 0).all()
+    assert len(np.unique(own.board.stops)) == len(own.board.stops)
+    assert len(own.path(np.array([0, 1, 1, 0, 2]))) > 3
+
+
 def test_a_view_is_what_the_environments_lidar_maps():
     env = room()
     ground, grid = env.truth.ground, env.belief.grid
