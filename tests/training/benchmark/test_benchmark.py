@@ -173,7 +173,7 @@ def test_the_planner_that_knows_the_map_stands_beside_the_agents(
         monkeypatch.setattr(known_map, name, less)
     result = measure(small(tmp_path, "--agents", "nearest-frontier,known-map", "--report", seeds="0:0"), capsys)
     assert result["rooms"].keys() == {"nearest-frontier", "known-map"}
-    assert "is no agent" in (tmp_path / "report.html").read_text("utf-8")
+    assert "are no agents" in (tmp_path / "report.html").read_text("utf-8")
 
 
 @pytest.mark.usefixtures("here")
