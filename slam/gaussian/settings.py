@@ -33,8 +33,8 @@ class EkfConfig(BackendConfig):
         math.inf
     )  # old landmarks expected no better than to this count only together
     # The wheels are not believed where landmarks seen twice, so many scans apart at most, contradict them: squared
-    # Mahalanobis, 99.9 % of chi-square with three degrees of freedom. Over more scans the view changes, and with it
-    # what lasts of a landmark's error: over 20, wheels that were right were doubted in halls, and the heading lost.
+    # Mahalanobis, 99.9 % of chi-square with three degrees of freedom. Over more scans the view changes, and with
+    # it what lasts of a landmark's error: over 20, wheels that were right were doubted in halls.
     wheel_scans: Count = 8
     wheel_gate: Annotated[float, Within("(0, inf]")] = 16.27
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
