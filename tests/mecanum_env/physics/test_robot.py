@@ -140,7 +140,9 @@ def test_actions_are_clipped_and_checked() -> None:
         targets.of_wheels([0, 0, 0])
 
 
-@pytest.mark.parametrize("bad", [[[0, 0, 0]], "abc", [None, 0, 0], [1j, 0, 0], 0.5, [], [[0], 0, 0], [math.inf, 0, 0]])
+@pytest.mark.parametrize(
+    "bad", [[[0, 0, 0]], "abc", [None, 0, 0], [1j, 0, 0], 0.5, [], [[0], 0, 0], [math.inf, 0, 0]]
+)
 def test_what_is_no_action_is_refused_in_words(bad: object) -> None:
     with pytest.raises(ValueError, match="3 finite numbers"):
         WheelTargets(RobotConfig()).of_twist(bad)  # type: ignore[arg-type]
