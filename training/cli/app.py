@@ -154,7 +154,7 @@ def _usage_message(error: Any) -> str:
         valid = sorted(name for p in context.command.params for name in p.opts if name.startswith("--"))
         valid.append("--help")
         return f"unknown option {option}{suggestion(str(option), valid)}; valid: {', '.join(valid)}"
-    message = one_line(error.format_message()).rstrip(".")
+    message = one_line(error.format_message()).rstrip(".").replace(". ,", ",")
     if message.startswith("No such command"):
         given = [*message.split("'"), "", ""][1]
         return f"unknown command {given!r}{suggestion(given, _commands())}; valid: {', '.join(_commands())}"
