@@ -6,176 +6,25 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import slam
 from slam import Observations, Odometry
 from slam.fastslam import FastSlam, FastSlam1, FastSlam2, FastSlamConfig
 from slam.geometry import compose, inverse, wrap
-from slam.landmarks.association import nearest_neighbour
 from slam.motion import OdometryNoise, jacobians, move
-from slam.particles.filter import draw, narrow
-from slam.particles.maps import ParticleMaps, associate, correct_landmark, innovation
+from slam.particles.maps import ParticleMaps, correct_landmark
 from slam.particles.resampling import ResamplingPolicy
 from slam.settings import from_mapping
-from tests.slam.numerics import numerical_jacobian, random_covariance
+from tests.slam.particles.sights import OFFSET, random_sight, seeds
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
 
-OFFSET = 0.2
 BOTH = pytest.mark.parametrize("kind", [FastSlam1, FastSlam2])
 WITHOUT_SLIP = OdometryNoise(slip_share=0.0)
 NOISE = np.diag([1e-4, 1e-5])
-seeds = st.integers(0, 10_000)
 
 
 def make(kind: Callable[..., FastSlam], **settings: object) -> FastSlam:
     return kind(FastSlamConfig(odometry=WITHOUT_SLIP, **settings))  # type: ignore[arg-type]
-
-
-def predicted(state: np.ndarray) -> np.ndarray:
-    """h of theory.md A for x, y, θ, xi, yi, written down once more from the geometry."""
-    x, y, theta = state[:3]
-    d = state[3:5] - np.array([x + OFFSET * math.cos(theta), y + OFFSET * math.sin(theta)])
-    return np.array([np.hypot(*d), float(wrap(math.atan2(d[1], d[0]) - theta))])
-
-
-def upper_terms(cov: np.ndarray) -> list[float]:
-    return [cov[0, 0], cov[0, 1], cov[1, 1]]
-
-
-def random_sight(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.random.Generator]:
-    """Return pose and landmark, their covariances, and an observation row some sigmas off."""
-    rng = np.random.default_rng(seed)
-    state = np.concatenate([rng.uniform(-3, 3, 3), rng.uniform(-6, 6, 2)])
-    while predicted(state)[0] < 0.5:
-        state[3:] = rng.uniform(-6, 6, 2)
-    r = random_covariance(2, rng, 0.001)
-    z = np.concatenate([predicted(state) + rng.normal(0, 0.05, 2), upper_terms(r), [0.0, 0.0, 0.0]])
-    return state, random_covariance(3, rng), random_covariance(2, rng), z, rng
-
-
-def noise_of(z: np.ndarray) -> np.ndarray:
-    return np.array([[z[2], z[3]], [z[3], z[4]]])
-
-
-def innovation_of(state: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return ν and H ``(2, 5)``, by finite differences."""
-    nu = z[:2] - predicted(state)
-    nu[1] = wrap(nu[1])
-    return nu, numerical_jacobian(predicted, state, angle=1)
-
-
-# ---- the arithmetic of one particle ----------------------------------------------------------------------------
-
-
-@given(seeds)
-def test_observation_jacobian_against_finite_differences(seed: int) -> None:
-    state, _, _, z, _ = random_sight(seed)
-    nu, h = innovation_of(state, z)
-    values = innovation(state[:3], math.cos(state[2]), math.sin(state[2]), OFFSET, state[3], state[4], z)
-    np.testing.assert_allclose(values[:2], nu, atol=1e-12)
-    np.testing.assert_allclose(np.reshape(values[2:], (2, 3)), h[:, :3], atol=1e-5)
-    np.testing.assert_allclose(-np.reshape(values[2:], (2, 3))[:, :2], h[:, 3:], atol=1e-5)
-
-
-@given(seeds)
-def test_proposal_and_weight_of_one_landmark_against_direct_computation(seed: int) -> None:
-    """The pose's Gaussian given z, p(x | z, u, the path so far), and the likelihood p(z | the path so far)."""
-    state, p, p_m, z, _ = random_sight(seed)
-    nu, h = innovation_of(state, z)
-    h_x, h_m = h[:, :3], h[:, 3:]
-    rest = h_m @ p_m @ h_m.T + noise_of(z)
-    s = h_x @ p @ h_x.T + rest
-    want_cov = np.linalg.inv(np.linalg.inv(p) + h_x.T @ np.linalg.inv(rest) @ h_x)
-    want_mean = state[:3] + want_cov @ h_x.T @ np.linalg.solve(rest, nu)
-    want_log = -0.5 * (nu @ np.linalg.solve(s, nu) + np.linalg.slogdet(2 * math.pi * s)[1])
-    pose, cov = state[:3].copy(), np.triu(p)
-    records, table = np.array([[*state[3:], *upper_terms(p_m)]]), np.array([0])
-    log_likelihood = narrow(pose, cov, records, table, z[None], np.array([0]), OFFSET, 0.0)
-    assert log_likelihood == pytest.approx(want_log, abs=1e-4)
-    difference = pose - want_mean
-    difference[2] = wrap(difference[2])
-    np.testing.assert_allclose(difference, 0, atol=1e-5)
-    np.testing.assert_allclose(np.triu(cov), np.triu(want_cov), atol=1e-6)
-    # Where the pose is known, only the landmark and the sensor are left to be uncertain.
-    want_log = -0.5 * (nu @ np.linalg.solve(rest, nu) + np.linalg.slogdet(2 * math.pi * rest)[1])
-    pose, nothing = state[:3].copy(), np.zeros((3, 3))
-    assert narrow(pose, nothing, records, table, z[None], np.array([0]), OFFSET, 0.0) == pytest.approx(
-        want_log, abs=1e-4
-    )
-    np.testing.assert_array_equal(pose, state[:3])
-
-
-def test_an_unexplained_observation_weighs_as_one_at_the_given_distance() -> None:
-    _, _, _, z, _ = random_sight(1)
-    pose = np.zeros(3)
-    got = narrow(pose, np.zeros((3, 3)), np.zeros((1, 5)), np.array([0]), z[None], np.array([-1]), OFFSET, 9.0)
-    assert got == pytest.approx(-0.5 * (9.0 + np.linalg.slogdet(2 * math.pi * noise_of(z))[1]))
-
-
-@given(seeds)
-def test_landmark_update_against_the_filter_equations(seed: int) -> None:
-    state, _, p_m, z, _ = random_sight(seed)
-    nu, h = innovation_of(state, z)
-    gain = p_m @ h[:, 3:].T @ np.linalg.inv(h[:, 3:] @ p_m @ h[:, 3:].T + noise_of(z))
-    record = np.array([*state[3:], *upper_terms(p_m)])
-    correct_landmark(state[:3], math.cos(state[2]), math.sin(state[2]), OFFSET, z, record, record)  # in place
-    np.testing.assert_allclose(record[:2], state[3:] + gain @ nu, atol=1e-6)
-    np.testing.assert_allclose(record[2:], upper_terms(p_m - gain @ h[:, 3:] @ p_m), atol=1e-7)
-
-
-@given(seeds)
-def test_poses_are_drawn_with_their_covariance(seed: int) -> None:
-    """The draws of the three unit vectors are the columns of a root of P."""
-    p = random_covariance(3, np.random.default_rng(seed))
-    root = []
-    for unit in np.eye(3):
-        pose, cov = np.zeros(3), np.triu(p)
-        draw(pose, cov, unit)
-        root.append(pose)
-        assert not cov.any()
-    np.testing.assert_allclose(np.transpose(root) @ root, p, atol=1e-12)
-
-
-def test_drawing_from_a_singular_covariance_adds_nothing_where_there_is_none() -> None:
-    pose, normal = np.zeros(3), np.array([1.0, 2.0, 3.0])
-    draw(pose, np.diag([0.0, -1e-20, 0.04]), normal)
-    np.testing.assert_allclose(pose, [0, 0, 0.6])
-    way = np.array([1.0, 2.0, 0.5])  # of rank one
-    draw(pose := np.zeros(3), np.triu(np.outer(way, way)), normal)
-    np.testing.assert_allclose(pose, way, atol=1e-7)
-
-
-@given(seeds)
-def test_association_is_that_of_the_joint_filter_without_correlations(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    n, m = 12, 6
-    marks = np.zeros((n, 8))
-    marks[:, 0], marks[:, 1] = rng.choice([-1.0, 0.0, 1.0], n), rng.uniform(-math.pi, math.pi, n)
-    marks[:, 6] = rng.choice([-1.0, 0.0], n)
-    x, p = np.concatenate([rng.uniform(-2, 2, 3), rng.uniform(-3, 3, 2 * n)]), np.zeros((3 + 2 * n, 3 + 2 * n))
-    p[:3, :3] = random_covariance(3, rng, 0.002)
-    maps = ParticleMaps(2)
-    z = np.zeros((m, 8))
-    for i in range(n):
-        p[3 + 2 * i : 5 + 2 * i, 3 + 2 * i : 5 + 2 * i] = cov = random_covariance(2, rng, 0.003)
-        maps.add(np.zeros((2, 3)), z[0], 0.0)
-        maps.records[maps.table[:, i]] = [*x[3 + 2 * i : 5 + 2 * i], *upper_terms(cov)]
-    for k in range(m):
-        i = int(rng.integers(n))
-        z[k, :2] = predicted(np.concatenate([x[:3], x[3 + 2 * i : 5 + 2 * i]])) + rng.normal(0, 0.1, 2)
-        z[k, 2:5] = upper_terms(random_covariance(2, rng, 0.002))
-        z[k, 5:8] = marks[i, 0], wrap(marks[i, 1] - x[2] + rng.normal(0, 0.4)), rng.choice([-1.0, 0.0])
-    maps.extents[:n] = np.repeat(x[3:].reshape(n, 2), 2, axis=1)
-    want, distance = np.zeros(m, np.int64), np.zeros(m)
-    nearest_neighbour(x, np.triu(p), OFFSET, z, marks, 11.8, 0.2, 0.6, False, want, distance)
-    match, covs = np.zeros((2, m), np.int64), np.repeat(np.triu(p[:3, :3])[None], 2, axis=0)
-    leader = associate(
-        np.repeat(x[None, :3], 2, axis=0), covs, OFFSET, z, marks, 11.8, 0.2, 0.6, maps.table, maps.records,
-        maps.extents, match,
-    )  # fmt: skip
-    assert leader == 0
-    np.testing.assert_array_equal(match, [want, want])
 
 
 # ---- shared landmarks ------------------------------------------------------------------------------------------

@@ -3,77 +3,21 @@
 from __future__ import annotations
 
 import math
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig, RobotConfig
-from mecanum_env.physics.floor import build_floor
 from mecanum_env.physics.robot import WheelTargets
 from mecanum_env.physics.world import CONTACT_GAP_S, MAX_TRAVEL_M, World
-from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
+from mecanum_env.rooms.floor_plan import FloorPlanError
 from mecanum_env.sensing.sensors import WheelEncoders
+from tests.mecanum_env.physics.worlds import EXACT, ROBOT, STEP, Array, drive, random_drive, room, world
 
-Array = NDArray[np.float64]
-
-ROBOT = ROBOT_PRESETS["youbot"]
-EXACT = NoiseConfig(encoder=0, radius_error=0, base_error=0, range_sigma_m=0, dropout=0)
 G = 9.80665
-STEP = 0.1
-
-
-def room(
-    size: float = 6.0,
-    start: tuple[float, float, float] = (3.0, 3.0, 0.0),
-    *,
-    pieces: int = 1,
-    polygons: tuple[Array, ...] = (),
-    circles: Array | None = None,
-) -> FloorPlan:
-    """Return a square room, each wall in so many pieces; the obstacles are cut out of its free cells."""
-    edge = np.linspace(0.0, size, pieces + 1)
-    a, b = edge[:-1], edge[1:]
-    zero, far = np.zeros(pieces), np.full(pieces, size)
-    walls = np.vstack(
-        [
-            np.column_stack([a, zero, b, zero]),
-            np.column_stack([far, a, far, b]),
-            np.column_stack([size - a, far, size - b, far]),
-            np.column_stack([zero, size - a, zero, size - b]),
-        ]
-    )
-    resolution = 0.05
-    cells = round(size / resolution)
-    x, y = np.meshgrid(*[(np.arange(cells) + 0.5) * resolution] * 2)
-    free = np.ones((cells, cells), bool)
-    circles = np.zeros((0, 3)) if circles is None else circles
-    for cx, cy, radius in circles:
-        free &= np.hypot(x - cx, y - cy) > radius
-    for polygon in polygons:
-        sides = np.roll(polygon, -1, axis=0) - polygon
-        inside = [
-            side[0] * (y - corner[1]) - side[1] * (x - corner[0]) > 0
-            for corner, side in zip(polygon, sides, strict=True)
-        ]
-        free &= ~np.all(inside, axis=0)
-    return FloorPlan(
-        name="room", walls=walls, polygons=polygons, circles=circles, free=free, resolution=resolution, start=start
-    )
-
-
-def world(plan: FloorPlan, *, noise: NoiseConfig = EXACT, robot: RobotConfig = ROBOT, **kwargs: object) -> World:
-    return World(plan, robot, noise, np.random.default_rng(7), **kwargs)  # type: ignore[arg-type]
-
-
-def drive(w: World, action: tuple[float, float, float], seconds: float) -> None:
-    wheels = WheelTargets(w.robot).of_twist(action)
-    for _ in range(round(seconds / STEP)):
-        w.step(wheels, STEP, 0.02)
 
 
 def footprint(w: World) -> Array:
@@ -88,17 +32,6 @@ def depth(w: World, size: float = 6.0) -> float:
     """Return how deep the robot is in the walls of the room [m], at most."""
     corners = footprint(w)
     return float(max(0.0, -corners.min(), corners.max() - size))
-
-
-def random_drive(w: World, steps: int, *, seed: int = 3, scale: float = 1.0, hold: int = 5) -> Array:
-    rng = np.random.default_rng(seed)
-    path = []
-    for step in range(steps):
-        if step % hold == 0:
-            wheels = WheelTargets(w.robot).of_twist(scale * rng.uniform(-1, 1, 3))
-        w.step(wheels, STEP, 0.02)
-        path.append(np.concatenate([w.pose, w.twist, w.wheel_speeds, w.wheel_readings[-1]]))
-    return np.array(path)
 
 
 # ---- driving -----------------------------------------------------------------------------------------------
@@ -177,36 +110,6 @@ def test_finer_physics_steps_give_the_same_path() -> None:
 
 
 # ---- the floor ---------------------------------------------------------------------------------------------
-
-
-def test_clearance_is_never_more_than_the_distance() -> None:
-    box = np.array([[3.8, 2.5], [4.4, 2.7], [4.3, 3.4]])
-    plan = room(6.0, (2.0, 3.0, 0.0), polygons=(box,), circles=np.array([[1.0, 1.2, 0.03]]))
-    floor = build_floor(plan, EXACT, np.random.default_rng(0))
-    points = np.random.default_rng(1).uniform(0, 6, (3000, 2))
-    col, row = np.floor((points - floor.raster[:2]) * floor.raster[2]).astype(int).T
-    known, true = floor.clearance[row, col], plan.distance_to_surfaces(points)
-    assert np.all(known <= true)
-    assert np.max(true - known) < 3.4 * plan.resolution  # and it is of use
-
-
-def test_patches_cover_their_share_and_only_then_draw_numbers() -> None:
-    plan = room(8.0, (4.0, 4.0, 0.0))
-    rng = np.random.default_rng(5)
-    floor = build_floor(plan, NOISE_PRESETS["slippery"], rng)
-    pad = (floor.friction.shape[0] - plan.free.shape[0]) // 2
-    inner = floor.friction[pad:-pad, pad:-pad][plan.free]
-    share = np.mean(inner < 0.6)
-    assert 0.25 <= share < 0.28
-    assert np.all((floor.patches[:, 3] >= 0.15) & (floor.patches[:, 3] <= 0.3))
-    assert inner.min() >= np.float32(0.15)
-    x, y, _, mu = floor.patches[0]
-    if 0 < x < 8 and 0 < y < 8:
-        row, col = (int((v - o) * floor.raster[2]) for v, o in ((y, floor.raster[1]), (x, floor.raster[0])))
-        assert floor.friction[row, col] <= np.float32(mu)
-    rng = np.random.default_rng(5)
-    build_floor(plan, EXACT, rng)
-    assert rng.random() == np.random.default_rng(5).random()
 
 
 def test_wheels_feel_the_patch_they_stand_on() -> None:
@@ -359,9 +262,8 @@ def test_a_start_in_a_wall_is_refused() -> None:
 # ---- repeatability -----------------------------------------------------------------------------------------
 
 SCRIPT = """
-import sys
-sys.path[:0] = {paths!r}
-from test_world import *
+from mecanum_env.config import NOISE_PRESETS
+from tests.mecanum_env.physics.worlds import random_drive, room, world
 w = world(room(3.0, (1.5, 1.5, 0.0)), noise=NOISE_PRESETS["slippery"])
 path = random_drive(w, 120, hold=20)
 assert w.collisions
@@ -370,12 +272,10 @@ print(path.tobytes().hex())
 
 
 def test_a_seed_gives_the_same_path_to_the_last_bit_in_any_process() -> None:
-    here = Path(__file__).resolve()
-    code = SCRIPT.format(paths=[str(here.parent), str(here.parents[3])])
     w = world(room(3.0, (1.5, 1.5, 0.0)), noise=NOISE_PRESETS["slippery"])
     own = random_drive(w, 120, hold=20).tobytes().hex()
     child = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ.copy(), capture_output=True, text=True, check=True
+        [sys.executable, "-c", SCRIPT], cwd=Path(__file__).parents[3], capture_output=True, text=True, check=True
     )
     assert child.stdout.strip() == own
     other = World(w.plan, ROBOT, NOISE_PRESETS["slippery"], np.random.default_rng(8))

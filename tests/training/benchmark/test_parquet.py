@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.benchmark.test_benchmark import episode, made_up_group, small
+from tests.training.benchmark.small import episode, made_up_group, small
 from tests.training.cli.test_bad_input import refused
 from training.benchmark.output import Report
 from training.benchmark.parquet import FILE, write_parquet

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.training.benchmark.test_benchmark import made_up_group
+from tests.training.benchmark.small import made_up_group
 from training.benchmark.figures import Group
 from training.benchmark.output import Report, as_json, markdown, table, write_tables
 from training.benchmark.report import page, worst_first, write_report

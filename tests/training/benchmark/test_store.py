@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
-from training.benchmark.store import Store
+from tests.training.benchmark.small import episode, without_clock
+from training.benchmark.episode import EpisodeJob
+from training.benchmark.store import FILE, Store
 from training.runs.errors import BadInput
 from training.studies.reliability.files import results
 
@@ -81,3 +83,12 @@ def test_metrics_that_no_table_can_be_made_of_are_refused(
 ) -> None:
     text = json.dumps(results.metrics_of(1) | {name: value})
     refused(stored(tmp_path, sound, f"UPDATE episodes SET metrics = '{text}' WHERE seed = 1"), "cannot use")
+
+
+def test_two_runs_into_one_store_do_not_disturb_each_other(tmp_path: Path) -> None:
+    job = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
+    with Store(tmp_path / FILE) as one, Store(tmp_path / FILE) as other:
+        one.add(job, episode(job.key), made_by="x")
+        other.add(job, episode(job.key, coverage=0.5), made_by="x")
+        ((key, row),) = one.rows([job.key, ("rooms", "rectangular", 2, "a", "ekf")])
+    assert key == job.key and without_clock(row) == without_clock(episode(key))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mecanum_env.team.config import TeamConfig
-from tests.training.benchmark.test_benchmark import episode, here, made_up_group, without_clock
+from tests.training.benchmark.small import episode, made_up_group, without_clock
 from tests.training.cli.test_bad_input import refused
 from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob
 from training.benchmark.figures import Group, group_rows
@@ -24,8 +24,6 @@ from training.benchmark.suites import teams_of
 from training.benchmark.team_episode import TeamJob, run_job
 from training.benchmark.team_figures import scaling_of
 from training.cli import main
-
-assert here  # a fixture
 
 NOTHING: dict[str, Any] = {"communication": None, "range_m": None, "starts": None, "unknown_starts": False}
 

@@ -20,7 +20,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.training.benchmark.test_benchmark import alive, children, contents, count
+from tests.training.benchmark.small import alive, children, contents, count
 from training.cli import main
 
 pytest.importorskip("ray", reason="needs the extra `ray`")

@@ -1,0 +1,49 @@
+"""Figures of rows: what was not reached, what is not defined, contacts, regret."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.training.benchmark.small import made_up_group
+from training.benchmark.figures import comparisons, figures, with_regrets
+
+
+def test_regret_is_over_the_least_time_in_the_same_room_whoever_had_it() -> None:
+    agent = made_up_group("a", time_to_95_s=[40.0, 18.0, None, 50.0])
+    known = made_up_group("known-map", time_to_95_s=[20.0, 20.0, 30.0, 40.0])
+    ours, theirs = with_regrets([agent, known])
+    assert [row.metrics["regret_95"] for row in ours.rows] == pytest.approx([1.0, 0.0, 9.0, 0.25])
+    assert [row.metrics["regret_95"] for row in theirs.rows] == pytest.approx([0.0, 20.0 / 18.0 - 1.0, 0.0, 0.0])
+    assert figures(ours)["regret_95"].averages.median.value == pytest.approx(0.625)
+    # Without the planner that knows the map there is no bound: none of 99 % here, none at all there.
+    assert np.isnan(figures(ours)["regret_99"].centre.value)
+    assert np.isnan(figures(with_regrets([agent])[0])["regret_95"].centre.value)
+
+
+def test_what_was_never_reached_counts_as_the_limit_and_loses() -> None:
+    group = made_up_group(time_to_95_s=[40.0, 50.0, None, None], coverage=[1.0, 1.0, 0.9, 0.8])
+    found = figures(group)
+    assert found["time_to_95_s"].centre.value == pytest.approx((50 + 300) / 2)
+    assert found["time_to_95_s"].averages.median.value == math.inf and found["time_to_95_s"].averages.n == 4
+    assert found["reached_95"].centre.value == 0.5
+    other = made_up_group("b", time_to_95_s=[45.0, 45.0, 290.0, None])
+    against = comparisons(group, other)["time_to_95_s"]
+    assert against.probability.value == pytest.approx((1 + 0 + 0 + 0.5) / 4) and against.n == 4
+
+
+def test_what_is_not_defined_is_left_out_and_counted() -> None:
+    found = figures(made_up_group(map_iou=[0.5, None, 0.7]))["map_iou"]
+    assert found.averages.n == 2 and found.centre.value == pytest.approx(0.6)
+    nothing = figures(made_up_group(map_iou=[None, None]))["map_iou"]
+    assert nothing.averages.n == 0 and math.isnan(nothing.centre.value)
+    pairs = comparisons(made_up_group(map_iou=[0.5, None, 0.7]), made_up_group("b", map_iou=[0.4, 0.4, None]))
+    assert pairs["map_iou"].n == 1 and pairs["map_iou"].probability.value == 1.0
+
+
+def test_collisions_are_all_contacts_over_all_the_way() -> None:
+    found = figures(made_up_group(collisions=[0, 3, 0], path_length_m=[10.0, 20.0, 70.0]))
+    assert found["collisions_per_100_m"].centre.value == pytest.approx(3.0)
+    assert found["collided"].centre.value == pytest.approx(1 / 3)
