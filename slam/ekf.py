@@ -7,21 +7,19 @@ downdate of the triangle; a scan's own cost is linear in the landmarks but for t
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import found_cov
-from slam.belief import Belief
 from slam.gaussian import joint_gaussian as joint
+from slam.gaussian.beliefs import GaussianBackend
 from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
-from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
+from slam.landmark_backend import FEWEST_BACK, far_better, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
@@ -30,7 +28,6 @@ from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, j
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.wheel_check import WheelCheck
 from slam.metrics.chi_square import chi2_quantile
-from slam.metrics.measures import nees_pose
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
 
@@ -39,7 +36,7 @@ __all__ = ["EkfSlam"]
 _WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 
 
-class EkfSlam(LandmarkBackend):
+class EkfSlam(GaussianBackend):
     """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``."""
 
     config: EkfConfig
@@ -47,7 +44,6 @@ class EkfSlam(LandmarkBackend):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
-        self._given: list[weakref.ref[Belief]] = []  # beliefs, since the state last changed
         self.witness: Callable[[list[Innovation]], object] | None = None  # told of every correction before it
         self._max_turn = math.radians(c.max_turn_deg)
         self._curved = curvature_model(c.features)
@@ -317,83 +313,3 @@ class EkfSlam(LandmarkBackend):
         self._unseen_motion = (0.0, 0.0)
         self._manage(z, match, scan)
         self._draw(scan)
-
-    # ---- the belief ----------------------------------------------------------------------------------------
-
-    @property
-    def _points(self) -> Array:
-        return self._x[3 : self._n].reshape(-1, 2)
-
-    @property
-    def pose(self) -> Array:
-        """Pose mean ``(3,)``."""
-        return self._x[:3].copy()
-
-    @property
-    def pose_cov(self) -> Array:
-        """Pose covariance ``(3, 3)``."""
-        out = np.empty((3, 3))
-        joint.symmetric_block(self._p, out)
-        return out
-
-    def pose_nees(self, true_pose: Array) -> float:
-        """Return the NEES of the pose against the truth ``(3,)``."""
-        return float(nees_pose(self._x, self._p, np.asarray(true_pose, dtype=np.float64)))
-
-    @property
-    def joint_cov(self) -> Array:
-        """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, walls included."""
-        return self._covariance(np.arange(len(self._ids)))
-
-    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
-        """Return the covariance of the robot and some landmarks."""
-        rows = joint.state_rows(landmarks, robot=True)
-        out = np.empty((len(rows), len(rows)))
-        joint.read_block(self._p, rows, out)
-        return out
-
-    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
-        """Return the covariances ``(n, 2, 2)`` of some landmarks, each by itself."""
-        i, p = 3 + 2 * landmarks, self._p
-        return np.stack([p[i, i], p[i, i + 1], p[i, i + 1], p[i + 1, i + 1]], axis=-1).reshape(-1, 2, 2)
-
-    @property
-    def _ids(self) -> NDArray[np.int64]:
-        """Ids ``(n,)`` of every landmark."""
-        return self._book.ids
-
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
-        """Write the nearest landmarks in the robot frame (see the base class)."""
-        joint.near_landmarks(self._x, self._p, self._book.marks, out)
-
-    @property
-    def belief(self) -> Belief:
-        """Pose, landmarks, joint covariance (of pose and points) and grid."""
-        belief = Belief.postponed(
-            self._landmarks, lambda: self._own_covariances(self._points_and_walls()[0]),
-            lambda: self._covariance(np.concatenate(self._points_and_walls())),
-            pose=self.pose, pose_cov=self.pose_cov, grid=self.grid, health=self.health,
-        )  # fmt: skip
-        self._given.append(weakref.ref(belief))
-        return belief
-
-    def _points_and_walls(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the rows of both among all landmarks."""
-        walls = self._marks[:, 0] == LINE
-        return np.flatnonzero(~walls), np.flatnonzero(walls)
-
-    def _landmarks(self) -> dict[str, Any]:
-        """Return what the belief says of landmarks, but for their covariance."""
-        marks, (points, _), (rows, walls) = self._marks, self._map_points(), self._points_and_walls()
-        return {
-            "landmarks": points[rows], "landmark_ids": self._ids[rows],
-            "landmark_kinds": marks[rows, 0].astype(np.int8), "lines": points[walls],
-            "line_ends": joint.line_ends(points[walls], marks[walls, 6:8]),
-        }  # fmt: skip
-
-    def _settle_beliefs(self) -> None:
-        """Have the beliefs that were given, and that someone still holds, read what changes now."""
-        for given in self._given:
-            if (belief := given()) is not None:
-                belief.settle()
-        self._given.clear()

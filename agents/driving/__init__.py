@@ -1,5 +1,6 @@
-"""Driving along a way: from a path to the next twist.
+"""Driving: from the goal that was chosen to the next twist.
 
-``control`` follows with ``follow``'s kernels, ``safety`` has the last word on a twist, ``sides`` are what it keeps
-to beside other robots, ``grip`` learns how gently to drive.
+``driver`` asks for another goal when that is due and notices what does not work out; ``control`` follows a path
+with ``follow``'s kernels, ``safety`` has the last word on a twist, ``sides`` are what it keeps to beside other
+robots, ``grip`` learns how gently to drive.
 """

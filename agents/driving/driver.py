@@ -1,0 +1,210 @@
+"""From the goal that was chosen to actions: choose when it is due, drive there, notice what does not work out."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.base import Agent, Goal
+from agents.driving.control import ControlConfig, PathFollower
+from agents.view_points.troubles import PatienceConfig, Troubles
+from agents.ways.cost_map import CostMap, CostMaps, PlannerConfig
+from agents.ways.giving_way import GivingWay, GivingWayConfig
+from agents.ways.planning import TravelCosts, shortest_path
+from slam import geometry
+from slam.belief import Belief
+from slam.types import Array
+
+__all__ = ["Driver", "DriverConfig"]
+
+_LOST = 0.1  # health of a belief below which it is no good for driving
+
+
+class DriverConfig(Protocol):
+    """What of an agent's configuration is about driving."""
+
+    @property
+    def planner(self) -> PlannerConfig:
+        """What ways cost."""
+
+    @property
+    def control(self) -> ControlConfig:
+        """From a path to the next twist."""
+
+    @property
+    def patience(self) -> PatienceConfig:
+        """When to choose anew, and when to give up."""
+
+    @property
+    def giving_way(self) -> GivingWayConfig:
+        """To other robots of a team."""
+
+
+class Driver(Agent):
+    """Drives to what :meth:`choose` says, on the map, and asks again when it is due."""
+
+    config: DriverConfig
+
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode; the strategy draws nothing at random unless it says so."""
+        super().reset(belief, seed)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._follower = PathFollower(
+            self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
+        )
+        self._cost_maps = CostMaps(self.config.planner, self._robot)
+        self._time = 0.0
+        self._chosen_at = -math.inf
+        self._chosen_on = 0  # known cells
+        self._target: Array | None = None  # the frontier point behind the goal
+        self._deadline = math.inf
+        self._arrived_for = 0.0
+        self._recover_until = -math.inf
+        self._anchor = (0.0, 0.0, 0.0)  # pose [m, m, rad] from which it has to get away in time
+        self._anchored_at = 0.0
+        self._lost_for = 0.0
+        self._troubles = Troubles(0.6 * self.config.patience.same_m)
+        self._giving_way = GivingWay(self.config.giving_way, self._robot)
+
+    @abstractmethod
+    def _keep_watch(self, belief: Belief) -> None:
+        """Remember from where the sensor has looked."""
+
+    @abstractmethod
+    def _is_frontier(self, belief: Belief, point: Array) -> bool:
+        """Whether there is anything left to see around the point."""
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action on the way to the goal, choosing a goal when one is due."""
+        if belief.health < _LOST:
+            return self._wait(observation, belief)
+        self._lost_for = 0.0
+        self._keep_watch(belief)
+        if belief.teammates and self._makes_way(belief):
+            self._time += self._step_s
+            self._anchored_at = self._time
+            self._status = "giving way"
+            return self._to_action(self._follower.follow(observation, belief))
+        if self._due(belief):
+            self._goal = self.choose(belief)
+            self._chosen_at, self._chosen_on = self._time, belief.grid.known_cells
+            if self._goal is not None:
+                # Who sees all round need not turn to look.
+                all_round = self._lidar.field_of_view_deg >= 360.0
+                self._follower.set_path(self._goal.path, None if all_round else float(self._goal.pose[2]))
+        self._time += self._step_s
+        if self._goal is None:
+            self._follower.reset()
+            self._anchored_at = self._time
+            return np.zeros(3, dtype=np.float32)
+        if self._time < self._recover_until:
+            self._status = "recovering"
+            twist = self._back_off(observation, belief)
+        else:
+            self._status = "driving"
+            twist = self._follower.follow(observation, belief)
+        self._watch(belief)
+        return self._to_action(twist)
+
+    def _makes_way(self, belief: Belief) -> bool:
+        """Whether the robot is out of its own way for another; sets off, where it is to begin."""
+        giving, now = self._giving_way, self._time
+        if now < giving.until_s:
+            return True
+        speed = None if self._goal is None else self._follower.speed_m_s
+        mate = giving.asked(belief, speed, self._step_s)
+        if mate is None:
+            return False
+        if self._target is not None:  # what the other stands before is put last for a while
+            self._troubles.note(self._target).avoid_until_s = now + giving.config.avoid_s
+        self._target, self._chosen_at = None, -math.inf
+        cost_map = self._cost_maps.of(belief)
+        found = giving.refuge(cost_map, belief, mate)
+        if found is None:
+            return False
+        travel, cell = found
+        path = self._path(cost_map, travel, cell, belief)
+        giving.until_s = now + giving.config.pass_s + float(travel.cost[cell]) / giving.config.speed_m_s
+        self._goal = Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path)
+        self._follower.set_path(path, None)
+        return True
+
+    def _wait(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Stand still while the belief is lost; after a while creep to where the scan has most room.
+
+        From where it stands, two places may look alike.
+        """
+        self._status = "lost"
+        self._time += self._step_s
+        self._lost_for += self._step_s
+        self._anchored_at = self._time
+        if self._lost_for < self.config.patience.lost_s:
+            return np.zeros(3, dtype=np.float32)
+        return self._to_action(self._follower.creep(observation, belief))
+
+    def _due(self, belief: Belief) -> bool:
+        patience = self.config.patience
+        waited = self._time - self._chosen_at + 1e-9
+        if self._chosen_at == -math.inf:
+            return True
+        if waited >= patience.replan_s and (waited >= patience.stale_s or not self._as_chosen(belief)):
+            return True
+        if waited < patience.min_replan_s or self._goal is None:
+            return False
+        return self._follower.blocked or self._target is None or not self._is_frontier(belief, self._target)
+
+    def _as_chosen(self, belief: Belief) -> bool:
+        """Whether the robot is far from its goal yet, and the map shows what it showed when that was chosen."""
+        if self._goal is None:
+            return False
+        away = math.hypot(*(self._goal.pose[:2] - belief.pose[:2]).tolist())
+        news_m2 = (belief.grid.known_cells - self._chosen_on) * belief.grid.resolution**2
+        return away > self.config.patience.far_m and abs(news_m2) < self.config.patience.news_m2
+
+    def _watch(self, belief: Belief) -> None:
+        """Count looks taken, and notice when nothing moves or a goal takes too long."""
+        patience, now = self.config.patience, self._time
+        x, y, heading = belief.pose.tolist()
+        assert self._target is not None
+        self._arrived_for = self._arrived_for + self._step_s if self._follower.arrived else 0.0
+        if self._arrived_for >= patience.settle_s - 1e-9:
+            self._troubles.note(self._target).looks += 1
+            self._chosen_at = -math.inf
+            self._arrived_for = 0.0
+            self._anchored_at = now
+            return
+        anchor_x, anchor_y, anchor_heading = self._anchor
+        moved = math.hypot(x - anchor_x, y - anchor_y)
+        turned = abs(geometry.wrap_scalar(heading - anchor_heading))
+        if moved > 0.15 or turned > 0.4 or self._follower.arrived:
+            self._anchor, self._anchored_at = (x, y, heading), now
+        stuck = now - self._anchored_at > patience.stuck_s
+        if (stuck or now > self._deadline) and now >= self._recover_until:
+            trouble = self._troubles.note(self._target)
+            trouble.avoid_until_s = now + patience.avoid_s * 2.0**trouble.failures
+            if self._giving_way.nearest(belief, self.config.giving_way.near_m) is None:
+                trouble.failures += 1  # else it was another robot that stood in the way
+            self._anchored_at = now
+            self._deadline = math.inf
+            self._target = None
+            self._recover_until = now + patience.recover_s if stuck else -math.inf
+            self._chosen_at = -math.inf
+
+    def _back_off(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Move to where there is more room, turning a little: what stood in the way is then seen anew."""
+        pose = np.asarray(belief.pose, dtype=np.float64)
+        angles = np.arange(16) * (math.pi / 8.0)
+        away = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        room = self._follower.room(belief, pose[:2] + 0.3 * away)
+        return self._follower.drive(0.15 * away[int(np.argmax(room))], 0.4, observation, belief)
+
+    def _path(self, cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], belief: Belief) -> Array:
+        spacing = self.config.planner.path_spacing_m
+        return shortest_path(cost_map, travel, cell, start=belief.pose, spacing_m=spacing)
