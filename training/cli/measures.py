@@ -39,9 +39,9 @@ def speed(
       mecanum speed --envs 8 --peer navground
     """  # noqa: D301
     from mecanum_env.arguments import make_config
-    from training.studies.peers import require
-    from training.studies.speed import run
-    from training.studies.speed_batch import run as run_batch
+    from training.studies.costs.peers import require
+    from training.studies.costs.speed import run
+    from training.studies.costs.speed_batch import run as run_batch
 
     with bad_input():
         make_config(rooms=rooms, slam=slam, lidar={"beams": beams})
@@ -108,7 +108,7 @@ def complexity(
       mecanum complexity
       mecanum complexity --slam ekf,odometry --landmarks 25,50,100 --out out/complexity --json
     """  # noqa: D301
-    from training.studies import complexity as study
+    from training.studies.costs import complexity as study
 
     result = study.complexity(backends=slam, landmarks=landmarks, steps=steps, out=out)
     print(json.dumps(result) if as_json else study.table(result))

@@ -13,12 +13,12 @@ from training.runs.options import Command
 __all__ = ["STUDIES", "study", "study_command"]
 
 STUDIES = {
-    "accuracy": ("training.benchmark.evaluate", "errors of explored maps over seeds, rooms and backends"),
+    "accuracy": ("training.studies.accuracy", "errors of explored maps over seeds, rooms and backends"),
     "belief": ("training.studies.belief", "where a belief stops being true: NEES, NIS, the largest innovations"),
     "calibration": ("training.studies.calibrate", "V of the simulated robot, beside what its estimators are told"),
     "digests": ("training.studies.digests", "same seed, same bits: digests of episodes, to compare commits by"),
     "dp-slam-cost": (
-        "training.studies.dp_slam_cost",
+        "training.studies.costs.dp_slam_cost",
         "cost of DP-SLAM's particles: one grid, or one each",
     ),
     "leaderboard": ("training.benchmark.leaderboard", "put a benchmark's figures into a Markdown page"),
@@ -34,7 +34,8 @@ STUDIES = {
         "a filter by differential transforms: errors, cost, use",
     ),
     "paper-d": ("training.studies.paper_d", "how far mapped corners are from the true ones, backend by backend"),
-    "ratios": ("training.benchmark.ratios", "one agent's errors and times against the others' in a benchmark"),
+    "ratios": ("training.studies.ratios", "one agent's errors and times against the others' in a benchmark"),
+    "recording-cost": ("training.studies.costs.recording_cost", "what recording an episode takes"),
     "recovery": (
         "training.studies.recovery.command",
         "faults made mid-episode: is the belief lost, does it know, is it found again?",
@@ -43,13 +44,12 @@ STUDIES = {
         "training.studies.reliability.command",
         "a campaign against the whole: hostile files, steps, kills, full disks, hours",
     ),
-    "scale": ("training.studies.scale", "what a step and a decision take, against the area explored"),
+    "scale": ("training.studies.costs.scale", "what a step and a decision take, against the area explored"),
     "team-cost": ("training.studies.teams.cost", "what a step takes against the number of robots"),
     "team-filters": (
         "training.studies.teams.filters",
         "robots that map one building: one filter for all, or one each",
     ),
-    "recording-cost": ("training.studies.recording_cost", "what recording an episode takes"),
 }
 """Name → the module whose function ``study`` it is, and a line for the list."""
 

@@ -12,7 +12,7 @@ import pytest
 import slam
 from tests.training.cli.test_bad_input import refused
 from training.cli import main
-from training.studies import complexity
+from training.studies.costs import complexity
 
 
 @pytest.mark.parametrize("count", [10, 25, 60])

@@ -7,8 +7,8 @@ import csv
 import numpy as np
 import pytest
 
-from training.benchmark.ratios import ratio, table
 from training.cli import main
+from training.studies.ratios import ratio, table
 
 FIELDS = ("suite", "place", "seed", "agent", "time_to_95_s", "time_s", "ate_rmse_m", "corner_mean_m", "limit_s")
 

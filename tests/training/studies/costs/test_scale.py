@@ -10,7 +10,7 @@ import pytest
 
 from tests.training.plans import write_room
 from training.cli import main
-from training.studies import scale
+from training.studies.costs import scale
 
 
 def test_a_room_is_explored_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
 from training.figures.tables import text_table
-from training.studies import peers
+from training.studies.costs import peers
 
 __all__ = ["REPEATS", "measure", "run"]
 
@@ -190,7 +190,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
 
 
 def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
-    """Measure ours and a peer in turn, over one exploration's rooms (``training.studies.peers.compare``)."""
+    """Measure ours and a peer in turn, over one exploration's rooms (``training.studies.costs.peers.compare``)."""
     env = _make_env(rooms, slam, beams)
     inner = _unwrapped(env)
     episodes = _record(env, min(max(steps // peers.ROUNDS, 1), 20_000), seed)

@@ -20,7 +20,7 @@ import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from training.figures.tables import text_table
-from training.studies import peers
+from training.studies.costs import peers
 
 __all__ = ["WAYS", "measure", "run"]
 

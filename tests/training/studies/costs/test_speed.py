@@ -11,7 +11,7 @@ from mecanum_env import rooms
 from mecanum_env.arguments import make_config
 from mecanum_env.sensing.sensors import Lidar
 from training.cli import main
-from training.studies import peers
+from training.studies.costs import peers
 
 
 def _missing() -> str:
