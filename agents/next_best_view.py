@@ -26,11 +26,9 @@ from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief
 from slam.settings import Length, NotNegative, Within
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
-
-Cells = NDArray[np.int64]
 
 _SAMPLE_RAYS = 60  # enough to rank places by; six degrees apart
 _NEARER = 0.85  # share of the range of good sight that a place keeps to: the robot stops a little short

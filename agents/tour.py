@@ -22,11 +22,9 @@ from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from slam.belief import Belief
 from slam.settings import Few, Gap, NotNegative
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
-
-Cells = NDArray[np.int64]
 
 _FAR = 1e6  # [m] farther than anything is
 

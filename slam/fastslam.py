@@ -38,11 +38,9 @@ from slam.particles.resampling import (
     systematic,
 )
 from slam.settings import Count, NotNegative, Positive, Within
-from slam.types import Array, Observations, Odometry, Scan
+from slam.types import Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)

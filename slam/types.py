@@ -8,10 +8,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONCAVE", "CONVEX", "LINE", "Array", "Observations", "Odometry", "Scan", "Sighting"]
+__all__ = [
+    "CONCAVE", "CONVEX", "LINE", "Array", "Cells", "Floats", "Indices", "Observations", "Odometry", "Scan",
+    "Sighting",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 """Numbers; their shape and units stand where they are named."""
+Floats = NDArray[np.float32]
+"""The same, where half the bits do: what is observed, and what networks compute."""
+Cells = NDArray[np.int64]
+"""Rows and columns on a grid, or cells counted row by row."""
+Indices = NDArray[np.int64]
+"""Places in other arrays."""
 
 CONVEX = 1
 """A corner that stands out into free space: the end of a wall, the edge of a cupboard."""

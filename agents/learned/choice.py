@@ -25,11 +25,9 @@ from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import Config, Duration, Few, Length, Within
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
-
-Floats = NDArray[np.float32]
 
 _FIRST_LEG_M = 0.5  # of a way: where it turns to first
 _SENSOR = SensorModel()

@@ -11,14 +11,12 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.learned.choice import Choice, mirrored
 from agents.learned.layers import Layers
+from slam.types import Floats
 
 __all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
-
-Floats = NDArray[np.float32]
 
 
 class ChoiceNetwork(Layers):

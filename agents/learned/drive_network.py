@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from agents.learned.drive_plan import descend, distances, node_prices
 from agents.learned.layers import Layers
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = [
     "BEAMS", "LOG_PRICES", "NUMBERS", "RANGE_M", "SECTORS", "STEP_LENGTHS", "DriveNetwork", "Inputs", "Plan",
     "PlanSettings", "pixel_size", "sectors",
 ]  # fmt: skip
 
-Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 SIZE = 64

@@ -17,10 +17,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.planning import D_COL, D_ROW
+from slam.types import Floats
 
 __all__ = ["EDGES", "descend", "distances", "gradient", "node_prices"]
-
-Floats = NDArray[np.float32]
 
 EDGES = ((0, 1), (1, 1), (1, 0), (1, -1))
 """Row and column offsets of the four steps that each pixel owns; the other four are its neighbours'."""

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Layers"]
+from slam.types import Floats
 
-Floats = NDArray[np.float32]
+__all__ = ["Layers"]
 
 
 class Layers:

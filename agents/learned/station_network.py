@@ -18,7 +18,7 @@ from agents.learned.choice_network import apart
 from agents.learned.layers import Layers
 from agents.stations.survey import STRIDE, Openings, Survey
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Cells, Floats
 
 __all__ = [
     "PLANES",
@@ -32,9 +32,6 @@ __all__ = [
     "pixels",
     "with_walls",
 ]
-
-Cells = NDArray[np.int64]
-Floats = NDArray[np.float32]
 
 SIDE = 32
 """Pixels a side of the picture, 4 m each: 128 m."""

@@ -12,11 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import FREE
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["count_in_sight", "edges", "in_sight", "join", "lengths", "line_is_free", "ways"]
-
-Cells = NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)

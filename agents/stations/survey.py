@@ -18,7 +18,7 @@ from agents.stations.lattice import edges, join, lengths, line_is_free, ways
 from agents.stations.sensor import Rays, look
 from agents.ways.routing import best_tour, draw_luck, improve, order_cost
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = [
     "HOP",
@@ -35,7 +35,6 @@ __all__ = [
     "tour",
 ]
 
-Cells = NDArray[np.int64]
 Classes = NDArray[np.int8]
 Flags = NDArray[np.bool_]
 

@@ -16,11 +16,9 @@ from agents.view_points.sight import view_points
 from agents.ways.giving_way import costs_from
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief, Teammate
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["Crew", "muster"]
-
-Cells = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

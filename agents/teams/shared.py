@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from agents.explorer import Candidates, Explorer
 from agents.teams.crew import Crew, muster
 from agents.teams.sharing import share_tours
-from agents.view_points.gain import expected_area
 from agents.ways.travel import between
 from slam.belief import Belief
-from slam.settings import Config, Duration, Few, Length, NotNegative
+from slam.settings import Config, Duration, Few, NotNegative
 
 __all__ = ["Shared", "SharingConfig"]
 
@@ -26,8 +25,6 @@ class SharingConfig(Config):
 
     trust_s: Duration = 20.0  # how long a robot that is no longer heard is counted on, where it was
     most: Few = 40  # pieces of frontier that are shared out: those nearest to any robot
-    service_m_m2: NotNegative = 0.0  # what a square metre of new area counts for, as a way
-    depth_m: Length = 3.0  # how far behind a frontier new area is expected
     # Shorter is the way to what a robot is on its way to: parts that change hands cost turns.
     hold_m: NotNegative = 3.0
 
@@ -49,10 +46,7 @@ class Shared(Explorer):
         near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]
         starts, cells = np.minimum(crew.held(config.hold_m)[:, near], _FAR), crew.cells[near]
         distance = np.nan_to_num(between(found.cost_map, crew.travel, cells, searched=0), nan=_FAR, posinf=_FAR)
-        area = expected_area(
-            found.cost_map, cells, range_m=self._lidar.range_max_m, depth_m=config.depth_m, rays=60
-        )
-        owner = share_tours(starts, distance, config.service_m_m2 * area)
+        owner = share_tours(starts, distance)
         return np.asarray(near[owner == crew.own])
 
     def _own_part(self, found: Candidates, belief: Belief) -> Candidates:

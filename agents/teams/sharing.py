@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["assign", "share_tours", "tour_length"]
-
-Indices = NDArray[np.int64]
 
 _MOST_ROUNDS = 50
 _LEAST = 1e-7
@@ -33,16 +30,16 @@ def assign(costs: Array) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def tour_length(start: Array, distance: Array, service: Array, tour: Indices) -> float:
-    """Return the length of an open tour from a robot with ways ``(n,)`` to its first place, service included."""
+def tour_length(start: Array, distance: Array, tour: Indices) -> float:
+    """Return the length of an open tour from a robot with ways ``(n,)`` to its first place."""
     total = 0.0
     for k in range(len(tour)):
-        total += (start[tour[k]] if k == 0 else distance[tour[k - 1], tour[k]]) + service[tour[k]]
+        total += start[tour[k]] if k == 0 else distance[tour[k - 1], tour[k]]
     return total
 
 
 @njit(cache=True, nogil=True)
-def share_tours(starts: Array, distance: Array, service: Array) -> Indices:
+def share_tours(starts: Array, distance: Array) -> Indices:
     """Return the robot ``(n,)`` that each place goes to, so that all tours end at about one time.
 
     Several travelling salesmen without a way back, who want the last of them to be done early: the sum of the
@@ -55,8 +52,6 @@ def share_tours(starts: Array, distance: Array, service: Array) -> Indices:
         ``(k, n)`` from each robot to each place [m]; ``1e6`` or more where it cannot get.
     distance
         ``(n, n)`` between places [m].
-    service
-        ``(n,)`` what each place takes once one is there, as a way [m].
     """
     robots, n = starts.shape
     tours = np.empty((robots, n), dtype=np.int64)
@@ -70,8 +65,8 @@ def share_tours(starts: Array, distance: Array, service: Array) -> Indices:
                 continue
             for k in range(robots):
                 at, longer = _cheapest(starts[k], distance, tours[k, : sizes[k]], i)
-                if lengths[k] + longer + service[i] < best - _LEAST:
-                    best_i, best_k, best_at, best = i, k, at, lengths[k] + longer + service[i]
+                if lengths[k] + longer < best - _LEAST:
+                    best_i, best_k, best_at, best = i, k, at, lengths[k] + longer
         if best_i < 0:
             break
         _put(tours[best_k], sizes[best_k], best_at, best_i)
@@ -79,7 +74,7 @@ def share_tours(starts: Array, distance: Array, service: Array) -> Indices:
         lengths[best_k] = best
         owner[best_i] = best_k
     for _ in range(_MOST_ROUNDS):
-        if not _move_one(starts, distance, service, tours, sizes, lengths, owner):
+        if not _move_one(starts, distance, tours, sizes, lengths, owner):
             break
     return owner
 
@@ -106,7 +101,7 @@ def _put(tour: Indices, size: int, at: int, place: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _move_one(
-    starts: Array, distance: Array, service: Array, tours: Indices, sizes: Indices, lengths: Array, owner: Indices
+    starts: Array, distance: Array, tours: Indices, sizes: Indices, lengths: Array, owner: Indices
 ) -> bool:
     """Move each place to where it costs least; return whether any was moved."""
     moved = False
@@ -120,12 +115,12 @@ def _move_one(
             if tours[a, k] != i:
                 rest[count] = tours[a, k]
                 count += 1
-        without = tour_length(starts[a], distance, service, rest[:count])
+        without = tour_length(starts[a], distance, rest[:count])
         best_k, best_at, best, best_length = -1, 0, -_LEAST, 0.0
         for k in range(len(starts)):
             tour = rest[:count] if k == a else tours[k, : sizes[k]]
             at, longer = _cheapest(starts[k], distance, tour, i)
-            length = (without if k == a else lengths[k]) + longer + service[i]
+            length = (without if k == a else lengths[k]) + longer
             # By how much the sum of powers changes.
             if k == a:
                 change = length**_POWER - lengths[a] ** _POWER

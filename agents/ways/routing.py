@@ -11,11 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["best_tour", "cover", "draw_luck", "improve", "nearest_order", "order_cost", "tours_begun_with"]
 
-Indices = NDArray[np.int64]
 Sight = NDArray[np.bool_]
 
 _MOST_ROUNDS = 100  # of improvement: each makes the tour shorter, so that this is never reached in practice

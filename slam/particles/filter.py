@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.motion import predict_robot
 from slam.particles.maps import correct_landmark, innovation, own
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["correct_particles", "draw", "narrow", "predict_particles"]
 
-Indices = NDArray[np.int64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
 

@@ -15,11 +15,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["PASSES", "STOPS", "SUM_X", "SUM_Y", "Lattice", "ParticleGrids", "ScanCells", "scan_cells"]
 
-Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 STOPS, SUM_X, SUM_Y, PASSES = range(4)

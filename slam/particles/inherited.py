@@ -15,14 +15,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.particles.maps import innovation
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["InheritedError", "beyond", "common_descent"]
-
-Indices = NDArray[np.int64]
 
 
 class InheritedError:

@@ -11,13 +11,10 @@ follows from the weights that were used, best or not, in Joseph's form (``docs/r
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["MapError", "transport"]
-
-Indices = NDArray[np.int64]
 
 
 class MapError:

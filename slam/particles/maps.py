@@ -13,15 +13,12 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import IGNORED, UNMATCHED
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["ParticleMaps", "associate", "correct_landmark", "innovation", "own", "refresh_extents"]
-
-Indices = NDArray[np.int64]
 
 _RECORD = 5  # x, y [m], σxx, σxy, σyy [m²] given the particle's path
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.grids.match_kernels import climb, prior_loss, slope
 from slam.grids.scan_matching import MatchConfig, Values, stamps_of
-from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Floats, Ints, ParticleGrids
-from slam.types import Array
+from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Ints, ParticleGrids
+from slam.types import Array, Floats
 
 __all__ = ["ParticleMatcher"]
 

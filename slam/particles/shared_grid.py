@@ -19,8 +19,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.particles.ancestry import Ancestry
-from slam.particles.grids import Floats, Ints, ParticleGrids, ScanCells
-from slam.types import Array
+from slam.particles.grids import Ints, ParticleGrids, ScanCells
+from slam.types import Array, Floats
 
 __all__ = ["TILE", "CopiedGrids", "SharedGrid"]
 

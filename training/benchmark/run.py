@@ -30,7 +30,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
-from training.runs.running import versions
+from training.runs.running import parts_of, versions
 from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = ["BenchmarkPlan", "EpisodesFailed", "benchmark"]
@@ -229,7 +229,7 @@ def _job(team: TeamConfig | None, **about: Any) -> EpisodeJob:
 
 
 def _agent_names(text: str) -> tuple[str, ...]:
-    chosen = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    chosen = tuple(parts_of(text))
     for name in chosen:
         agents.check(name, *KNOWN_MAPS)
     return chosen

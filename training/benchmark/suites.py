@@ -16,6 +16,7 @@ from training.episodes.team import read_team
 from training.runs.errors import BadInput, bad_input
 from training.runs.options import whole_numbers
 from training.runs.provenance import short_digest
+from training.runs.running import parts_of
 
 __all__ = [
     "FLOOR_PLANS",
@@ -100,14 +101,14 @@ def choose(text: str, *, floor_plans: Path | None = None) -> tuple[Suite, ...]:
         For a folder that cannot be used.
     """
     valid = names(floor_plans=floor_plans is not None)
-    wanted = list(valid) if text.strip() == "all" else [part.strip() for part in text.split(",")]
+    wanted = list(valid) if text.strip() == "all" else parts_of(text)
     for name in wanted:
         if name not in valid and name in names(floor_plans=True):
             raise BadInput(f"--suite {name} needs the folder of the plans; give --floor-plans DIR")
         if name not in valid:
             raise unknown_name("suite", name, (*valid, "all"))
     plans = read_floor_plans(floor_plans) if floor_plans is not None else ()
-    return tuple(_make(name, plans) for name in dict.fromkeys(wanted))
+    return tuple(_make(name, plans) for name in wanted)
 
 
 def read_floor_plans(folder: Path) -> tuple[Place, ...]:
@@ -153,7 +154,7 @@ def teams_of(
     counts = whole_numbers("--robots", robots, low=1, high=64)
     if counts == [1]:  # refuses what is for several
         read_team(communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts)
-    words = [None] if communication is None else list(dict.fromkeys(map(str.strip, communication.split(","))))
+    words = [None] if communication is None else parts_of(communication)
     found: list[TeamConfig | None] = [None] if 1 in counts else []
     for count in counts:
         found += [

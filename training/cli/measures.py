@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Json, Ray, Workers, workers_of
+from training.runs.options import Backends, Json, Out, Ray, Workers, workers_of
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -66,7 +66,7 @@ def consistency(
     seed0: Annotated[int, typer.Option(min=0, max=2**30, help="Seed of the first run.")] = 0,
     workers: Workers = None,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/consistency"),
+    out: Out = Path("out/consistency"),
     as_json: Json = False,
 ) -> None:
     """Ask whether errors are as large as the covariances say: NEES and NIS over Monte-Carlo runs.
@@ -95,7 +95,7 @@ def complexity(
         str, typer.Option(help="Sizes of the map, separated by commas.")
     ] = "25,50,100,200,400,800",
     steps: Annotated[int, typer.Option(min=10, max=100_000, help="Steps that a median is taken of.")] = 100,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/complexity"),
+    out: Out = Path("out/complexity"),
     as_json: Json = False,
 ) -> None:
     """Measure the time per step against the number of landmarks in the map.

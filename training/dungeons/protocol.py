@@ -8,7 +8,6 @@ prints the table. What an episode is stands in :mod:`training.dungeons.episode`.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -28,6 +27,7 @@ from training.figures.tables import csv_table, markdown_table, number
 from training.runs.campaign import Workers, installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
 from training.runs.rows import resume
+from training.runs.running import write_json
 
 __all__ = ["PUBLISHED", "run_dungeons", "summarise", "table"]
 
@@ -92,7 +92,7 @@ def run_dungeons(
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
     shown = [{name: _cell(row[name]) for name in _COLUMNS} for row in rows]
     atomic_write(out / _CSV, csv_table(shown, _COLUMNS))
-    atomic_write(out / _SUMMARY, json.dumps(summary, indent=1) + "\n")
+    write_json(out / _SUMMARY, summary)
     return summary
 
 

@@ -29,6 +29,7 @@ from agents.learned.station_network import PLANES, opening_numbers, with_walls
 from agents.learned_tour import FORMAT, load_station_policy
 from slam.formats import replacing
 from slam.settings import Config, Few, NotNegative, Seed, Share, Within
+from slam.types import Floats
 from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork, read_network
@@ -39,7 +40,6 @@ from training.runs.options import Ray, workers_of
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
-Floats = NDArray[np.float32]
 
 _CHECKPOINT, _WEIGHTS = "checkpoint-{}.pt", "learned-tour.safetensors"
 _SCORE_M = 20.0

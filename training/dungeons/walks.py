@@ -30,7 +30,7 @@ from agents.stations.sensor import BLIND, SENSORS, Rays, look, rays
 from agents.stations.survey import Openings, Survey, begin, find_pieces, first_hop, no_pieces, options, survey
 from agents.ways.routing import draw_luck
 from slam.grids.occupancy import UNKNOWN
-from slam.types import Array
+from slam.types import Array, Cells, Floats
 from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.world import CELL_M, Dungeon, scan
 
@@ -45,9 +45,6 @@ __all__ = [
     "Walk",
     "rest_of_the_tour",
 ]
-
-Cells = NDArray[np.int64]
-Floats = NDArray[np.float32]
 
 MOST = 5
 """Openings that are weighed at a stop."""

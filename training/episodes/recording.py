@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Recorded", "Recorder", "Recording", "TeamRecorder"]
 
-Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 _Notes = dict[int, NDArray[Any]]  # by the step that they were noted in
 

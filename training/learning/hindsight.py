@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from agents.ways.routing import improve
 from slam.belief import Belief
-from slam.types import Array
+from slam.types import Array, Cells
 from training.truth.places import TruePlaces, greedy_tour, see_from
 
 __all__ = ["Hindsight"]
-
-Cells = NDArray[np.int64]
 
 _OFFSETS_M = np.array([0.5, 2.0, 6.0])  # greedy tours tried: what a new cell is worth against its way
 _ENOUGH = 0.04  # share of the cells that may stay unseen: small remains are left out of the count anyway

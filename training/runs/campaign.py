@@ -12,13 +12,12 @@ from typing import Any, TypeVar
 
 import slam
 from slam.files import quoted, read_json
-from slam.formats import atomic_write
 from slam.settings import check_name
 from training.runs.cluster import Cluster, RayPool, ray_pool
 from training.runs.errors import BadInput, Interrupted, check_writable
 from training.runs.processes import ProcessPool, process_pool
 from training.runs.progress import Progress
-from training.runs.running import versions
+from training.runs.running import parts_of, versions, write_json
 
 __all__ = [
     "Pool",
@@ -62,7 +61,7 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
     """
     without = without or {}
     valid = [name for name in slam.names() if name not in without]
-    chosen = list(dict.fromkeys(part.strip() for part in text.split(",")))
+    chosen = parts_of(text)
     for name in chosen:
         if name in without:
             raise ValueError(f"--slam {name} {without[name]}; valid: {', '.join(sorted(valid))}")
@@ -101,7 +100,7 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
             "choose another --out, or give the same to go on"
         )
     out.mkdir(parents=True, exist_ok=True)
-    atomic_write(out / SETTINGS, json.dumps(settings, indent=1) + "\n")
+    write_json(out / SETTINGS, settings)
 
 
 def _told(value: Any) -> str:

@@ -13,6 +13,7 @@ from typer.core import TyperCommand
 
 from training.runs.compiling import compiling_shown
 from training.runs.errors import BadInput
+from training.runs.running import parts_of
 
 if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
@@ -126,7 +127,7 @@ def workers_of(workers: int | None, ray: str | None) -> Whose:
 
 def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
     """Return the numbers of ``25,50,100``, as typed for an option, each once and in order."""
-    words = [word.strip() for word in text.split(",")]
+    words = parts_of(text)
     if all(word.isascii() and word.isdigit() and len(word) < 9 for word in words):
         numbers = sorted(set(map(int, words)))
         if low <= numbers[0] and numbers[-1] <= high:

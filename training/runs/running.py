@@ -1,7 +1,8 @@
-"""What every long run needs: files that come together, values as JSON has them, the versions it ran with."""
+"""What every long run needs: lists as typed, files that come together, values as JSON has them, versions."""
 
 from __future__ import annotations
 
+import json
 import math
 import platform
 from collections.abc import Iterable, Iterator
@@ -13,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from slam.formats import atomic_write
 from training.runs.signals import interrupt_flag
 
-__all__ = ["plain", "versions", "written_together"]
+__all__ = ["parts_of", "plain", "versions", "write_json", "written_together"]
 
 _LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
 
@@ -54,3 +56,13 @@ def plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a value as indented JSON, the file whole or not at all."""
+    atomic_write(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
+
+
+def parts_of(text: str) -> list[str]:
+    """Return the parts of a list as typed, separated by commas, each once and in order."""
+    return list(dict.fromkeys(part.strip() for part in text.split(",")))

@@ -7,7 +7,6 @@ prints the table.
 
 from __future__ import annotations
 
-import json
 import statistics
 import tempfile
 from importlib.metadata import version
@@ -24,8 +23,9 @@ from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Ray, Seeds, Workers, workers_of
+from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import parts_of, write_json
 
 __all__ = ["study", "summarise"]
 
@@ -120,24 +120,22 @@ def study(
     seeds: Seeds = "10000:10049",
     workers: Workers = None,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/accuracy"),
+    out: Out = Path("out/accuracy"),
 ) -> None:
     """Explore over seeds, rooms and backends: one row each, and their medians."""
     with bad_input():
         agents.check(agent)
-        for kind in rooms.split(","):
-            for backend in slam.split(","):
+        kinds, backends = parts_of(rooms), parts_of(slam)
+        for kind in kinds:
+            for backend in backends:
                 make_config(rooms=kind, slam=backend, noise=noise)
-        jobs = [
-            (r, b, s, agent, noise) for s in parse_seeds(seeds) for r in rooms.split(",") for b in slam.split(",")
-        ]
+        jobs = [(r, b, s, agent, noise) for s in parse_seeds(seeds) for r in kinds for b in backends]
     who = workers_of(workers, ray)
     every = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")
     rows = [every[job] for job in sorted(set(jobs))]
     summaries = summarise(rows)
     versions = {name: version(name) for name in ("mecanum-slam", "numpy", "numba", "pymunk", "gymnasium")}
-    text = json.dumps({"versions": versions, "summaries": summaries}, indent=1)
-    atomic_write(out / "summary.json", text + "\n")
+    write_json(out / "summary.json", {"versions": versions, "summaries": summaries})
     shown = [{key: _shown(value) for key, value in row.items() if key not in _NOT_IN_CSV} for row in rows]
     atomic_write(out / "episodes.csv", csv_table(shown))
     print(_table(summaries))

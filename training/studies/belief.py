@@ -7,7 +7,6 @@ moments with a picture of the scan. What was found with it: ``docs/studies/build
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -31,8 +30,9 @@ from training.episodes import explore
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.errors import Interrupted
-from training.runs.options import ConfigFile, FloorPlanFile, MaxSteps, Noise, Rooms, RoomSeed, Slam
+from training.runs.options import ConfigFile, FloorPlanFile, MaxSteps, Noise, Out, Rooms, RoomSeed, Slam
 from training.runs.progress import Progress
+from training.runs.running import write_json
 
 __all__ = ["BeliefWitness", "figures", "rises", "study"]
 
@@ -227,7 +227,7 @@ def study(
     seed: RoomSeed = 0,
     config: ConfigFile = None,
     max_steps: MaxSteps = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/belief"),
+    out: Out = Path("out/belief"),
 ) -> None:
     """Ask where a belief stops being true: NEES, errors by direction, NIS by kind, largest innovations."""
     episode = explore.prepare(
@@ -249,7 +249,7 @@ def study(
     atomic_write(out / "belief.png", _draw_course(witness, step_s))
     if witness.moments:
         atomic_write(out / "innovations.png", _draw_innovations(witness.shown(), episode.env, step_s))
-    atomic_write(out / "belief.json", json.dumps(found, indent=1) + "\n")
+    write_json(out / "belief.json", found)
     print(_told(found))
     if episode.interrupted:
         raise Interrupted(f"interrupted after {step_s * found['steps']:.1f} s; what was seen so far is in {out}")

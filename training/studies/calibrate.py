@@ -21,6 +21,7 @@ from slam.settings import check_name
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
 from training.runs.options import Json, Seed
+from training.runs.running import parts_of
 
 __all__ = ["compare", "study", "table"]
 
@@ -81,7 +82,7 @@ def study(
     as_json: Json = False,
 ) -> None:
     """Calibrate odometry: V as the simulated robot has it, beside V as its estimators are told."""
-    presets = list(dict.fromkeys(noise.split(",")))
+    presets = parts_of(noise)
     with bad_input():
         for preset in presets:
             check_name("noise preset", preset, NOISE_PRESETS)

@@ -7,7 +7,6 @@ explored by the nearest-frontier agent. ``docs/studies/consistency.md`` has the 
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +31,7 @@ from training.figures.tables import number, text_table
 from training.runs.campaign import Workers, backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.rows import resume
+from training.runs.running import write_json
 from training.studies.circle_world import WORLDS, drive, not_observing
 from training.studies.exploring import AGENT, exploring
 
@@ -147,7 +147,7 @@ def consistency(
     groups = {name: [_record(row) for job, row in rows.items() if job[0] == name] for name in names}
     result: dict[str, Any] = {name: summarise(group) for name, group in groups.items()}
     result["config"] = settings | {"seeds": [seed0, seed0 + runs - 1]}
-    atomic_write(out / "consistency.json", json.dumps(result, indent=1) + "\n")
+    write_json(out / "consistency.json", result)
     title = f"Pose NEES / 3, average of {runs} runs: {rooms}, noise × {noise:g}"
     atomic_write(out / "consistency.png", png(_chart(title, groups, nees_band(3, runs))))
     return result

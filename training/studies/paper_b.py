@@ -24,7 +24,8 @@ from slam.formats import atomic_write
 from slam.types import Array
 from training.figures.charts import COLOURS, chart, label, png
 from training.runs.errors import BadInput, check_writable
-from training.runs.options import Seed
+from training.runs.options import Out, Seed
+from training.runs.running import write_json
 from training.studies.circle_world import WORLDS, LandmarkWorld, drive
 
 __all__ = ["floor_of", "follow_filter", "follow_particles", "paper_b", "study"]
@@ -167,7 +168,7 @@ def paper_b(out: Path, *, seed: int = 0, steps: int | None = None) -> dict[str, 
     _draw_particles(panels[3], particles)
     out.mkdir(parents=True, exist_ok=True)
     atomic_write(out / "paper_b.png", png(figure))
-    atomic_write(out / "paper_b.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    write_json(out / "paper_b.json", result)
     return result
 
 
@@ -204,7 +205,7 @@ def _draw_particles(axes: Axes, particles: dict[str, dict[str, Array]]) -> None:
 
 
 def study(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_b"),
+    out: Out = Path("out/paper_b"),
     seed: Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, max=1_000_000, help="Of the run.")] = None,
 ) -> None:

@@ -7,23 +7,20 @@ Deviations are measured without alignment: the start pose is the origin.
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import PAPER_D
-from slam.formats import atomic_write
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Ray, Seeds, Workers, workers_of
+from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import write_json
 from training.studies.exploring import exploring
 
 __all__ = ["PAPER_MEAN_MAX_M", "run_job", "study", "summarise"]
@@ -106,7 +103,7 @@ def study(
     seeds: Seeds = "10000:10019",
     workers: Workers = None,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper-d"),
+    out: Out = Path("out/paper-d"),
 ) -> None:
     """Repeat paper D's table: how far mapped corners are from the true ones, backend by backend."""
     with bad_input():
@@ -118,5 +115,5 @@ def study(
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
     rows = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")
     summaries = summarise(rows, backends)
-    atomic_write(out / "paper_d.json", json.dumps({**settings, "summaries": summaries}, indent=1) + "\n")
+    write_json(out / "paper_d.json", {**settings, "summaries": summaries})
     print(_table(summaries))

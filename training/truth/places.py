@@ -19,11 +19,9 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["TILE", "TruePlaces", "cells_per_tile", "greedy_tour", "see_from", "true_cost_map", "true_grid"]
-
-Cells = NDArray[np.int64]
 
 TILE = 6
 """Fine cells a side of the tiles that are to be seen."""

@@ -13,14 +13,12 @@ from agents.driving.follow import Motors, Pace, aim, send
 from agents.driving.safety import Guard, LocalMap
 from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
-from slam.types import Array
+from slam.types import Array, Cells
 from training.truth.places import true_grid
 from training.truth.search import MOST_STOPS, moved
 from training.truth.sights import Sights, look
 
 __all__ = ["Rehearsal"]
-
-Cells = NDArray[np.int64]
 
 _STEPS = 6000  # of a drive, at most
 _STUCK = 20  # steps that it is blocked for

@@ -14,12 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.planning import D_COL, D_ROW
-from slam.types import Array
+from slam.types import Array, Cells
 from training.truth.sights import Board, look
 
 __all__ = ["MOST_STOPS", "annealed", "moved"]
-
-Cells = NDArray[np.int64]
 
 MOST_STOPS = 60
 

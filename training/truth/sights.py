@@ -19,12 +19,11 @@ from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.sensing.sensors import Lidar
 from slam.geometry import compose
 from slam.grids.occupancy import UNKNOWN, OccupancyGrid
-from slam.types import Array, Scan
+from slam.types import Array, Cells, Scan
 from training.truth.places import true_cost_map
 
 __all__ = ["Board", "Eye", "Sights", "look"]
 
-Cells = NDArray[np.int64]
 Bits = NDArray[np.uint64]
 
 _STOP = 3  # cells of the planning grid between two stops

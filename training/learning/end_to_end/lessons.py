@@ -24,11 +24,9 @@ from mecanum_env.observation import LOCAL_CELL_M, MAP_SIZE, map_frame
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["LOG_PRICE", "NO_WAY", "FollowingTeacher", "map_lesson"]
-
-Floats = NDArray[np.float32]
 
 LOG_PRICE = 70.0
 """A log price of 1 in the bytes that labels are kept in."""

@@ -6,7 +6,6 @@ always sees as many: what grows is the map that it does not see. ``docs/studies/
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -29,6 +28,7 @@ from training.runs.campaign import backend_names, installed_version, keep_settin
 from training.runs.errors import bad_input
 from training.runs.options import whole_numbers
 from training.runs.rows import resume
+from training.runs.running import write_json
 from training.studies.circle_world import not_observing
 
 __all__ = ["REFERENCE", "SEEN", "complexity", "exponent", "run_job", "table"]
@@ -190,7 +190,7 @@ def complexity(*, backends: str, landmarks: str, steps: int, out: Path) -> dict[
         result[name] = {"times": rows, "exponent": exponent(sizes, times)}
         axes.plot(sizes, times, "o-", label=name)
     result["config"] = settings
-    atomic_write(out / "complexity.json", json.dumps(result, indent=1) + "\n")
+    write_json(out / "complexity.json", result)
     label(axes, f"Time per step: predict, and observe {SEEN} of n landmarks", "landmarks n", "µs", log="xy")
     atomic_write(out / "complexity.png", png(figure))
     return result

@@ -7,7 +7,6 @@ and ``time.png``. Both kinds are the same filter, bit for bit; the last poses ar
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from pathlib import Path
@@ -28,7 +27,8 @@ from slam.types import Odometry, Scan
 from training.figures.charts import INK, chart, label, png
 from training.figures.tables import text_table
 from training.runs.errors import bad_input, check_writable
-from training.runs.options import Seed, whole_numbers
+from training.runs.options import Out, Seed, whole_numbers
+from training.runs.running import write_json
 
 __all__ = ["cost", "record", "study"]
 
@@ -109,7 +109,7 @@ def _replay(drive: Drive, settings: dict[str, Any], particles: int, *, copies: b
 
 
 def study(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/dp_slam_cost"),
+    out: Out = Path("out/dp_slam_cost"),
     particles: Annotated[str, typer.Option(help="Numbers, separated by commas.")] = "50,100,200,500,1000",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     seed: Seed = 0,
@@ -141,7 +141,7 @@ def _write(out: Path, rows: list[dict[str, Any]], run: dict[str, Any]) -> None:
             axes.plot(x, [row["copies_mb"] for row in rows], "--", color=INK, label="copies, computed")
         label(axes, f"Maps of the particles: {title}", "particles", unit, log="xy")
         atomic_write(out / f"{name}.png", png(figure))
-    atomic_write(out / "dp_slam_cost.json", json.dumps({"run": run, "rows": rows}, indent=1) + "\n")
+    write_json(out / "dp_slam_cost.json", {"run": run, "rows": rows})
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -6,7 +6,6 @@ measured.
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from collections.abc import Sequence
@@ -28,8 +27,9 @@ from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
-from training.runs.options import Seed
+from training.runs.options import Out, Seed
 from training.runs.rows import resume
+from training.runs.running import parts_of, write_json
 
 __all__ = ["explore", "study", "table"]
 
@@ -126,13 +126,13 @@ def _draw(episode: Episode, path: Path) -> None:
 
 def study(
     plans: Annotated[list[Path], typer.Argument(metavar="PLAN...", help="ROS maps or images.")],
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/scale"),
+    out: Out = Path("out/scale"),
     agent: Annotated[str, typer.Option(help="Agents, separated by commas.")] = "brisk-tour,ppo-frontier",
     seed: Seed = 10000,
     minutes: Annotated[float, typer.Option(min=0.0, max=1e6, help="Most that one exploration may take.")] = 15.0,
 ) -> None:
     """Explore buildings, and measure what steps and decisions take as the map grows."""
-    names = list(dict.fromkeys(agent.split(",")))
+    names = parts_of(agent)
     with bad_input():
         for name in names:
             agents.check(name)
@@ -145,7 +145,7 @@ def study(
         what = f"exploration {k + 1} of {len(jobs)}, {Path(job[0]).stem}, {job[1]}"
         rows = resume(out / STORE, jobs[: k + 1], explore, workers=1, what=what, apart=True)
     found = list(rows.values())
-    atomic_write(out / "scale.json", json.dumps(found, indent=1) + "\n")
+    write_json(out / "scale.json", found)
     atomic_write(out / "scale.png", _chart(found))
     print(table(found))
 

@@ -27,8 +27,8 @@ from slam.types import Array
 from training.figures.charts import COLOURS, INK, chart, label, png
 from training.runs.campaign import Workers
 from training.runs.errors import check_writable
-from training.runs.options import Ray, Seed, workers_of
-from training.runs.running import versions
+from training.runs.options import Out, Ray, Seed, workers_of
+from training.runs.running import versions, write_json
 from training.studies.paper_c import odometry
 from training.studies.paper_c.work import METHODS, Run, cheapest, measure, reference, relative_deviation
 
@@ -236,7 +236,7 @@ def _odometry_chart(rows: list[dict[str, Any]]) -> Figure:
 
 
 def study(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/paper_c"),
+    out: Out = Path("out/paper_c"),
     seed: Seed = 0,
     runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Of the filter, for its errors.")] = 200,
     episodes: Annotated[
@@ -263,7 +263,7 @@ def study(
     out.mkdir(parents=True, exist_ok=True)
     for name, figure in charts.items():
         atomic_write(out / name, png(figure))
-    atomic_write(out / "paper_c.json", json.dumps(result, indent=1, ensure_ascii=False) + "\n")
+    write_json(out / "paper_c.json", result)
     # What fits on a screen.
     work = {name: result["work"][name]["cheapest_within_goal"] for name in _WORK_MODELS}
     told = {key: value for key, value in result["odometry"].items() if key != "training"}

@@ -6,7 +6,6 @@ health is. ``docs/studies/recovery.md`` has what was measured.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,8 +20,9 @@ from training.figures.charts import png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Backends, MaxSteps, Ray, Seeds, Workers, workers_of
+from training.runs.options import Backends, MaxSteps, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import parts_of, write_json
 from training.studies.recovery.faults import FAULTS
 from training.studies.recovery.figures import draw_recovery, draw_reliability, false_alarms, reliability, sum_up
 from training.studies.recovery.runs import Job, Row, run_job
@@ -46,16 +46,16 @@ def study(
     max_steps: MaxSteps = 3000,
     workers: Workers = None,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/recovery"),
+    out: Out = Path("out/recovery"),
 ) -> None:
     """Make faults mid-episode: whether a belief is lost, knows it, and is right again; how true its health is."""
     with bad_input():
         agents.check(agent)
         names = backend_names(slam)
-        chosen = list(dict.fromkeys(name.strip() for name in faults.split(",")))
+        chosen = parts_of(faults)
         for name in chosen:
             check_name("fault", name, FAULTS)
-        places = [place.strip() for place in rooms.split(",")]
+        places = parts_of(rooms)
         for place in places:
             where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}
             make_config(noise=noise, **where)  # type: ignore[arg-type]
@@ -69,7 +69,7 @@ def study(
     rows = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     found = _figures(rows, names, chosen)
     found["config"] = settings | {"rooms": [Path(p).name for p in places], "seeds": seeds}
-    atomic_write(out / "recovery.json", json.dumps(found, indent=1) + "\n")
+    write_json(out / "recovery.json", found)
     groups = {f"{fault}, {name}": _of(rows, fault, name) for fault in chosen if fault != "none" for name in names}
     if groups:
         atomic_write(out / "recovery.png", png(draw_recovery(groups)))

@@ -5,7 +5,6 @@ What is found is in ``<part>.json`` and on one page; ``docs/studies/reliability.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -16,8 +15,9 @@ from slam.settings import unknown_name
 from training.figures.tables import text_table
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Ray, Seed, Workers, workers_of
+from training.runs.options import Out, Ray, Seed, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import parts_of, write_json
 from training.studies.reliability.files.part import FILES
 from training.studies.reliability.kills.part import KILLS
 from training.studies.reliability.page import page
@@ -44,7 +44,7 @@ def study(
     seed: Seed = 0,
     workers: Workers = 1,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/reliability"),
+    out: Out = Path("out/reliability"),
 ) -> None:
     """Try to break the whole: files, steps, kills, places, hours. Goes on where it was broken off.
 
@@ -56,7 +56,7 @@ def study(
       mecanum study reliability --parts files,steps --files 1000 --steps 1000000 --workers 4
     """  # noqa: D301
     with bad_input():
-        chosen = list(dict.fromkeys(name.strip() for name in parts.split(",")))
+        chosen = parts_of(parts)
         for name in chosen:
             if name not in PARTS:
                 raise unknown_name("part", name, PARTS)
@@ -68,7 +68,7 @@ def study(
         part = PARTS[name]
         rows = resume(out / f"{name}.jsonl", part.jobs(sizes[name], seed), part.work, workers=who, what=name)
         found[name] = part.sum_up(rows) | {"size": sizes[name], "seed": seed}
-        atomic_write(out / f"{name}.json", json.dumps(found[name], indent=1, ensure_ascii=False) + "\n")
+        write_json(out / f"{name}.json", found[name])
     atomic_write(out / PAGE, page({name: (PARTS[name], summary) for name, summary in found.items()}))
     for name, summary in found.items():
         print(text_table(*PARTS[name].table(summary)))

@@ -16,7 +16,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import tell_goal
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
-from training.runs.options import Seeds
+from training.runs.options import Seeds, whole_numbers
 from training.studies.exploring import AGENT
 
 __all__ = ["measure", "study"]
@@ -55,7 +55,7 @@ def study(
 ) -> None:
     """Measure a step of a team that explores, resets and decisions left out."""
     with bad_input():
-        chosen, counts = parse_seeds(seeds), [int(count) for count in robots.split(",")]
+        chosen, counts = parse_seeds(seeds), whole_numbers("--robots", robots, low=1, high=64)
         teams = {count: Team(count, rooms=rooms, config={"coverage_target": 1.0}) for count in counts}
     for team in teams.values():
         measure(team, chosen[:1], _WARM_UP + 1)  # kernels are compiled

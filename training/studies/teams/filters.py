@@ -7,7 +7,6 @@ Where a robot starts is known to every filter with the same error and covariance
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable
@@ -24,7 +23,6 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.sensing.calibration import backend_settings
 from slam.backend import Backend
-from slam.formats import atomic_write
 from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse, wrap
 from slam.metrics.measures import ate, heading_errors
@@ -35,8 +33,9 @@ from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
 from training.runs.errors import bad_input
-from training.runs.options import Ray, Seeds, Workers, workers_of
+from training.runs.options import Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import write_json
 from training.studies.exploring import AGENT
 
 __all__ = ["SINGLE", "TEAM", "explore", "study", "table"]
@@ -195,7 +194,7 @@ def table(rows: list[dict[str, dict[str, Any]]]) -> str:
 
 
 def study(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/team_filters"),
+    out: Out = Path("out/team_filters"),
     seeds: Seeds = "10000:10015",
     robots: Annotated[int, typer.Option(min=1, max=8, help="How many explore together.")] = 2,
     steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Most steps of a robot.")] = 3000,
@@ -216,4 +215,4 @@ def study(
     jobs: list[Job] = [(seed, robots, steps, start_sigma_m, turn, noise) for seed in chosen]
     rows = list(resume(out / STORE, jobs, explore, workers=who, what="episodes").values())
     print(table(rows))
-    atomic_write(out / FILES[0], json.dumps({"jobs": jobs, "rows": rows}, indent=1).encode())
+    write_json(out / FILES[0], {"jobs": jobs, "rows": rows})

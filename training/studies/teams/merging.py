@@ -8,7 +8,6 @@ that were measured to within :data:`PRIOR_SIGMA`.
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Iterable, Mapping
@@ -21,7 +20,6 @@ import typer
 
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms.floor_plan import FloorPlan
-from slam.formats import atomic_write
 from slam.geometry import compose, inverse, transform_points, wrap
 from slam.grids.occupancy import FREE, OccupancyGrid
 from slam.metrics.measures import nees_pose
@@ -35,8 +33,9 @@ from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Ray, Seeds, Workers, workers_of
+from training.runs.options import Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
+from training.runs.running import write_json
 from training.studies.exploring import AGENT
 
 __all__ = ["PRIOR_SIGMA", "RIGHT_M", "RIGHT_RAD", "run_job", "study", "summarise"]
@@ -211,7 +210,7 @@ def study(
     time_s: Annotated[float, typer.Option(min=0.1, max=1e6, help="… or after so long [s].")] = 100.0,
     workers: Workers = None,
     ray: Ray = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/merging"),
+    out: Out = Path("out/merging"),
 ) -> None:
     """Let two robots explore a room each on its own, then align and merge their maps."""
     with bad_input():
@@ -226,7 +225,5 @@ def study(
     jobs: list[Job] = [(rooms, seed, coverage, time_s) for seed in chosen]
     rows = resume(out / "pairs.jsonl", jobs, run_job, workers=who, what="pairs")
     summary = summarise(rows)
-    atomic_write(
-        out / "merging.json", json.dumps({"seeds": seeds, **settings, "summary": summary}, indent=1) + "\n"
-    )
+    write_json(out / "merging.json", {"seeds": seeds, **settings, "summary": summary})
     print(_table(summary))
