@@ -19,14 +19,14 @@ from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
-from slam.landmark_backend import FEWEST_BACK, far_better, observation_rows
+from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
-from slam.landmarks.wheel_check import WheelCheck
+from slam.landmarks.spinning_wheels import FEWEST_BACK
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -62,8 +62,6 @@ class EkfSlam(GaussianBackend):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
-        c, white = self.config, 1.0 / self.config.features.wall_lasting_scans
-        self._wheels = WheelCheck(c.lidar_offset_m, scans=c.wheel_scans, gate=c.wheel_gate, white_share=white)
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
 
@@ -78,7 +76,6 @@ class EkfSlam(GaussianBackend):
 
     def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Predict by a twist of the body."""
-        self._wheels.predict(dt, twist, var_v, var_w)
         self._beside.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
 
     def _update(self, scan: Scan) -> None:
@@ -98,11 +95,8 @@ class EkfSlam(GaussianBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
-        if scan is not None:
-            if self._out_of_sight(*self._recall):
-                match = self._allow_for_spinning_wheels(z, match, scan)
-            if (lacking := self._wheels.doubt(z, match, self._book.ids)) is not None:
-                self._p[:3, :3] += lacking
+        if scan is not None and self._may_spin(scan, *self._recall, len(z) - _matched(match)):
+            match = self._allow_for_spinning_wheels(z, match, scan)
         given = z.copy() if self.config.lines else z  # what is matched with curved walls is straightened in place
         self._accept(z, match, JOINT_LIMITS)
         if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
@@ -114,9 +108,9 @@ class EkfSlam(GaussianBackend):
         if loop:
             self._close_loop(z, match)
         if scan is not None:
-            self._wheels.note(given, match, self._book.ids, float(self._x[2]))
+            self._spinning.note(scan, self.sensor_pose(), self._recall[0], _matched(match))
             if self.nis_dof >= 2 * FEWEST_BACK:
-                self._unseen_motion = (0.0, 0.0)
+                self._spinning.forget_motion()
         self._manage(z, match, scan)
 
     def observe(self, observations: Observations) -> None:
@@ -211,26 +205,22 @@ class EkfSlam(GaussianBackend):
     def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
         """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
 
-        A filter that trusts V where the robot does not follow has every gate closed within two steps. So the pose
-        may be off by all that the wheels claim since the landmarks were last in sight. Gates so wide take any
-        corner for a landmark: one pose must explain them all, and the scan must fit the map far better from there.
+        See :mod:`slam.landmarks.spinning_wheels`.
         """
-        n = self._n
+        n, spinning = self._n, self._spinning
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
-        usual = usual.copy()
-        moved, turned = self._unseen_motion
-        self._p[[0, 1, 2], [0, 1, 2]] += moved**2, moved**2, turned**2
-        match = self._associate_jointly(z)
-        found = np.count_nonzero(match >= 0)
-        if found >= FEWEST_BACK and found > np.count_nonzero(usual >= 0):
-            p_wide = self._p[:3, :3].copy()
+        usual, lately = usual.copy(), spinning.lately
+        self._p[[0, 1, 2], [0, 1, 2]] += spinning.variances
+        wide = self._p[:3, :3].copy()
+        match, spun = self._associate_jointly(z), False
+        if spinning.enough(_matched(match), _matched(usual)):
             fit = self._fit(z, match, scan)
             self._x[:n], self._p[:n, :n] = x, p
-            if far_better(fit, self._fit(z, usual, scan)):
-                p[:3, :3] = p_wide
-                usual = match
+            spun = spinning.explain(fit, self._fit(z, usual, scan))
+        if spun or lately:
+            p[:3, :3] = wide
         self._x[:n], self._p[:n, :n] = x, p
-        return usual
+        return match if spun else usual
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
         """Correct by a match; return how well the scan fits the map from there. It is only a trial."""
@@ -300,7 +290,6 @@ class EkfSlam(GaussianBackend):
     def _place(self, pose: Array, pose_cov: Array) -> None:
         self._settle_beliefs()
         joint.place(self._x, self._p, self._n, pose, pose_cov)
-        self._wheels.forget()
         self._beside.forget_pose()
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
@@ -310,6 +299,10 @@ class EkfSlam(GaussianBackend):
         match = self._associate(z).copy()
         self._place(pose, np.diag(np.square(_WIDE)))
         self._correct(z, match)
-        self._unseen_motion = (0.0, 0.0)
+        self._spinning.forget_motion()
         self._manage(z, match, scan)
         self._draw(scan)
+
+
+def _matched(match: NDArray[np.int64]) -> int:
+    return int(np.count_nonzero(match >= 0))

@@ -20,10 +20,11 @@ from slam.backend import BackendConfig
 from slam.belief import Belief
 from slam.gaussian.joint_gaussian import ANYWHERE_COV, OBSERVED_LIMIT
 from slam.geometry import rotation
-from slam.landmark_backend import FEWEST_BACK, LandmarkBackend, far_better, observation_rows
+from slam.landmark_backend import LandmarkBackend, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.landmarks.book import DIRECTION, EDGE, KIND, LandmarkPolicy, count_recent
 from slam.landmarks.joint_compatibility import MAX_OBSERVATIONS, joint_compatibility
+from slam.landmarks.spinning_wheels import FEWEST_BACK
 from slam.metrics.measures import align_se2
 from slam.particles.filter import correct_particles, narrow, predict_particles
 from slam.particles.gate import refuse_unlikely
@@ -110,11 +111,14 @@ class FastSlam(LandmarkBackend):
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         z = self.extractor.extract(scan)[:MAX_OBSERVATIONS]
         match, leader = self._associate(z)
-        if self._out_of_sight(*count_recent(self._book.marks, match[leader], self._book.now)):
+        recent, still = count_recent(self._book.marks, match[leader], self._book.now)
+        if self._may_spin(scan, recent, still, int(np.count_nonzero(match[leader] < 0))):
             self._allow_for_spinning_wheels(z, match, leader, scan)
-        if np.count_nonzero(match[leader] >= 0) >= FEWEST_BACK:
-            self._unseen_motion = (0.0, 0.0)
+        matched = int(np.count_nonzero(match[leader] >= 0))
+        if matched >= FEWEST_BACK:
+            self._spinning.forget_motion()
         best = self._correct(z, match)
+        self._spinning.note(scan, self.sensor_pose(self._poses[best]), recent, matched)
         self._manage(z, match[best], best, scan)
         self._resample(len(z))
         self._believe()
@@ -238,12 +242,13 @@ class FastSlam(LandmarkBackend):
     def _allow_for_spinning_wheels(self, z: Array, match: Indices, leader: int, scan: Scan) -> None:
         """Associate anew as though the wheels had turned in vain, where one pose then explains more.
 
-        See :meth:`slam.ekf.EkfSlam._allow_for_spinning_wheels`. The leader's map decides for all; its landmarks
+        See :mod:`slam.landmarks.spinning_wheels`. The leader's map decides for all; its landmarks
         are independent, given the path. Where the wheels did spin, the poses are drawn by what is seen in either
         version: a thousand times the usual volume is more than any number of blind draws could fill.
         """
         n, config, policy = self._maps.count, self.config, self.config.landmarks
-        wide = np.diag(np.square([self._unseen_motion[0], *self._unseen_motion]))
+        spinning, wide = self._spinning, np.diag(self._spinning.variances)
+        lately, spun = spinning.lately, False
         pose, cov, landmarks = self._poses[leader], self._covs[leader], self._maps.of(leader)
         x, p = np.concatenate([pose, landmarks[:, :2].ravel()]), np.zeros((3 + 2 * n, 3 + 2 * n))
         p[:3, :3] = cov + wide
@@ -254,13 +259,13 @@ class FastSlam(LandmarkBackend):
             x, p, config.lidar_offset_m, z, self._book.marks, policy.new_distance_m,
             math.radians(config.max_turn_deg), found,
         )  # fmt: skip
-        count = np.count_nonzero(found >= 0)
-        if count < FEWEST_BACK or count <= np.count_nonzero(match[leader] >= 0):
-            return
-        usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
-        if far_better(self._fit(pose, cov + wide, landmarks, z, found, scan), usual_fit):
+        if spinning.enough(int(np.count_nonzero(found >= 0)), int(np.count_nonzero(match[leader] >= 0))):
+            usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
+            spun = spinning.explain(self._fit(pose, cov + wide, landmarks, z, found, scan), usual_fit)
+        if spun or lately:
             self._covs += wide
             self._inherited.widen(wide)
+        if spun:
             match[:] = found
 
     def _fit(self, pose: Array, cov: Array, landmarks: Array, z: Array, match: Indices, scan: Scan) -> float:
@@ -276,7 +281,7 @@ class FastSlam(LandmarkBackend):
         n = self.config.particles
         self._poses[:], self._covs[:] = pose, np.triu(pose_cov)
         self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
-        self._unseen_motion = (0.0, 0.0)
+        self._spinning.forget_motion()
         self._believe()
 
     # ---- the book of landmarks -----------------------------------------------------------------------------

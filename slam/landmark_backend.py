@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from slam.backend import Backend
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
+from slam.landmarks.spinning_wheels import SpinningWheels
 from slam.motion import OdometryNoise, Twist
-from slam.types import LINE, Array, Observations, Odometry
+from slam.types import LINE, Array, Observations, Odometry, Scan
 
-__all__ = ["FEWEST_BACK", "LandmarkBackend", "far_better", "observation_rows"]
-
-FEWEST_BACK = 2
-"""Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
+__all__ = ["LandmarkBackend", "observation_rows"]
 
 
 class LandmarkBackend(Backend):
@@ -30,19 +28,18 @@ class LandmarkBackend(Backend):
         self._book = LandmarkBook(policy)
         self._known = KnownIds(self.config.lidar_offset_m)
         self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
-        self._unseen_motion = (0.0, 0.0)  # [m, rad] what the wheels claim since the landmarks were last in sight
+        self._spinning = SpinningWheels()
 
     def _measured(self, odometry: Odometry, noise: OdometryNoise) -> tuple[Twist, float, float]:
         """Count a step by the wheels; return its twist and V's variances of speed and turn rate."""
         twist, var_v, var_w, self._body = noise.of_step(odometry, self._body)
         way = math.hypot(twist[0], twist[1], noise.lever_m * twist[2]) * odometry.dt
-        moved, turned = self._unseen_motion
-        self._unseen_motion = moved + way, turned + way / noise.lever_m
+        self._spinning.claim(way, way / noise.lever_m)
         return twist, var_v, var_w
 
-    def _out_of_sight(self, recent: int, still: int) -> bool:
-        """Tell whether many of the landmarks that the last scans showed are missing all at once."""
-        return recent >= 3 and still < 0.6 * recent
+    def _may_spin(self, scan: Scan, recent: int, still: int, unmatched: int) -> bool:
+        """Tell whether the wheels may have turned in vain; see :meth:`SpinningWheels.suspected`."""
+        return self._spinning.suspected(self.grid, self.sensor_pose(), scan, recent, still, unmatched)
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 
@@ -94,11 +91,6 @@ class LandmarkBackend(Backend):
 
     def _redraw_if_moved(self) -> bool:
         return self.key_scans.redraw_if_moved(self.grid, *self._map_points())
-
-
-def far_better(fit: float, usual: float) -> bool:
-    """Tell whether a scan fits the grid at least twice as well; where wheels did spin it is 25 times."""
-    return fit > usual + abs(usual)
 
 
 def observation_rows(observations: Observations) -> Array:

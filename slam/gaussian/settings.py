@@ -8,7 +8,7 @@ from typing import Annotated
 
 from slam.backend import BackendConfig
 from slam.landmarks.book import LandmarkPolicy
-from slam.settings import Count, OneOf, Positive, Within
+from slam.settings import OneOf, Positive, Within
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig"]
 
@@ -32,11 +32,6 @@ class EkfConfig(BackendConfig):
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = (
         math.inf
     )  # old landmarks expected no better than to this count only together
-    # The wheels are not believed where landmarks seen twice, so many scans apart at most, contradict them: squared
-    # Mahalanobis, 99.9 % of chi-square with three degrees of freedom. Over more scans the view changes, and with
-    # it what lasts of a landmark's error: over 20, wheels that were right were doubted in halls.
-    wheel_scans: Count = 8
-    wheel_gate: Annotated[float, Within("(0, inf]")] = 16.27
     lines: bool = False  # take straight walls for landmarks, too (theory.md A)
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 

@@ -1,0 +1,101 @@
+"""Wheels that turn in vain: the robot is pressed to a wall, or has lost its grip.
+
+A filter that trusts V where the robot does not follow has every gate closed within two steps, or holds a few wrong
+landmarks for the right ones. So where landmarks are missed all at once, and the scan fits the map worse from where
+the wheels have the robot than the last one did, observations are associated anew with a pose that may be off by
+all that the wheels claim. Gates so wide take any corner for a landmark: one pose must explain them all, and the
+scan must fit the map surely better from there. Wheels that spun once are likely to do so in the next scans, too:
+then they are not believed, and of two explanations the better one is taken.
+"""
+
+from __future__ import annotations
+
+from slam.grids.occupancy import OccupancyGrid
+from slam.types import Array, Scan
+
+__all__ = ["FEWEST_BACK", "SpinningWheels"]
+
+FEWEST_BACK = 2
+"""Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
+
+_FEWEST_RECENT = 3  # landmarks that the last scans showed, below which none is missed
+# Log-odds [nat] by which a scan fits worse, or better. Over 36 drives of brisk-tour, seeds 0-11 of apartments,
+# corridors and mazes, one scan in twenty is worse by the first; none of 1301 wrong explanations was better by the
+# second, and of 5200 right ones, of robots driven at random, six in seven.
+_WORSE_NAT, _SURE_NAT = 30.0, 80.0
+_LATELY = 6  # scans for which wheels that spun are not believed
+
+
+class SpinningWheels:
+    """What the wheels claim, when to ask whether they turn in vain, and what counts as an answer.
+
+    Attributes
+    ----------
+    moved_m, turned_rad : float
+        What the wheels claim since the landmarks were last in sight.
+    """
+
+    def __init__(self) -> None:
+        self.moved_m = self.turned_rad = 0.0
+        self._left = 0
+        self._last: tuple[Scan, Array] | None = None
+
+    def claim(self, moved_m: float, turned_rad: float) -> None:
+        """Count what the wheels claim in a step."""
+        self.moved_m += moved_m
+        self.turned_rad += turned_rad
+
+    def forget_motion(self) -> None:
+        """Note that the landmarks say where the robot is."""
+        self.moved_m = self.turned_rad = 0.0
+
+    @property
+    def variances(self) -> tuple[float, float, float]:
+        """What the pose may be off by: x, y [m²], θ [rad²]."""
+        return self.moved_m**2, self.moved_m**2, self.turned_rad**2
+
+    @property
+    def lately(self) -> bool:
+        """Whether they turned in vain in one of the last scans."""
+        return self._left > 0
+
+    def suspected(
+        self, grid: OccupancyGrid, sensor_pose: Array, scan: Scan, recent: int, still: int, unmatched: int
+    ) -> bool:
+        """Tell whether to ask.
+
+        Parameters
+        ----------
+        grid, sensor_pose, scan
+            The map, and from where in it ``(3,)`` the scan was taken by the wheels.
+        recent, still
+            Landmarks that the last scans showed, and how many of them are matched.
+        unmatched
+            Observations that are matched with none.
+        """
+        if self._left:
+            return True
+        if recent < _FEWEST_RECENT or min(recent - still, unmatched) < FEWEST_BACK:
+            return False
+        if self._last is None:
+            return True
+        last, pose = self._last
+        return grid.agreement(sensor_pose, scan) < grid.agreement(pose, last) - _WORSE_NAT
+
+    def enough(self, found: int, usual: int) -> bool:
+        """Tell whether so many landmarks, found as though they spun, may explain more than so many as usual."""
+        return found >= max(FEWEST_BACK, usual + (0 if self._left else FEWEST_BACK))
+
+    def explain(self, fit: float, usual: float) -> bool:
+        """Tell whether a scan says that they spun, by how well [nat] it fits from there and as usual."""
+        surely = fit > usual + min(abs(usual), _SURE_NAT)
+        if surely:
+            self._left = _LATELY
+            return True
+        return self.lately and fit > usual
+
+    def note(self, scan: Scan, sensor_pose: Array, recent: int, matched: int) -> None:
+        """Take note of a scan and where it was taken; one that misses landmarks is nothing to compare with."""
+        self._left = max(self._left - 1, 0)
+        if matched > recent - FEWEST_BACK:
+            self._last = scan, sensor_pose

@@ -1,0 +1,83 @@
+"""Wheels that turn in vain: when they are suspected, what acquits them, and robots pushed into walls."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from mecanum_env.env import ExploreEnv
+from slam.grids.occupancy import OccupancyGrid
+from slam.landmarks.spinning_wheels import SpinningWheels
+from slam.metrics.chi_square import chi2_quantile
+from slam.types import Scan
+
+STEPS_EACH = 15  # 1.5 s of one twist: long enough to reach a wall and to be pressed to it
+
+
+def mapped_wall() -> tuple[OccupancyGrid, Scan]:
+    """Return a map of a round wall 2 m around the origin, and the scan that drew it."""
+    grid, scan = OccupancyGrid(0.05), Scan(np.full(360, 2.0), -np.pi, np.radians(1.0), 8.0)
+    for _ in range(5):
+        grid.integrate(np.zeros(3), scan, np.full(360, -1, np.int16))
+    return grid, scan
+
+
+def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
+    grid, scan = mapped_wall()
+    here, off = np.zeros(3), np.array([0.3, 0.0, 0.0])
+    wheels = SpinningWheels()
+    assert wheels.suspected(grid, here, scan, 5, 1, 4)  # nothing to compare with yet
+    wheels.note(scan, here, recent=5, matched=5)
+    assert not wheels.suspected(grid, here, scan, 5, 1, 4)  # as good a fit as the last
+    assert wheels.suspected(grid, off, scan, 5, 1, 4)
+    assert not wheels.suspected(grid, off, scan, 5, 4, 4)  # one landmark may well go out of sight
+    assert not wheels.suspected(grid, off, scan, 5, 1, 1)  # and what is not seen explains nothing
+    wheels.note(scan, off, recent=5, matched=1)  # nothing to compare with: the fit there is bad
+    assert wheels.suspected(grid, off, scan, 5, 1, 4)
+
+
+def test_the_scan_decides_and_is_believed_for_a_while() -> None:
+    wheels = SpinningWheels()
+    wheels.claim(0.3, 0.1)
+    wheels.claim(0.1, 0.1)
+    assert wheels.variances == pytest.approx((0.16, 0.16, 0.04))
+    wheels.forget_motion()
+    assert wheels.variances == (0.0, 0.0, 0.0)
+    assert wheels.enough(3, 1)
+    assert not wheels.enough(2, 1)
+    assert not wheels.enough(1, 0)
+    assert not wheels.explain(560.0, 500.0)
+    assert wheels.explain(2.0, 0.9)  # twice as well
+    assert wheels.lately
+    assert wheels.suspected(*mapped_wall()[:1], np.zeros(3), mapped_wall()[1], 0, 0, 0)
+    assert wheels.enough(2, 2)
+    assert wheels.explain(501.0, 500.0)
+    for _ in range(10):
+        wheels.note(mapped_wall()[1], np.zeros(3), 3, 3)
+    assert not wheels.lately
+
+
+@pytest.mark.parametrize("room", ["apartment", "corridors", "maze"])
+@pytest.mark.parametrize("backend", ["ekf-lines", "invariant-ekf"])
+def test_a_robot_that_is_driven_into_walls_knows_where_it_is(room: str, backend: str) -> None:
+    """Twists at random press it to walls for a good part of the time, and its wheels go on turning."""
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms=room, slam=backend, max_episode_steps=450)
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    nees, touched = [], 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        _, info = env.reset(seed=seed)
+        truncated = False
+        step = 0
+        while not truncated:
+            if step % STEPS_EACH == 0:
+                action = rng.uniform(-1.0, 1.0, 3).astype(np.float32)
+            _, _, _, truncated, info = env.step(action)
+            nees.append(info["nees"])
+            step += 1
+        touched += info["collisions"]
+    assert touched > 5
+    assert np.mean(nees) < 3 * 2.5
+    assert np.mean(np.array(nees) > chi2_quantile(0.997, 3)) < 0.06
