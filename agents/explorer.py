@@ -31,6 +31,7 @@ from slam.types import Array
 __all__ = ["Candidates", "Explorer", "ExplorerConfig"]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
+_FIRST_LOOK_S = 1.0
 _REMOTE_RAYS = 60
 
 
@@ -67,6 +68,9 @@ class Explorer(Driver):
     def __init__(self, config: Any = None, **body: Any) -> None:
         super().__init__(config, **body)
         self._frontier_config = self.config.frontiers.for_body(self._robot.width_m)
+        # Beams fall no farther apart than a cell of the planning grid up to here [m].
+        self._dense_m = max(self.config.planner.resolution_m / self._lidar.angle_increment, 1.0)
+        self._sparse = self._dense_m < self.config.frontiers.view_range_m
         # Beyond far_m all costs ask the same extent of a frontier.
         self._least_within_m = max(_WITHIN_M, self.config.frontiers.far_m)
         self._forget()
@@ -85,9 +89,13 @@ class Explorer(Driver):
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
+        if self._is_last(candidates, belief):
+            return self._goal
         if not np.isfinite(candidates.costs).any():
             self._target = None
-            self._status = self._ending
+            # A first scan may show no way out of where the robot stands: beams get lost.
+            early = self._time < _FIRST_LOOK_S and self._ending != "covered"
+            self._status = "looking" if early else self._ending
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]
@@ -96,7 +104,7 @@ class Explorer(Driver):
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
-            if self._target is not None and candidates.current is None:
+            if self._target is not None and candidates.current is None and self._seen_from(belief):
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
                 self._troubles.note(self._target).looks += 1
             cost = float(candidates.costs[index])
@@ -105,6 +113,17 @@ class Explorer(Driver):
         self._target = target
         self._status = "driving"
         return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
+
+    def _seen_from(self, belief: Belief) -> bool:
+        """Whether the robot is where beams fall densely on the target; where they do not it may vanish unseen."""
+        assert self._target is not None
+        return not self._sparse or math.hypot(*(self._target - belief.pose[:2]).tolist()) <= self._dense_m
+
+    def _is_last(self, candidates: Candidates, belief: Belief) -> bool:
+        """Whether the target is gone for no better reason than beams that lie far apart, and nothing else is left."""
+        if self._target is None or self._goal is None or self._seen_from(belief):
+            return False
+        return not np.isfinite(candidates.costs).any() and self._time < self._deadline and not self._follower.blocked
 
     def _way_near(self, point: Array, belief: Belief) -> tuple[Array, float, float]:
         """Return the path ``(n, 2)`` [m] to the reachable place nearest to a point, its cost and that distance."""
@@ -123,11 +142,16 @@ class Explorer(Driver):
         if self._ending == "unreachable" and not np.isfinite(found.costs).any():
             sure = self._cost_maps.of(belief, sigma_m=0.0)
             found = self._candidates_on(sure)
+        # Between two beams there may be a door.
+        if self._sparse and self._ending == "covered" and not np.isfinite(found.costs).any():
+            finest = self._frontier_config.finest(found.cost_map.resolution)
+            found = self._candidates_on(found.cost_map, finest)
         return self._own_part(found, belief) if belief.teammates else found
 
-    def _candidates_on(self, cost_map: CostMap) -> Candidates:
+    def _candidates_on(self, cost_map: CostMap, finest: FrontierConfig | None = None) -> Candidates:
+        """Return what there is to go to; with ``finest`` however small it is, and though it was passed by."""
         watch = self._watch_kept()
-        frontiers = find(cost_map, self._frontier_config, watch)
+        frontiers = find(cost_map, finest, None) if finest else find(cost_map, self._frontier_config, watch)
         # Ways are searched for as far as they are asked for: on a large map most frontiers are far away.
         asked = self._costs_asked()
         within_m = math.inf if asked is None else self._within_m
@@ -201,11 +225,9 @@ class Explorer(Driver):
         return out
 
     def _watch_kept(self) -> Watch:
-        # Beams fall no farther apart than a cell of the planning grid.
-        dense = max(self.config.planner.resolution_m / self._lidar.angle_increment, 1.0)
         return Watch(
             poses=self._track.poses,
-            range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, dense),
+            range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, self._dense_m),
             half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
         )
 

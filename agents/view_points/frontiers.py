@@ -44,6 +44,14 @@ class FrontierConfig(Config):
             self, min_extent_m=min(self.min_extent_m, width_m), far_extent_m=min(self.far_extent_m, 2.0 * width_m)
         )
 
+    def finest(self, resolution_m: float) -> FrontierConfig:
+        """Return the same for whatever is larger than a cell of this size [m]."""
+        least = 2.0 * resolution_m
+        return replace(
+            self, min_extent_m=least, min_unknown_m2=resolution_m**2, min_unknown_width_m=resolution_m,
+            min_clearance_m=0.0,
+        )  # fmt: skip
+
     def wanted_extent(self, costs: Array) -> Array:
         """Return the extent [m] that makes a cluster worth going to at these travel costs ``(m,)``."""
         share = np.minimum(costs / self.far_m, 1.0)
