@@ -120,10 +120,10 @@ class Explorer(Driver):
         return not self._sparse or math.hypot(*(self._target - belief.pose[:2]).tolist()) <= self._dense_m
 
     def _is_last(self, candidates: Candidates, belief: Belief) -> bool:
-        """Whether the target is gone for no better reason than beams that lie far apart, and nothing else is left."""
-        if self._target is None or self._goal is None or self._seen_from(belief):
+        """Whether nothing is left, and the target gone for no better reason than beams that lie far apart."""
+        if self._target is None or self._goal is None or np.isfinite(candidates.costs).any():
             return False
-        return not np.isfinite(candidates.costs).any() and self._time < self._deadline and not self._follower.blocked
+        return not (self._seen_from(belief) or self._follower.blocked) and self._time < self._deadline
 
     def _way_near(self, point: Array, belief: Belief) -> tuple[Array, float, float]:
         """Return the path ``(n, 2)`` [m] to the reachable place nearest to a point, its cost and that distance."""

@@ -14,7 +14,8 @@ import agents
 from agents.base import Agent, Goal
 from agents.brisk_tour import BRISK
 from agents.ppo_frontier import SHIPPED, load_choice_policy
-from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig
+from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, NoiseConfig, RobotConfig
+from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from slam.types import Scan
@@ -306,3 +307,23 @@ def test_explores_two_rooms_without_touching(preset):
 def test_the_policy_over_view_points_is_driven_as_the_tour_that_it_is_compared_with():
     _, driver, _ = load_choice_policy(SHIPPED)
     assert driver.control == BRISK
+
+
+@pytest.mark.parametrize(
+    ("seed", "lidar", "dropout"),
+    [(1, LidarConfig(beams=90), 0.005), (5, LidarConfig(beams=90), 0.005), (5, LidarConfig(), 0.3)],
+)
+def test_a_sensor_that_shows_little_is_no_reason_to_stop(seed: int, lidar: LidarConfig, dropout: float) -> None:
+    """Beams 4° apart miss a door, or show a frontier that is gone from elsewhere; lost ones hide the way out."""
+    noise = NoiseConfig(dropout=dropout)
+    env = ExploreEnv(rooms="corridors", lidar=lidar, noise=noise)
+    observation, info = env.reset(seed=seed)
+    agent = agents.make("nearest-frontier", lidar=env.config.lidar, step_s=env.config.step_s)
+    agent.reset(env.belief, seed)
+    ended, steps = False, 0
+    while not (ended or agent.ended) and steps < 2000:
+        steps += 1
+        observation, _, terminated, truncated, info = env.step(agent.act(observation, env.belief))
+        ended = terminated or truncated
+    assert info["coverage"] >= 0.95
+    assert info["collisions"] == 0
