@@ -31,7 +31,6 @@ from slam.types import Array
 __all__ = ["Candidates", "Explorer", "ExplorerConfig"]
 
 _WITHIN_M = 20.0  # [weighted m] that ways are searched for at least
-_FIRST_LOOK_S = 1.0
 _REMOTE_RAYS = 60
 
 
@@ -93,9 +92,7 @@ class Explorer(Driver):
             return self._goal
         if not np.isfinite(candidates.costs).any():
             self._target = None
-            # A first scan may show no way out of where the robot stands: beams get lost.
-            early = self._time < _FIRST_LOOK_S and self._ending != "covered"
-            self._status = "looking" if early else self._ending
+            self._status = self._ending
             return None
         index = self.pick(candidates, belief)
         target = candidates.frontiers.targets[index]

@@ -23,6 +23,7 @@ from slam.types import Array
 __all__ = ["Driver", "DriverConfig"]
 
 _LOST = 0.1  # health of a belief below which it is no good for driving
+_FIRST_LOOK_S = 1.0
 
 
 class DriverConfig(Protocol):
@@ -101,6 +102,8 @@ class Driver(Agent):
                 self._follower.set_path(self._goal.path, None if all_round else float(self._goal.pose[2]))
         self._time += self._step_s
         if self._goal is None:
+            if self._status == "unreachable" and self._time < _FIRST_LOOK_S:
+                self._status = "looking"  # the first scans may have lost the beams that show the way out
             self._follower.reset()
             self._anchored_at = self._time
             return np.zeros(3, dtype=np.float32)

@@ -208,6 +208,10 @@ def test_enclosed_robot_stays():
     assert len(agent.frontiers) > 0
     assert agent.ended and agent.status == "unreachable"
     np.testing.assert_array_equal(agent.act(None, belief), np.zeros(3, np.float32))
+    assert not agent.ended and agent.status == "looking"  # the first scans may have lost the beams that show a way
+    for _ in range(15):
+        agent.act(None, belief)
+    assert agent.ended
     # One door, and it leaves.
     fill(classes, 4.8, 3.5, 5.1, 4.5, FREE)
     assert ready("nearest-frontier", belief).choose(belief_of(classes, (4.0, 4.0, 0.0))) is not None
