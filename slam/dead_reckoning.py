@@ -15,7 +15,7 @@ from slam.backend import Backend
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.stacked_update import NO_LIMITS
-from slam.types import Array, Odometry, Scan
+from slam.types import Array, Indices, Odometry, Scan
 
 __all__ = ["OdometrySlam", "TruthSlam"]
 
@@ -49,7 +49,7 @@ class OdometrySlam(EkfSlam):
         super()._correct(z, match)
         self._x[:3] = pose
 
-    def _may_spin(self, scan: Scan, recent: int, still: int, unmatched: int) -> bool:
+    def _may_spin(self, scan: Scan, match: Indices, recent: int, still: int) -> bool:
         return False  # the pose is not for the scan to doubt
 
     @property

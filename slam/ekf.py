@@ -95,7 +95,7 @@ class EkfSlam(GaussianBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
-        if scan is not None and self._may_spin(scan, *self._recall, len(z) - _matched(match)):
+        if scan is not None and self._may_spin(scan, match, *self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
         given = z.copy() if self.config.lines else z  # what is matched with curved walls is straightened in place
         self._accept(z, match, JOINT_LIMITS)
@@ -108,7 +108,7 @@ class EkfSlam(GaussianBackend):
         if loop:
             self._close_loop(z, match)
         if scan is not None:
-            self._spinning.note(scan, self.sensor_pose(), self._recall[0], _matched(match))
+            self._spinning.note(scan, self._x[:3], self._recall[0], match)
             if self.nis_dof >= 2 * FEWEST_BACK:
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
@@ -213,7 +213,7 @@ class EkfSlam(GaussianBackend):
         self._p[[0, 1, 2], [0, 1, 2]] += spinning.variances
         wide = self._p[:3, :3].copy()
         match, spun = self._associate_jointly(z), False
-        if spinning.enough(_matched(match), _matched(usual)):
+        if spinning.enough(match, usual):
             fit = self._fit(z, match, scan)
             self._x[:n], self._p[:n, :n] = x, p
             spun = spinning.explain(fit, self._fit(z, usual, scan))
@@ -302,7 +302,3 @@ class EkfSlam(GaussianBackend):
         self._spinning.forget_motion()
         self._manage(z, match, scan)
         self._draw(scan)
-
-
-def _matched(match: NDArray[np.int64]) -> int:
-    return int(np.count_nonzero(match >= 0))

@@ -112,13 +112,12 @@ class FastSlam(LandmarkBackend):
         z = self.extractor.extract(scan)[:MAX_OBSERVATIONS]
         match, leader = self._associate(z)
         recent, still = count_recent(self._book.marks, match[leader], self._book.now)
-        if self._may_spin(scan, recent, still, int(np.count_nonzero(match[leader] < 0))):
+        if self._may_spin(scan, match[leader], recent, still):
             self._allow_for_spinning_wheels(z, match, leader, scan)
-        matched = int(np.count_nonzero(match[leader] >= 0))
-        if matched >= FEWEST_BACK:
+        if np.count_nonzero(match[leader] >= 0) >= FEWEST_BACK:
             self._spinning.forget_motion()
         best = self._correct(z, match)
-        self._spinning.note(scan, self.sensor_pose(self._poses[best]), recent, matched)
+        self._spinning.note(scan, self._poses[best], recent, match[leader])
         self._manage(z, match[best], best, scan)
         self._resample(len(z))
         self._believe()
@@ -259,7 +258,7 @@ class FastSlam(LandmarkBackend):
             x, p, config.lidar_offset_m, z, self._book.marks, policy.new_distance_m,
             math.radians(config.max_turn_deg), found,
         )  # fmt: skip
-        if spinning.enough(int(np.count_nonzero(found >= 0)), int(np.count_nonzero(match[leader] >= 0))):
+        if spinning.enough(found, match[leader]):
             usual_fit = self._fit(pose, cov, landmarks, z, match[leader], scan)
             spun = spinning.explain(self._fit(pose, cov + wide, landmarks, z, found, scan), usual_fit)
         if spun or lately:

@@ -14,7 +14,7 @@ from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
 from slam.landmarks.spinning_wheels import SpinningWheels
 from slam.motion import OdometryNoise, Twist
-from slam.types import LINE, Array, Observations, Odometry, Scan
+from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["LandmarkBackend", "observation_rows"]
 
@@ -37,9 +37,9 @@ class LandmarkBackend(Backend):
         self._spinning.claim(way, way / noise.lever_m)
         return twist, var_v, var_w
 
-    def _may_spin(self, scan: Scan, recent: int, still: int, unmatched: int) -> bool:
+    def _may_spin(self, scan: Scan, match: Indices, recent: int, still: int) -> bool:
         """Tell whether the wheels may have turned in vain; see :meth:`SpinningWheels.suspected`."""
-        return self._spinning.suspected(self.grid, self.sensor_pose(), scan, recent, still, unmatched)
+        return self._spinning.suspected(self.grid, self.sensor_pose, scan, recent, still, match)
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 

@@ -10,8 +10,12 @@ then they are not believed, and of two explanations the better one is taken.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
 from slam.grids.occupancy import OccupancyGrid
-from slam.types import Array, Scan
+from slam.types import Array, Indices, Scan
 
 __all__ = ["FEWEST_BACK", "SpinningWheels"]
 
@@ -60,31 +64,35 @@ class SpinningWheels:
         return self._left > 0
 
     def suspected(
-        self, grid: OccupancyGrid, sensor_pose: Array, scan: Scan, recent: int, still: int, unmatched: int
-    ) -> bool:
+        self, grid: OccupancyGrid, sensor_pose: Callable[[Array | None], Array], scan: Scan, recent: int,
+        still: int, match: Indices,
+    ) -> bool:  # fmt: skip
         """Tell whether to ask.
 
         Parameters
         ----------
-        grid, sensor_pose, scan
-            The map, and from where in it ``(3,)`` the scan was taken by the wheels.
+        grid, scan
+            The map, and the scan at hand.
+        sensor_pose
+            Returns where the sensor is ``(3,)`` with the body at a pose ``(3,)``, the believed one for ``None``.
         recent, still
             Landmarks that the last scans showed, and how many of them are matched.
-        unmatched
-            Observations that are matched with none.
+        match
+            Landmark of each observation ``(m,)``, negative for none.
         """
         if self._left:
             return True
-        if recent < _FEWEST_RECENT or min(recent - still, unmatched) < FEWEST_BACK:
+        if recent < _FEWEST_RECENT or recent - still < FEWEST_BACK or np.count_nonzero(match < 0) < FEWEST_BACK:
             return False
         if self._last is None:
             return True
-        last, pose = self._last
-        return grid.agreement(sensor_pose, scan) < grid.agreement(pose, last) - _WORSE_NAT
+        last, body = self._last
+        return grid.agreement(sensor_pose(None), scan) < grid.agreement(sensor_pose(body), last) - _WORSE_NAT
 
-    def enough(self, found: int, usual: int) -> bool:
-        """Tell whether so many landmarks, found as though they spun, may explain more than so many as usual."""
-        return found >= max(FEWEST_BACK, usual + (0 if self._left else FEWEST_BACK))
+    def enough(self, found: Indices, usual: Indices) -> bool:
+        """Tell whether a match that was made as though they spun may explain more than the usual one."""
+        least = int(np.count_nonzero(usual >= 0)) + (0 if self._left else FEWEST_BACK)
+        return int(np.count_nonzero(found >= 0)) >= max(FEWEST_BACK, least)
 
     def explain(self, fit: float, usual: float) -> bool:
         """Tell whether a scan says that they spun, by how well [nat] it fits from there and as usual."""
@@ -94,8 +102,8 @@ class SpinningWheels:
             return True
         return self.lately and fit > usual
 
-    def note(self, scan: Scan, sensor_pose: Array, recent: int, matched: int) -> None:
-        """Take note of a scan and where it was taken; one that misses landmarks is nothing to compare with."""
+    def note(self, scan: Scan, body: Array, recent: int, match: Indices) -> None:
+        """Take note of a scan, the body's pose ``(3,)`` and the match; one that misses landmarks is no measure."""
         self._left = max(self._left - 1, 0)
-        if matched > recent - FEWEST_BACK:
-            self._last = scan, sensor_pose
+        if np.count_nonzero(match >= 0) > recent - FEWEST_BACK:
+            self._last = scan, body.copy()

@@ -23,39 +23,51 @@ def mapped_wall() -> tuple[OccupancyGrid, Scan]:
     return grid, scan
 
 
+def matched(count: int, unmatched: int) -> np.ndarray:
+    return np.array([*range(count), *[-1] * unmatched])
+
+
 def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
     grid, scan = mapped_wall()
     here, off = np.zeros(3), np.array([0.3, 0.0, 0.0])
     wheels = SpinningWheels()
-    assert wheels.suspected(grid, here, scan, 5, 1, 4)  # nothing to compare with yet
-    wheels.note(scan, here, recent=5, matched=5)
-    assert not wheels.suspected(grid, here, scan, 5, 1, 4)  # as good a fit as the last
-    assert wheels.suspected(grid, off, scan, 5, 1, 4)
-    assert not wheels.suspected(grid, off, scan, 5, 4, 4)  # one landmark may well go out of sight
-    assert not wheels.suspected(grid, off, scan, 5, 1, 1)  # and what is not seen explains nothing
-    wheels.note(scan, off, recent=5, matched=1)  # nothing to compare with: the fit there is bad
-    assert wheels.suspected(grid, off, scan, 5, 1, 4)
+
+    def suspected(believed: np.ndarray, still: int, unmatched: int, recent: int = 5) -> bool:
+        match = matched(still, unmatched)
+        return wheels.suspected(grid, lambda body: believed if body is None else body, scan, recent, still, match)
+
+    assert suspected(here, 1, 4)  # nothing to compare with yet
+    wheels.note(scan, here, 5, matched(5, 0))
+    assert not suspected(here, 1, 4)  # as good a fit as the last
+    assert suspected(off, 1, 4)
+    assert not suspected(off, 4, 4)  # one landmark may well go out of sight
+    assert not suspected(off, 1, 1)  # and what is not seen explains nothing
+    assert not suspected(off, 0, 4, recent=2)
+    wheels.note(scan, off, 5, matched(1, 4))  # nothing to compare with: the fit there is bad
+    assert suspected(off, 1, 4)
+    assert wheels.explain(200.0, 50.0)
+    assert suspected(here, 5, 0)  # they did, lately
 
 
 def test_the_scan_decides_and_is_believed_for_a_while() -> None:
-    wheels = SpinningWheels()
+    wheels, scan = SpinningWheels(), mapped_wall()[1]
     wheels.claim(0.3, 0.1)
     wheels.claim(0.1, 0.1)
     assert wheels.variances == pytest.approx((0.16, 0.16, 0.04))
     wheels.forget_motion()
     assert wheels.variances == (0.0, 0.0, 0.0)
-    assert wheels.enough(3, 1)
-    assert not wheels.enough(2, 1)
-    assert not wheels.enough(1, 0)
-    assert not wheels.explain(560.0, 500.0)
+    assert wheels.enough(matched(3, 0), matched(1, 2))
+    assert not wheels.enough(matched(2, 1), matched(1, 2))
+    assert not wheels.enough(matched(1, 2), matched(0, 3))
+    assert not wheels.explain(575.0, 500.0)
     assert wheels.explain(2.0, 0.9)  # twice as well
     assert wheels.lately
-    assert wheels.suspected(*mapped_wall()[:1], np.zeros(3), mapped_wall()[1], 0, 0, 0)
-    assert wheels.enough(2, 2)
+    assert wheels.enough(matched(2, 0), matched(2, 0))
     assert wheels.explain(501.0, 500.0)
     for _ in range(10):
-        wheels.note(mapped_wall()[1], np.zeros(3), 3, 3)
+        wheels.note(scan, np.zeros(3), 3, matched(3, 0))
     assert not wheels.lately
+    assert not wheels.explain(501.0, 500.0)
 
 
 @pytest.mark.parametrize("room", ["apartment", "corridors", "maze"])
