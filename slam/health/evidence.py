@@ -38,15 +38,29 @@ class Agreement(NamedTuple):
         return self.in_the_open / beams if beams else 0.0
 
 
-def agreement(grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int) -> Agreement:
-    """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ)."""
+def agreement(
+    grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int, *, dense: bool = False
+) -> Agreement:
+    """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ).
+
+    With ``dense`` only those speak that end where the scan's beams lie close together: what stood between two that
+    lie farther apart was drawn as free.
+    """
     row0, col0 = grid.lattice_origin
     x, y, theta = sensor_pose
     ranges, angle_min, increment, range_max, _ = scan
     return Agreement(*_count_beams(
-        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, x, y, theta,
-        len(ranges) // beams or 1,
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment,
+        _dense(range_max, increment) if dense else range_max, x, y, theta, len(ranges) // beams or 1,
     ))  # fmt: skip
+
+
+_APART_M = 0.14
+
+
+def _dense(range_max: float, increment: float) -> float:
+    """Return up to which range [m] two beams lie closer together than that."""
+    return min(range_max, _APART_M / increment)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -97,8 +111,8 @@ def agrees(grid: OccupancyGrid, body: Array, offset_m: float, scan: Scan, beams:
     ranges, angle_min, increment, range_max, _ = scan
     row0, col0 = grid.lattice_origin
     return bool(_agrees(
-        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, body, offset_m,
-        len(ranges) // beams or 1,
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, _dense(range_max, increment),
+        body, offset_m, len(ranges) // beams or 1,
     ))  # fmt: skip
 
 

@@ -70,6 +70,21 @@ def test_the_right_pose_agrees_and_the_map_of_nothing_says_nothing(true: tuple[f
     assert empty.against == 0.0
 
 
+def test_beams_that_lie_far_apart_do_not_speak_of_what_stands_between() -> None:
+    grid = OccupancyGrid(0.05)
+    nothing = np.full(360, np.inf)
+    for _ in range(3):
+        grid.integrate(np.zeros(3), Scan(np.full(360, 7.9), -np.pi, np.radians(1.0), 8.0), np.full(360, -1, np.int16))
+    for apart_deg, far_m in ((1.0, 7.5), (4.0, 1.8), (4.0, 2.2)):
+        ranges = nothing[:: int(apart_deg)].copy()
+        ranges[::2] = far_m  # things in the open
+        scan = Scan(ranges, -np.pi, np.radians(apart_deg), 8.0)
+        seen = agreement(grid, (0.0, 0.0, 0.0), scan, len(ranges))
+        assert seen.in_the_open == len(ranges) // 2
+        dense = agreement(grid, (0.0, 0.0, 0.0), scan, len(ranges), dense=True)
+        assert dense.in_the_open == (seen.in_the_open if far_m * np.radians(apart_deg) < 0.14 else 0)
+
+
 def test_a_glance_at_the_body_s_pose_is_a_look_at_the_sensor_s() -> None:
     grid, true = room_grid(), np.array([3.0, 2.0, 0.5])
     scan = room_scan(true)
