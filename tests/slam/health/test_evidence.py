@@ -74,7 +74,9 @@ def test_beams_that_lie_far_apart_do_not_speak_of_what_stands_between() -> None:
     grid = OccupancyGrid(0.05)
     nothing = np.full(360, np.inf)
     for _ in range(3):
-        grid.integrate(np.zeros(3), Scan(np.full(360, 7.9), -np.pi, np.radians(1.0), 8.0), np.full(360, -1, np.int16))
+        grid.integrate(
+            np.zeros(3), Scan(np.full(360, 7.9), -np.pi, np.radians(1.0), 8.0), np.full(360, -1, np.int16)
+        )
     for apart_deg, far_m in ((1.0, 7.5), (4.0, 1.8), (4.0, 2.2)):
         ranges = nothing[:: int(apart_deg)].copy()
         ranges[::2] = far_m  # things in the open
