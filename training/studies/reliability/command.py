@@ -15,7 +15,7 @@ from slam.settings import unknown_name
 from training.figures.tables import text_table
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Out, Ray, Seed, Workers, workers_of
+from training.runs.options import Out, Ray, Seed, workers_of
 from training.runs.rows import resume
 from training.runs.running import parts_of, write_json
 from training.studies.reliability.files.part import FILES
@@ -42,7 +42,7 @@ def study(
     places: Annotated[int, typer.Option(min=1, max=1000, help="Rounds of places.")] = int(PLACES.size),
     soak: Annotated[float, typer.Option("--soak", "--hours", min=0.001, max=1000, help="Hours.")] = SOAK.size,
     seed: Seed = 0,
-    workers: Workers = 1,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes; kills and files want a quiet machine.")] = 1,
     ray: Ray = None,
     out: Out = Path("out/reliability"),
 ) -> None:
