@@ -42,7 +42,7 @@ def study(
     places: Annotated[int, typer.Option(min=1, max=1000, help="Rounds of places.")] = int(PLACES.size),
     soak: Annotated[float, typer.Option("--soak", "--hours", min=0.001, max=1000, help="Hours.")] = SOAK.size,
     seed: Seed = 0,
-    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes; kills and files want a quiet machine.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes.")] = 1,
     ray: Ray = None,
     out: Out = Path("out/reliability"),
 ) -> None:
