@@ -18,6 +18,7 @@ from slam.grids.occupancy import OccupancyGrid
 from slam.metrics import measures
 from slam.teams.account import Account
 from slam.teams.alignment import align
+from slam.teams.corners import settled
 from slam.teams.fusion import MergedMap, fuse
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Array
@@ -138,6 +139,7 @@ def team_landmarks(team: Team) -> MergedMap | None:
         grids = [team.members[account.robot].backend.grid for account in (a, b)]
         alignments.append(align(a, b, grids=(grids[0], grids[1]), prior=(where, _LOOK_NEAR)))
     found = [one for one in alignments if one is not None]
+    accounts = [settled(account) for account in accounts]
     if team.team.starts_exact:
         return fuse(accounts, found, frames={k: (pose, _EXACT) for k, pose in frames.items()})
     tied = {0}

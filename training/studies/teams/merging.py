@@ -26,6 +26,7 @@ from slam.metrics.measures import nees_pose
 from slam.settings import to_mapping
 from slam.teams.account import Account
 from slam.teams.alignment import Alignment, AlignmentConfig, align
+from slam.teams.corners import CornerConfig, settled
 from slam.teams.fusion import MergedMap, fuse
 from slam.types import Array
 from training.episodes.explore import make_agent
@@ -49,6 +50,7 @@ FILES = ("merging.json", "pairs.jsonl")
 SLAM = "invariant-ekf"
 _CLEARANCE_M = 0.6  # of the second robot's start
 _SAME_CORNER_M = 0.3  # a mapped corner is the nearest true one, if no farther
+_FALSE_M = 0.08  # … and a false one, made by two surfaces that do not meet, if farther than this
 
 Job = tuple[str, int, float, float]  # rooms, seed of the room, coverage and time [s] at which a robot stops
 Row = dict[str, Any]
@@ -135,7 +137,7 @@ def _judged(found: Alignment, a: _Told, b: _Told, true: Array, prior: tuple[Arra
     if prior is not None:
         frames = {0: (np.zeros(3), np.zeros((3, 3))), 1: prior}
     if right and len(a.corners):  # caves have none
-        row |= _merged(fuse([a.account, b.account], [found], frames=frames), a, b, true)
+        row |= _merged(fuse([settled(a.account), settled(b.account)], [found], frames=frames), a, b, true)
     return row
 
 
@@ -173,11 +175,15 @@ def summarise(rows: Mapping[Job, Row]) -> dict[str, Row]:
             values = [v for t in told for v in (t if isinstance(t, list) else [t])]
             return statistics.fmean(values) / dof if values else None
 
+        corners = [c for t in right for c in zip(t.get("corner_m", []), t.get("corner_nees", []), strict=True)]
+        true = [nees for off, nees in corners if off < _FALSE_M]
         out[name] = {
             **{outcome: sum(t["outcome"] == outcome for t in told) for outcome in ("right", "none", "wrong")},
             "off_m": mean("off_m", 1), "off_deg": None if not right else math.degrees(mean("off_rad", 1) or 0.0),
             "off_m_max": max((t["off_m"] for t in right), default=None),
             "nees": mean("nees", 3), "corner_nees": mean("corner_nees", 2),
+            "true_corner_nees": statistics.fmean(true) / 2 if true else None,
+            "corners": len(corners), "false_corners": len(corners) - len(true),
             "shared_corner_nees": mean("shared_corner_nees", 2), "corner_m": mean("corner_m", 1),
             "pose_nees": mean("pose_nees", 3),
             "overlap": statistics.fmean(row["overlap"] for row in rows.values()),
@@ -189,14 +195,16 @@ def summarise(rows: Mapping[Job, Row]) -> dict[str, Row]:
 def _table(summary: Mapping[str, Row]) -> str:
     head = [
         "starts", "right", "none", "wrong", "off: mean, max [m]", "off [°]", "NEES/3 of the alignment",
-        "NEES/2 of merged corners (of those both saw)", "NEES/3 of poses", "merged corners off [m]",
+        "NEES/2 of merged corners (of those both saw; without false ones)", "false",
+        "NEES/3 of poses", "merged corners off [m]",
     ]  # fmt: skip
     rows = [
         [
             name, str(s["right"]), str(s["none"]), str(s["wrong"]),
             f"{number(s['off_m'], 4)}, {number(s['off_m_max'], 4)}", number(s["off_deg"], 3), number(s["nees"], 2),
-            f"{number(s['corner_nees'], 2)} ({number(s['shared_corner_nees'], 2)})", number(s["pose_nees"], 2),
-            number(s["corner_m"], 4),
+            f"{number(s['corner_nees'], 2)} ({number(s['shared_corner_nees'], 2)}; "
+            f"{number(s['true_corner_nees'], 2)})",
+            f"{s['false_corners']} of {s['corners']}", number(s["pose_nees"], 2), number(s["corner_m"], 4),
         ]
         for name, s in summary.items()
     ]  # fmt: skip
@@ -219,7 +227,7 @@ def study(
     settings = {
         "version": installed_version(), "slam": SLAM, "agent": AGENT, "rooms": rooms, "coverage": coverage,
         "time_s": time_s, "right": [RIGHT_M, RIGHT_RAD], "prior_sigma": list(PRIOR_SIGMA),
-        "alignment": to_mapping(AlignmentConfig()),
+        "alignment": to_mapping(AlignmentConfig()), "corner": to_mapping(CornerConfig()),
     }  # fmt: skip
     keep_settings(out, settings, FILES)
     jobs: list[Job] = [(rooms, seed, coverage, time_s) for seed in chosen]

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from slam.teams.account import Account
+from slam.teams.corners import CornerConfig, settled
+from slam.types import CONCAVE, CONVEX, Array
+
+AS_TOLD = CornerConfig(end_share=1.0)  # ends no better than the filter says
+WALLS = np.array([[math.pi, -4.0], [1.5 * math.pi, -2.0]])  # x = 4 and y = 2, bodies at x < 4 and y < 2
+ENDS = np.array([[4.0, -3.0, 4.0, 2.0], [4.0, 2.0, -1.0, 2.0]])
+CROSSING, JAMB, ALONE = (4.012, 1.99), (3.985, -3.02), (6.0, 6.0)
+DIRECTIONS = np.radians([45.0, -45.0, 45.0])
+
+
+def account(cov: Array, kinds: tuple[int, ...] = (CONVEX,) * 3) -> Account:
+    return Account(
+        robot=0, stamp=0.0, pose=np.zeros(3), points=np.array([CROSSING, JAMB, ALONE]), point_ids=np.arange(3),
+        kinds=np.array(kinds, np.int8), directions=DIRECTIONS, times_seen=np.full(3, 9), walls=WALLS,
+        wall_ends=ENDS, cov=cov,
+    )  # fmt: skip
+
+
+def some_cov(seed: int, sigma: float = 0.01) -> Array:
+    root = np.random.default_rng(seed).normal(size=(13, 13))
+    return np.asarray(sigma**2 * (root @ root.T / 13 + 0.1 * np.eye(13)))
+
+
+def test_corners_are_read_off_their_walls() -> None:
+    found = settled(account(some_cov(0)), AS_TOLD)
+    np.testing.assert_allclose(found.points, [(4.0, 2.0), (4.0, JAMB[1]), ALONE], atol=1e-12)
+
+
+def test_the_covariance_goes_over_as_the_corners_do() -> None:
+    told = account(some_cov(1))
+    found, step = settled(told, AS_TOLD), 1e-6
+    columns = []
+    for k in range(13):
+        moved = told.state + step * np.eye(13)[k]
+        other = replace(told, pose=moved[:3], points=moved[3:9].reshape(3, 2), walls=moved[9:].reshape(2, 2))
+        columns.append((settled(other, AS_TOLD).state - found.state) / step)
+    jacobian = np.column_stack(columns)
+    np.testing.assert_allclose(found.cov, jacobian @ told.cov @ jacobian.T, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("change", [{"directions": DIRECTIONS + np.pi}, {"points": np.full((3, 2), 4.2)}])
+def test_a_corner_beside_a_wall_or_behind_it_is_left_alone(change: dict[str, Array]) -> None:
+    told = replace(account(some_cov(2)), **change)
+    found = settled(told, AS_TOLD)
+    np.testing.assert_array_equal(found.state, told.state)
+    np.testing.assert_allclose(found.cov, told.cov, atol=1e-15)
+
+
+def test_an_end_is_off_by_what_lasts_and_a_share_of_the_rest() -> None:
+    cov = np.diag(np.r_[np.full(3, 1e-6), [0.04, 1e-6, 1e-6, 1e-8, 0.01, 1e-6], np.full(4, 1e-6)])
+    config = CornerConfig(end_share=0.005, end_sigma_m=0.0075, gate=0.001)  # a gate that no wall passes
+    got = np.diag(settled(account(cov, (CONVEX, CONVEX, CONCAVE)), config).cov)[3:9]
+    np.testing.assert_allclose(got, [0.005 * 0.04 + 0.0075**2, 1e-6, 1e-6, 1e-8, 0.01, 1e-6], rtol=1e-4)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.003, 1.0))
+def test_a_covariance_stays_one_and_no_larger(seed: int, sigma: float) -> None:
+    told = account(some_cov(seed, sigma))
+    found = settled(told, replace(CornerConfig(), gate=0.001))
+    assert np.linalg.eigvalsh(found.cov).min() > -1e-9 * sigma**2
+    assert np.linalg.eigvalsh(told.cov - found.cov).min() > -1e-9 * sigma**2
+
+
+def test_an_account_without_corners_is_itself() -> None:
+    none = replace(
+        account(some_cov(0)), points=np.zeros((0, 2)), point_ids=np.zeros(0, np.int64), kinds=np.zeros(0, np.int8),
+        directions=np.zeros(0), times_seen=np.zeros(0, np.int64), cov=np.eye(7),
+    )  # fmt: skip
+    assert settled(none) is none
