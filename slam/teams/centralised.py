@@ -12,25 +12,28 @@ Newman and Leonard (ICRA 2002), and what distributed ones are measured against.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.companions import Companions
 from slam.gaussian.settings import EkfConfig, EkfLinesConfig
-from slam.gaussian.stacked_update import cholesky, solve
-from slam.gaussian.tiles import add_combination, downdate, subtract
-from slam.geometry import wrap, wrap_scalar
+from slam.geometry import wrap
 from slam.grids.occupancy import OccupancyGrid
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
+from slam.metrics.measures import nees_pose
 from slam.settings import require
-from slam.types import Array, Observations, Odometry, Scan
+from slam.teams.account import Account
+from slam.teams.apart import EXACT_COV, Apart, Start
+from slam.teams.turns import correct_by_sighting, swap_robots
+from slam.types import LINE, Array, Observations, Odometry, Scan
 
-__all__ = ["JointEkf", "JointMember", "expected_sighting", "swap_robots"]
+__all__ = ["JointEkf", "JointMember"]
 
+_MOST_TURN = 0.03  # [rad] 1σ of a start's heading; a robot that knows less maps alone at first
 _SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
 _LAST_SEEN = 5  # column of marks
 
@@ -52,7 +55,10 @@ class JointEkf:
 
     Notes
     -----
-    All of it is in one frame, that of the start poses. Shared are the landmarks, every covariance and one grid,
+    All of it is in one frame, that of the start poses. A robot but the first whose heading at the start is not
+    known to within 0.03 rad maps alone (``apart``) until its map and the others' say where it started: its
+    landmarks have ids of its own until then (:mod:`slam.teams.apart`). Shared are the landmarks, every covariance
+    and one grid,
     into which all scans are drawn: who follows it by ``take_changes`` must be one for all robots. Each robot has
     its own wheels, extractor, health, key scans and count of updates: what "lately seen" means is its own affair.
     """
@@ -80,7 +86,12 @@ class JointEkf:
         others = np.zeros((3 * (many - 1), 3 * (many - 1)))
         for i, member in enumerate(self.members[1:]):
             others[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = member._start_cov
-            member.grid = first.grid
+            if member._start_cov[2, 2] > _MOST_TURN**2:
+                apart = Apart(start=Start(at[i + 1], member._start_cov))
+                member._begin_at(at[i + 1], EXACT_COV, seed)
+                member._apart = apart
+            else:
+                member.grid = first.grid
         first._beside = Companions(len(first._match), len(first._x), others)
         first._beside.mean[:] = at[1:].ravel()
         self._active = 0
@@ -88,7 +99,7 @@ class JointEkf:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map of cells that all members draw into; live."""
+        """The map of cells that all members draw into but those who map alone; live."""
         return self.members[0].grid
 
     @property
@@ -97,20 +108,31 @@ class JointEkf:
         at = self.members[self._active]
         every: Array = np.concatenate([at._x[:3], at._beside.mean])[self._rows()].reshape(-1, 3)
         every[:, 2] = wrap(every[:, 2])
+        for member in self._apart():
+            every[member.index] = member.pose
         return every
 
     def joint_pose_cov(self) -> Array:
         """Return the covariance ``(3N, 3N)`` of all robots' poses, in their order."""
         cov, rows = self._whole_cov(3), self._rows()
-        return cov[np.ix_(rows, rows)]
+        return self._with_apart(cov[np.ix_(rows, rows)])
 
     def joint_cov(self) -> Array:
         """Return the covariance ``(3N + 2n, 3N + 2n)`` of all robots' poses and all landmarks, walls included."""
         size, rows = self.members[self._active]._n, self._rows()
         cov = self._whole_cov(size)
         order = np.concatenate([np.where(rows < 3, rows, rows + size - 3), np.arange(3, size)])
-        whole: Array = cov[np.ix_(order, order)]
-        return whole
+        return self._with_apart(cov[np.ix_(order, order)])
+
+    def _apart(self) -> list[JointMember]:
+        return [member for member in self.members if member.apart]
+
+    def _with_apart(self, cov: Array) -> Array:
+        """Put in the poses of robots that map alone; in the joint filter they stand where they started."""
+        for member in self._apart():
+            rows = slice(3 * member.index, 3 * member.index + 3)
+            cov[rows, rows] = member.pose_cov
+        return cov
 
     def _whole_cov(self, n: int) -> Array:
         """Return the covariance of the first ``n`` states of the map's filter and those beside them."""
@@ -125,7 +147,7 @@ class JointEkf:
     def _turn(self, index: int) -> None:
         """Let it be this robot's turn."""
         before, now = self.members[self._active], self.members[index]
-        if before is now:
+        if before is now or now.apart:
             return
         before._settle_beliefs()  # they read the rows that another robot's pose stands in from now on
         for name in _SHARED:
@@ -135,6 +157,20 @@ class JointEkf:
         swap_robots(now._x, now._p, now._n, beside.mean, beside.cov, beside.cross, row)
         self._row[self._active], self._row[index] = row, self._row[self._active]
         self._active = index
+
+    def _join(self, member: JointMember, start: Start) -> None:
+        """Let a robot that mapped alone be one of all, from a start; what it measured is measured again."""
+        kept, at, row = member._apart, self.members[self._active], self._row[member.index]
+        assert kept is not None
+        member._settle_beliefs()
+        at._beside.mean[row : row + 3], at._beside.cov[row : row + 3, row : row + 3] = start
+        member._begin_at(start.pose, start.cov, 0)
+        member.grid = self.grid
+        for measured in kept.measured:
+            if isinstance(measured, Scan):
+                member.update(measured)
+            else:
+                member.predict(measured)
 
 
 class JointMember(EkfSlam):
@@ -148,13 +184,20 @@ class JointMember(EkfSlam):
 
     def __init__(self, team: JointEkf, index: int, config: EkfConfig) -> None:
         self._team, self.index = team, index
+        self._apart: Apart | None = None
         super().__init__(config)
 
     def reset(self, *args: object, **kwargs: object) -> None:
         """Refuse: the start of one robot is the start of all."""
         raise RuntimeError("one robot of a team cannot start over: call JointEkf.reset with the poses of all")
 
+    @property
+    def apart(self) -> bool:
+        """Whether this robot still maps alone."""
+        return self._apart is not None
+
     def _begin_at(self, pose: Array, cov: Array | None, seed: int) -> None:
+        self._apart = None
         super().reset(pose, pose_cov=cov, seed=seed)
 
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
@@ -169,6 +212,8 @@ class JointMember(EkfSlam):
 
     def predict(self, odometry: Odometry) -> None:
         """Move this robot on by what its wheels measured."""
+        if self._apart is not None:
+            self._apart.keep(odometry)
         self._team._turn(self.index)
         super().predict(odometry)
 
@@ -176,9 +221,25 @@ class JointMember(EkfSlam):
         """Correct all robots and the map by a scan of this one's."""
         self._team._turn(self.index)
         super().update(scan)
+        if self._apart is not None:
+            self._apart.keep(scan)
+            if self._apart.due:
+                self._look_for_others(self._apart)
+
+    def _look_for_others(self, apart: Apart) -> None:
+        team, landmarks = self._team, np.concatenate(self._points_and_walls())
+        at = team.members[team._active]
+        own = replace(Account.of(self.index, 0.0, self), cov=super()._covariance(landmarks))
+        if (start := apart.look(Account.of(at.index, 0.0, at), own, (at.grid, self.grid))) is not None:
+            team._join(self, start)
 
     def observe(self, observations: Observations) -> None:
-        """Correct all robots and the map by landmark observations of this robot's."""
+        """Correct all robots and the map by landmark observations of this robot's.
+
+        Landmarks that are told apart need no search: one that maps alone is one of all from then on.
+        """
+        if self._apart is not None:
+            self._team._join(self, self._apart.start)
         self._team._turn(self.index)
         super().observe(observations)
 
@@ -191,27 +252,32 @@ class JointMember(EkfSlam):
             The index of the robot that is seen.
         z : Array
             ``(3,)`` range [m] and bearing [rad] of its body's centre from this one's, and its heading less this
-            one's [rad]: :func:`expected_sighting`.
+            one's [rad]: :func:`slam.teams.turns.expected_sighting`.
         cov : Array
             ``(3, 3)`` covariance of ``z``.
         gate : float
-            Nothing is corrected where the NIS is above it.
+            Nothing is corrected where the NIS is above it, nor where one of the two maps alone: that is nan.
         """
         team, at, r = self._team, np.array(z, dtype=np.float64), np.array(cov, dtype=np.float64)
         if not 0 <= other < len(team.members) or other == self.index:
             raise ValueError(f"robot {self.index} of {len(team.members)} cannot see a robot {other}")
         if at.shape != (3,) or r.shape != (3, 3) or not (np.all(np.isfinite(at)) and np.all(np.isfinite(r))):
             raise ValueError("a sighting is three finite numbers with a finite (3, 3) covariance")
+        for member in (self, team.members[other]):
+            if member._apart is not None and member._apart.scans:
+                return math.nan
+            if member._apart is not None:  # without a map it finds nobody by it
+                team._join(member, member._apart.start)
         team._turn(self.index)
         self._settle_beliefs()
         beside = self._beside
-        return float(_see(
+        return float(correct_by_sighting(
             self._x, self._p, self._n, beside.mean, beside.cov, beside.cross, team._row[other], at, r, gate,
             self._w, self._s, np.zeros((3, len(beside.mean))),
         ))  # fmt: skip
 
     def _redraw_if_moved(self) -> bool:
-        others = [m.key_scans for m in self._team.members if m is not self]
+        others = [m.key_scans for m in self._team.members if m is not self and not (m.apart or self.apart)]
         return self.key_scans.redraw_if_moved(self.grid, *self._map_points(), others)
 
     # ---- the belief: each look is a turn, too --------------------------------------------------------------
@@ -226,12 +292,41 @@ class JointMember(EkfSlam):
     def pose_cov(self) -> Array:
         """Pose covariance ``(3, 3)`` of this robot."""
         self._team._turn(self.index)
-        return super().pose_cov
+        own = super().pose_cov
+        none = np.zeros((0, 2))
+        return own if self._apart is None else own + self._apart.in_all(self._x[:3], none, none)
+
+    def _end_variance(self) -> float:
+        cov = super().pose_cov  # in the frame in which it draws
+        return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
+
+    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
+        cov: Array = super()._covariance(landmarks)
+        return cov if self._apart is None else cov + self._in_all(landmarks)
+
+    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+        own: Array = super()._own_covariances(landmarks)
+        if self._apart is not None and len(landmarks):
+            added = self._in_all(landmarks)[3:, 3:].reshape(len(landmarks), 2, len(landmarks), 2)
+            own = own + np.einsum("iajb,ij->iab", added, np.eye(len(landmarks)))
+        return own
+
+    def _in_all(self, landmarks: NDArray[np.int64]) -> Array:
+        """Return what the start's error adds to the covariance of the robot and some landmarks, in their order."""
+        assert self._apart is not None
+        walls = self._marks[landmarks, 0] == LINE
+        order = np.argsort(np.concatenate([np.flatnonzero(~walls), np.flatnonzero(walls)]))
+        at = self._points[landmarks]
+        added = self._apart.in_all(self._x[:3], at[~walls], at[walls])
+        rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
+        return added[np.ix_(rows, rows)]
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the NEES of this robot's pose against the truth ``(3,)``."""
         self._team._turn(self.index)
-        return super().pose_nees(true_pose)
+        return (
+            super().pose_nees(true_pose) if self._apart is None else nees_pose(self.pose, self.pose_cov, true_pose)
+        )
 
     @property
     def joint_cov(self) -> Array:
@@ -284,91 +379,3 @@ class _TeamBook(LandmarkBook):
         seen = np.full(size, -np.inf)
         seen[: len(self._seen)] = self._seen
         self.marks[:, _LAST_SEEN] = seen[ids]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def swap_robots(x: Array, p: Array, n: int, mean: Array, cov: Array, cross: Array, s: int) -> None:
-    """Exchange the robot of a joint Gaussian with the one whose pose stands beside the map from state ``s`` on.
-
-    ``x`` ``(≥ n,)`` and ``p``, an upper triangle, are the map's filter, ``mean`` ``(k,)``, ``cov`` ``(k, k)`` and
-    ``cross`` ``(k, ≥ n)`` the states beside it. Every number stays what it is.
-    """
-    for q in range(3):
-        x[q], mean[s + q] = mean[s + q], x[q]
-        for j in range(3, n):
-            p[q, j], cross[s + q, j] = cross[s + q, j], p[q, j]
-        for t in range(mean.shape[0]):
-            if t < s or t >= s + 3:
-                value = cross[t, q]
-                cross[t, q] = cov[t, s + q]
-                cov[t, s + q] = cov[s + q, t] = value
-        for r in range(q, 3):
-            value = p[q, r]
-            p[q, r] = cov[s + q, s + r]
-            cov[s + q, s + r] = cov[s + r, s + q] = value
-            cross[s + q, r], cross[s + r, q] = cross[s + r, q], cross[s + q, r]
-    x[2] = wrap_scalar(x[2])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def expected_sighting(seer: Array, seen: Array, hi: Array, hj: Array) -> tuple[float, float, float]:
-    """Return range, bearing and relative heading at which a robot at ``seer`` should see one at ``seen``.
-
-    Of poses ``(≥ 3,)``; ``hi`` and ``hj`` ``(3, 3)`` are filled with the Jacobians by either pose.
-    """
-    dx, dy = seen[0] - seer[0], seen[1] - seer[1]
-    rho2 = dx * dx + dy * dy
-    rho = math.sqrt(rho2)
-    hj[0, 0], hj[0, 1], hj[0, 2] = dx / rho, dy / rho, 0.0
-    hj[1, 0], hj[1, 1], hj[1, 2] = -dy / rho2, dx / rho2, 0.0
-    hj[2, 0], hj[2, 1], hj[2, 2] = 0.0, 0.0, 1.0
-    for e in range(3):
-        hi[e, 0], hi[e, 1], hi[e, 2] = -hj[e, 0], -hj[e, 1], 0.0
-    hi[1, 2] = hi[2, 2] = -1.0
-    return rho, wrap_scalar(math.atan2(dy, dx) - seer[2]), wrap_scalar(seen[2] - seer[2])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _see(
-    x: Array, p: Array, n: int, mean: Array, cov: Array, cross: Array, j: int, z: Array, r: Array, gate: float,
-    w: Array, s: Array, we: Array,
-) -> float:  # fmt: skip
-    """Correct by a sighting of the robot that stands beside the map from state ``j`` on; return the NIS.
-
-    As :mod:`slam.gaussian.stacked_update` and :mod:`slam.gaussian.companions` do it, with H by both poses; ``w``,
-    ``s`` and ``we`` ``(3, k)`` are work space.
-    """
-    k = mean.shape[0]
-    hi, hj = np.empty((3, 3)), np.empty((3, 3))
-    rho, bearing, turn = expected_sighting(x, mean[j : j + 3], hi, hj)
-    for e in range(3):
-        for c in range(n):
-            w[e, c] = 0.0
-            for q in range(3):
-                w[e, c] += hi[e, q] * p[min(q, c), max(q, c)] + hj[e, q] * cross[j + q, c]
-        for c in range(k):
-            we[e, c] = 0.0
-            for q in range(3):
-                we[e, c] += hi[e, q] * cross[c, q] + hj[e, q] * cov[j + q, c]
-    for e in range(3):
-        for f in range(e, 3):
-            s[e, f] = r[e, f]
-            for q in range(3):
-                s[e, f] += w[e, q] * hi[f, q] + we[e, j + q] * hj[f, q]
-    s[0, 3], s[1, 3], s[2, 3] = z[0] - rho, wrap_scalar(z[1] - bearing), wrap_scalar(z[2] - turn)
-    cholesky(s, 3)
-    nis = s[0, 3] ** 2 + s[1, 3] ** 2 + s[2, 3] ** 2
-    if not nis <= gate:
-        return float(nis)
-    solve(s, w, n, 3)
-    solve(s, we, k, 3)
-    add_combination(x, n, s[:3, 3], w)
-    x[2] = wrap_scalar(x[2])
-    add_combination(mean, k, s[:3, 3], we)
-    downdate(p, n, w, w, 3, 0)
-    subtract(cross, k, n, we, w, 3)
-    for a in range(k):
-        for b in range(k):
-            for e in range(3):
-                cov[a, b] -= we[e, a] * we[e, b]
-    return float(nis)

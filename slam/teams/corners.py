@@ -31,7 +31,7 @@ _FACING = 0.3  # cosine; a corner's bisector makes 45° with the free side of ei
 
 @dataclass(frozen=True, kw_only=True)
 class CornerConfig(Config):
-    """Which walls a corner lies on, and the error of visible ends. Chosen in apartments of the training seeds 0-249."""
+    """Which walls a corner lies on, and how far off ends are; chosen in apartments of training seeds 0-249."""
 
     off_m: Length = 0.05  # from the wall …
     beyond_m: Length = 0.15  # … and past what was seen of it
@@ -83,7 +83,7 @@ def _on_walls(account: Account, config: CornerConfig) -> Account:
     likely &= np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1)) < config.beyond_m
     points, jacobian, gate = account.points.copy(), np.eye(len(account.cov)), chi2_quantile(config.gate, 1)
     for u in range(n):
-        walls = [j for j in np.flatnonzero(likely[u]) if off[u, j] ** 2 < gate * _variance(account, u, j)]
+        walls = [j for j in np.flatnonzero(likely[u]) if off[u, j] ** 2 < gate * _variance(account, u, int(j))]
         if not walls:
             continue
         walls.sort(key=lambda j: abs(off[u, j]))

@@ -14,7 +14,8 @@ from slam.geometry import compose, inverse, wrap
 from slam.health.monitor import HealthConfig
 from slam.metrics.measures import nees_band, nees_pose
 from slam.motion import OdometryNoise, jacobians, move
-from slam.teams.centralised import JointEkf, expected_sighting, swap_robots
+from slam.teams.centralised import JointEkf
+from slam.teams.turns import expected_sighting, swap_robots
 from slam.types import LINE, Observations, Odometry
 from tests.slam.numerics import numerical_jacobian, random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
