@@ -163,7 +163,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         backend.update(mapped)
         self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._remember()
-        return self._info(self._coverage.update(backend.grid), true_pose)
+        return self._info(self.own_coverage.update(backend.grid), true_pose)
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step; see :mod:`mecanum_env.reward` for the reward."""
@@ -195,7 +195,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         backend.update(mapped)
         self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._steps += 1
-        coverage = self._coverage.update(backend.grid)
+        coverage = self.own_coverage.update(backend.grid)
         terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
         info = self._info(coverage, true_pose)
         info["reward_terms"] = terms
@@ -254,7 +254,12 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         Rows of ``(n, 4)``: lattice row, lattice column, class before, class now.
         """
-        return self._coverage.changes
+        return self.own_coverage.changes
+
+    @property
+    def own_coverage(self) -> Coverage:
+        """What the map of its belief covers."""
+        return self._coverage
 
     def episode_metrics(self) -> dict[str, float | int | None]:
         """Return the metrics of the episode so far (see :class:`mecanum_env.episode.EpisodeRecord`)."""

@@ -21,6 +21,7 @@ from slam.backend import Backend
 from slam.belief import Belief, Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
+from slam.teams.centralised import JointMember
 from slam.types import Array, Scan, Sighting
 
 __all__ = ["Member", "member_observation_space"]
@@ -96,8 +97,7 @@ class Member(ExploreEnv):
         self._shared_ground = first.truth.ground if first is not None and known else None
         self._start_error, self._step_limit, self.sightings = start_error, step_limit, ()
         self._set_up(plan, seed, None if first is None else first.truth.world.floor)
-        if first is not None and self.joint:
-            self._coverage = first.own_coverage  # of the one grid
+        self._shared_coverage = first.own_coverage if first is not None and self.joint else None  # of the one grid
         self._sighting_rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))
 
     def join(self, fleet: Fleet, ground: GroundTruth) -> None:
@@ -196,8 +196,9 @@ class Member(ExploreEnv):
 
     @property
     def own_coverage(self) -> Coverage:
-        """What its own map covers."""
-        return self._coverage
+        """What its own map covers, or of a joint belief that of all that is not apart."""
+        shared = self._shared_coverage
+        return self._coverage if shared is None or cast(JointMember, self.backend).apart else shared
 
     @property
     def grid(self) -> OccupancyGrid:

@@ -235,8 +235,9 @@ class Team:
     def _share(self, infos: Sequence[dict[str, Any]]) -> None:
         """Put what is the team's into the infos of the active robots."""
         active = [self.members[k] for k in self.active]
+        apart = self.joint is not None and any(member.apart for member in self.joint.members)
         if len(self.members) == 1 or self.joint is not None:
-            self.coverage_share = infos[-1]["coverage"]
+            self.coverage_share = max(info["coverage"] for info in infos) if apart else infos[-1]["coverage"]
         else:
             if self.coverage.each_step or self._steps % self._every == 0:
                 for member in active:

@@ -317,9 +317,9 @@ class JointMember(EkfSlam):
         walls = self._marks[landmarks, 0] == LINE
         order = np.argsort(np.concatenate([np.flatnonzero(~walls), np.flatnonzero(walls)]))
         at = self._points[landmarks]
-        added = self._apart.in_all(self._x[:3], at[~walls], at[walls])
         rows = np.concatenate([np.arange(3), (3 + 2 * order[:, None] + np.arange(2)).ravel()])
-        return added[np.ix_(rows, rows)]
+        added: Array = self._apart.in_all(self._x[:3], at[~walls], at[walls])[np.ix_(rows, rows)]
+        return added
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the NEES of this robot's pose against the truth ``(3,)``."""
