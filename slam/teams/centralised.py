@@ -33,7 +33,7 @@ from slam.types import LINE, Array, Observations, Odometry, Scan
 
 __all__ = ["JointEkf", "JointMember"]
 
-_MOST_TURN = 0.03  # [rad] 1σ of a start's heading; a robot that knows less maps alone at first
+_MOST_TURN = 0.01  # [rad] 1σ of a start's heading; a robot that knows less maps alone at first
 _SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
 _LAST_SEEN = 5  # column of marks
 
@@ -56,7 +56,7 @@ class JointEkf:
     Notes
     -----
     All of it is in one frame, that of the start poses. A robot but the first whose heading at the start is not
-    known to within 0.03 rad maps alone (``apart``) until its map and the others' say where it started: its
+    known to within 0.01 rad maps alone (``apart``) until its map and the others' say where it started: its
     landmarks have ids of its own until then (:mod:`slam.teams.apart`). Shared are the landmarks, every covariance
     and one grid,
     into which all scans are drawn: who follows it by ``take_changes`` must be one for all robots. Each robot has
