@@ -5,5 +5,6 @@ another's, from candidates by ``constellation`` that ``contradiction`` rules out
 it by one robot seeing another. ``corners`` puts an account's corners on its walls. ``fusion`` makes one map of
 accounts, from scratch each time and never fed back, by the Gaussian in ``joint``; ``frames`` takes poses, points
 and walls from one frame into another. ``merged_grid`` is a map of cells of one's own and others' together;
-``centralised`` is one filter over all robots.
+``centralised`` is one filter over all robots, whose turns the kernels of ``turns`` pass on; ``apart`` is what one
+keeps that maps alone until its start is known.
 """

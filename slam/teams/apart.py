@@ -30,7 +30,7 @@ EXACT_COV = 1e-8 * np.eye(3)
 """Of the start of a robot that maps alone."""
 
 _LOOSER = 100.0  # in covariance
-_EVERY = 50  # scans between two looks for the others
+_EVERY, _FIRST = 50, 10  # scans between two looks for the others, and before the first: some start side by side
 
 
 class Start(NamedTuple):
@@ -77,7 +77,7 @@ class Apart:
     @property
     def due(self) -> bool:
         """Whether it is time to look for the others."""
-        return self.scans % _EVERY == 0
+        return self.scans % _EVERY == _FIRST
 
     def look(self, others: Account, own: Account, grids: tuple[OccupancyGrid, OccupancyGrid]) -> Start | None:
         """Return where the robot started by what its map and the others' have in common, if that can be told."""

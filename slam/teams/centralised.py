@@ -33,7 +33,7 @@ from slam.types import LINE, Array, Observations, Odometry, Scan
 
 __all__ = ["JointEkf", "JointMember"]
 
-_MOST_TURN = 0.01  # [rad] 1σ of a start's heading; a robot that knows less maps alone at first
+_KNOWN = (0.05, 0.05, 0.01)  # [m, m, rad] 1σ of a start; a robot that knows less of it maps alone at first
 _SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
 _LAST_SEEN = 5  # column of marks
 
@@ -55,12 +55,12 @@ class JointEkf:
 
     Notes
     -----
-    All of it is in one frame, that of the start poses. A robot but the first whose heading at the start is not
-    known to within 0.01 rad maps alone (``apart``) until its map and the others' say where it started: its
-    landmarks have ids of its own until then (:mod:`slam.teams.apart`). Shared are the landmarks, every covariance
-    and one grid,
-    into which all scans are drawn: who follows it by ``take_changes`` must be one for all robots. Each robot has
-    its own wheels, extractor, health, key scans and count of updates: what "lately seen" means is its own affair.
+    All of it is in one frame, that of the start poses. A robot but the first whose start is not known to within
+    0.05 m and 0.01 rad maps alone (``apart``) until its map and the others' say where it started: its landmarks
+    have ids of its own until then (:mod:`slam.teams.apart`). Shared are the landmarks, every covariance and one
+    grid, into which all scans are drawn: who follows it by ``take_changes`` must be one for all robots. Each robot
+    has its own wheels, extractor, health, key scans and count of updates: what "lately seen" means is its own
+    affair.
     """
 
     def __init__(self, robots: int, config: EkfConfig | None = None) -> None:
@@ -86,7 +86,7 @@ class JointEkf:
         others = np.zeros((3 * (many - 1), 3 * (many - 1)))
         for i, member in enumerate(self.members[1:]):
             others[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = member._start_cov
-            if member._start_cov[2, 2] > _MOST_TURN**2:
+            if np.any(np.diag(member._start_cov) > np.square(_KNOWN)):
                 apart = Apart(start=Start(at[i + 1], member._start_cov))
                 member._begin_at(at[i + 1], EXACT_COV, seed)
                 member._apart = apart

@@ -292,20 +292,23 @@ def test_members_are_environments_to_whoever_reads_them() -> None:
 
 def test_a_joint_belief_is_one_map_and_all_poses() -> None:
     errors = []
-    for seed in range(6):
-        starts = {"belief": "joint", "start_sigma_m": 0.1, "start_sigma_rad": 0.01}
+    for seed in range(4):
+        starts = {"belief": "joint", "start_sigma_m": 0.1, "start_sigma_rad": 0.05}
         team = Team(3, rooms="apartment", team=starts, config=ALL)
         team.reset(seed=seed)
-        _drive(team, 30)
         assert team.joint is not None
+        assert [member.apart for member in team.joint.members] == [False, True, True]
+        assert len({id(m.own_coverage) for m in team.members}) == 3
+        _drive(team, 70)
+        assert not any(member.apart for member in team.joint.members)
         assert len({id(m.belief.grid) for m in team.members}) == 1
         assert team.coverage_share == max(m.truth.record.coverage[-1] for m in team.members)
         truth = np.array([m.truth.pose for m in team.members])
         assert np.allclose(team.joint.poses, [m.belief.pose for m in team.members])
         errors.append(np.abs(team.joint.poses - truth)[:, :2].max())
         assert [[mate.robot for mate in m.belief.teammates] for m in team.members] == [[1, 2], [0, 2], [0, 1]]
-    # They see each other: their starts are soon known better than they were told.
-    assert np.median(errors) < 0.05
+    # They see the same walls: their starts are soon known better than they were told.
+    assert np.median(errors) < 0.02
 
 
 def test_a_joint_belief_needs_to_hear_all() -> None:
