@@ -35,7 +35,7 @@ class ConstellationConfig(Config):
     length_m: Length = 0.12  # by which two pairs may differ in length
     turn_rad: Angle = 0.4  # between the directions of two corners that are the same
     near_m: Length = 0.25  # of corners that count for a candidate
-    places: Count = 60  # different ones by the corners alone, the best …
+    places: Count = 200  # different ones by the corners alone, the best …
     count: Count = 15  # … and of these, by walls too, candidates that are looked at more closely
     tolerances_m: Annotated[tuple[float, ...], Within("[0.001, 1000]")] = (
         0.25,
