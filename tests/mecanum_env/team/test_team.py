@@ -302,7 +302,7 @@ def test_a_joint_belief_is_one_map_and_all_poses() -> None:
         _drive(team, 70)
         assert not any(member.apart for member in team.joint.members)
         assert len({id(m.belief.grid) for m in team.members}) == 1
-        assert team.coverage_share == team.members[-1].truth.record.coverage[-1]  # who draws last into the one grid
+        assert team.coverage_share == team.members[-1].truth.record.coverage[-1]  # who draws last into it
         truth = np.array([m.truth.pose for m in team.members])
         assert np.allclose(team.joint.poses, [m.belief.pose for m in team.members])
         errors.append(np.abs(team.joint.poses - truth)[:, :2].max())
