@@ -18,4 +18,4 @@ def test_a_step_is_measured_for_each_number_of_robots(capsys: pytest.CaptureFixt
     assert main(argv) == 0
     assert "mean ms a robot" in capsys.readouterr().out
     assert main(["study", "team-cost", "--robots", "0"]) == 2
-    assert "robots must be a whole number in [1, 64]" in capsys.readouterr().err
+    assert "must be whole numbers in 1 … 64" in capsys.readouterr().err
