@@ -76,8 +76,12 @@ class Chooser(Tour):
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action on the way to what was chosen, as gentle as the floor was found slippery."""
         self._wheels.look(observation, belief)
-        self._follower.config = self.config.slip.eased(self.config.control, self._wheels.share)
+        self._follower.config = self._control()
         return super().act(observation, belief)
+
+    def _control(self) -> ControlConfig:
+        """Return how to drive next."""
+        return self.config.slip.eased(self.config.control, self._wheels.share)
 
     def due(self, belief: Belief) -> bool:
         """Whether the next :meth:`act` will ask for a choice."""
