@@ -1,13 +1,13 @@
 """Active SLAM at the speed of the fastest: it looks before it goes, and slows down where nothing tells its place.
 
 Where to go a trained policy says, as for :mod:`agents.ppo_frontier`. What care costs is time, so it is taken where
-it brings most. What a map gets wrong at its very beginning it never loses. The start pose is known by definition; a
-robot that drives off before its landmarks are settled has its wheels alone to tell where it was when it first saw
-them, and every later landmark inherits that. So it looks before it goes, for as long as looking pays.
+it brings most. What a map gets wrong at its very beginning it never loses. The start pose is known by definition;
+a robot that drives off before its landmarks are settled has its wheels alone to tell where it was when it first
+saw them, and every later landmark inherits that. So it looks before it goes, for as long as looking pays.
 
-On the way nearly all error is made on the few metres on which nothing in sight tells the place along a corridor, or
-what is in sight cannot be told apart. There the wheels alone count. What they lose is noise of each step in
-proportion to its length, so that over a way it grows with the root of the speed: that is where it drives slowly.
+Of what is added on the way most is made on the few metres where nothing in sight tells the place along a corridor.
+There the wheels alone count. What they lose is noise of each step in proportion to its length, so that over a way
+it grows with the root of the speed: that is where it drives slowly.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig
 from agents.driving.grip import GentleFollower
+from agents.learned.chooser import SlipConfig
 from agents.ppo_frontier import PpoFrontier, PpoFrontierConfig
-from agents.view_points.foresight import anchoring, marks_of, spread_m
+from agents.view_points.anchoring import anchoring, marks_of, spread_m
 from agents.view_points.sightings import SensorModel, expected_sightings
 from slam.belief import Belief
 from slam.settings import Config, Count, Duration, Length, NotNegative, Positive, Rate, argument, from_mapping
@@ -36,12 +37,12 @@ __all__ = ["ActiveConfig", "ActiveSlam", "DriftConfig", "LookConfig"]
 class LookConfig(Config):
     """How long to look before the first drive."""
 
-    at_most_s: Duration = 4.0
+    at_most_s: Duration = 5.0
     blind_s: Duration = 0.5  # … where nothing is seen that could be a landmark
     step_s: Duration = 0.5  # what looking on for so long would bring is asked
     most: Count = 24  # landmarks that are counted
     lever_m: Length = 4.0  # an error of the heading counts as what it moves at this distance
-    worth_s_per_m: NotNegative = 20000.0  # time that a metre less of the spread is worth: 20 s a millimetre
+    worth_s_per_m: NotNegative = 30000.0  # time that a metre less of the spread is worth: 30 s a millimetre
     sensor: SensorModel = field(default_factory=SensorModel)
 
 
@@ -49,7 +50,7 @@ class LookConfig(Config):
 class DriftConfig(Config):
     """How fast the position may grow unsure."""
 
-    rate_m_rt_s: Positive = 0.0017  # 1σ along its least known axis, a random walk: so much in the root of a second
+    rate_m_rt_s: Positive = 0.0018  # 1σ along its least known axis, a random walk: so much in the root of a second
     steps: Count = 3  # over which it is measured
     slowest_m_s: Rate = 0.1
 
@@ -60,6 +61,8 @@ class ActiveConfig(PpoFrontierConfig):
 
     look: LookConfig = field(default_factory=LookConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
+    # In place of the policy's.
+    slip: SlipConfig = field(default_factory=lambda: SlipConfig(lateral_m_s2=1.2))
 
 
 class ActiveSlam(PpoFrontier):
@@ -70,6 +73,7 @@ class ActiveSlam(PpoFrontier):
             settings = from_mapping(ActiveConfig, config)
         self._look_config, self._drift = settings.look, settings.drift
         super().__init__(settings, **body)
+        self.config = replace(self.config, slip=settings.slip)
 
     def _forget(self) -> None:
         super()._forget()
@@ -81,7 +85,7 @@ class ActiveSlam(PpoFrontier):
         self._lately: deque[tuple[float, float, float]] = deque(maxlen=self._drift.steps + 1)
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
-        """Return the next action: looking first, then on the way to the goal, slowly where the place grows unsure."""
+        """Return the next action: looking first, then to the goal, slowly where the place grows unsure."""
         if self._looked_s is not None:
             if self._looks_on(belief):
                 return self._look(observation, belief)
@@ -106,7 +110,7 @@ class ActiveSlam(PpoFrontier):
         return np.zeros(3, dtype=np.float32)
 
     def _looks_on(self, belief: Belief) -> bool:
-        """Whether another look from the known start pays (:func:`agents.view_points.foresight.anchoring`).
+        """Whether another look from the known start pays (:func:`agents.view_points.anchoring.anchoring`).
 
         The landmarks' error relative to the start falls with the root of the number of looks.
         """
@@ -132,7 +136,10 @@ class ActiveSlam(PpoFrontier):
 
     def _measure(self, belief: Belief) -> None:
         """Take down where the robot is, and how unsure that is along the least known axis."""
-        pose, variance = np.asarray(belief.pose), float(np.linalg.eigvalsh(np.asarray(belief.pose_cov)[:2, :2])[-1])
+        pose, variance = (
+            np.asarray(belief.pose),
+            float(np.linalg.eigvalsh(np.asarray(belief.pose_cov)[:2, :2])[-1]),
+        )
         self._lately.append((float(pose[0]), float(pose[1]), variance))
 
     def _control(self) -> ControlConfig:

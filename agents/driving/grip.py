@@ -17,7 +17,7 @@ import numpy as np
 from agents.driving.control import ControlConfig, PathFollower
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
-from slam.motion import OdometryNoise, twist_between
+from slam.motion import twist_between
 from slam.types import Array
 
 __all__ = ["GentleFollower", "WheelWatch", "eased"]
@@ -55,12 +55,6 @@ class WheelWatch:
     def share(self) -> float:
         """1σ of a linear component of the twist, as a share of the wheels' speed."""
         return math.sqrt(self._missed / self._driven)
-
-    def noise(self) -> OdometryNoise:
-        """Return V with the share that was learnt."""
-        return OdometryNoise(
-            lever_m=self._lever, speed_share=self.share, turn_share_rad_m=self.share / self._lever
-        )
 
     def look(self, observation: Mapping[str, Any] | None, belief: Belief) -> None:
         """Take in one step: the observation's ``twist``, where there is one, and where the belief has moved."""

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.explorer import Candidates
-from agents.view_points.foresight import marks_of
+from agents.view_points.anchoring import marks_of
 from agents.view_points.gain import expected_area
 from agents.view_points.sightings import SensorModel, expected_sightings
 from agents.ways.cost_map import CostMap
