@@ -83,7 +83,7 @@ def test_suite_actions(name, preset):
     belief = belief_of(half_known(), (1.5, 2.0, 0.4))
     lidar = LIDAR_PRESETS[preset]
     config = {"frontiers": SHORT} if name not in ("ppo", "random") else None
-    if name in ("ppo-frontier", "team-frontier"):
+    if name in ("active", "ppo-frontier", "team-frontier"):
         config = {"driver": config}
     agent = ready(name, belief, robot=preset, lidar=preset, config=config)
     blank = {"scan": np.zeros(lidar.beams, np.float32)}
