@@ -45,7 +45,7 @@ GROUP = "mecanum_slam.agents"
 
 _POLICIES = {
     "mecanum-slam choice policy 1": "ppo-frontier",
-    "mecanum-slam drive policy 1": "ppo",
+    "mecanum-slam drive policy 2": "ppo",
     "mecanum-slam station policy 2": "learned-tour",
 }
 """The formats of trained policies, and the agents that read them."""

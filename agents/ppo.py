@@ -1,4 +1,4 @@
-"""``ppo``: a trained policy that drives, from the observation straight to the body twist.
+"""``ppo``: a trained policy that drives, from the map and the observation straight to the body twist.
 
 It was trained for the youBot and its lidar; another body's twists are fractions of another's limits.
 """
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
-from agents.learned.drive_network import BEAMS, RANGE_M, DriveNetwork, Plan, PlanSettings
+from agents.learned.drive_memory import Plan, PlanSettings
+from agents.learned.drive_network import BEAMS, RANGE_M, DriveNetwork
 from agents.learned.policy_files import read_policy
-from mecanum_env.observation import draw_maps
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
@@ -26,7 +26,7 @@ from slam.types import Array
 
 __all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
 
-FORMAT = "mecanum-slam drive policy 1"
+FORMAT = "mecanum-slam drive policy 2"
 SHIPPED = Path(__file__).parent / "policies" / "ppo.safetensors"
 
 
@@ -36,6 +36,7 @@ class PpoConfig(Config):
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
     patience_s: Duration = 30.0  # with nothing new in sight, until the place is held for explored
+    hopeful_s: Duration = 300.0  # the same while it is on the way to what is rather a goal than none
     new_m2: Positive = 0.3  # what counts for new
 
 
@@ -50,7 +51,7 @@ def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
 
 
 class Ppo(Agent):
-    """Sends what the policy's network says, until nothing new has come in sight for a while."""
+    """Sends what the policy's network says, until nothing new has come in sight and nothing more is likely to."""
 
     config_type = PpoConfig
 
@@ -61,19 +62,21 @@ class Ppo(Agent):
         self._forget()
 
     def _forget(self) -> None:
+        self._memory = self._network.memory(step_s=self._step_s)
+        self._hopes = True
         self._sent = np.zeros(3, np.float32)
         self._time = self._news_at = 0.0
         self._known_m2 = 0.0
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
-        """Start an episode; nothing is drawn at random, and of the past only the last action is known."""
+        """Start an episode with nothing remembered; nothing is drawn at random."""
         super().reset(belief, seed)
         self._forget()
         self._status = "driving"
 
     def choose(self, belief: Belief) -> Goal:
         """Return the way that the network's planning layer sees on the belief's maps."""
-        return _goal(self._network.plan(draw_maps(belief.grid, belief.pose)), belief)
+        return _goal(self._memory.way(belief), belief)
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the network's action; what the observation lacks is drawn from the belief."""
@@ -81,34 +84,35 @@ class Ppo(Agent):
             self._sent, self._goal = np.zeros(3, np.float32), None
             return self._sent.copy()
         seen = self._complete(observation, belief)
-        way = self._network.plan(seen)
-        self._goal = _goal(way, belief)
+        way = self._memory.way(belief)
+        self._goal, self._hopes = _goal(way, belief), way.likely
         self._sent = self._network.twist(self._network.inputs(seen, way))
         return self._sent.copy()
 
     def _done(self, belief: Belief) -> bool:
-        """Whether nothing new has been seen for long; looked after once a second."""
+        """Whether nothing new has been seen for long, and nothing is hoped for; looked after once a second."""
         step = round(self._time / self._step_s)
         self._time += self._step_s
         if step % max(round(1.0 / self._step_s), 1) == 0:
             known = float(np.count_nonzero(belief.grid.classes() == FREE)) * belief.grid.resolution**2
             if known >= self._known_m2 + self.config.new_m2:
                 self._known_m2, self._news_at = known, self._time
-            self._status = "covered" if self._time - self._news_at > self.config.patience_s else "driving"
+            waited, config = self._time - self._news_at, self.config
+            patience = config.hopeful_s if self._hopes else config.patience_s
+            self._status = "covered" if waited > patience else "driving"
         return self.ended
 
     def _complete(self, observation: Mapping[str, Any] | None, belief: Belief) -> dict[str, Any]:
         """Return an observation in which all is there, and the scan is one of the lidar that was trained with."""
         given = dict(observation or {})
-        seen: dict[str, Any] = {} if "map_local" in given else draw_maps(belief.grid, belief.pose)
-        seen |= {
+        seen: dict[str, Any] = {
             "scan": np.ones(BEAMS, np.float32), "landmarks": np.zeros((1, 6), np.float32),
             "pose_cov": np.asarray(belief.pose_cov)[np.triu_indices(3)].astype(np.float32), "twist": self._sent,
             "progress": np.zeros(2, np.float32),
         }  # fmt: skip
         if "scan" in given:
             given["scan"] = self._scan(np.asarray(given["scan"], np.float32))
-        return seen | given if "map_local" in given else seen | {"scan": given.get("scan", seen["scan"])}
+        return seen | given
 
     def _scan(self, scan: NDArray[np.float32]) -> NDArray[np.float32]:
         lidar = self._lidar

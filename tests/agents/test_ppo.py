@@ -1,4 +1,4 @@
-"""The end-to-end policy without PyTorch: the planning layer, the pixel's size, the agent."""
+"""The end-to-end policy without PyTorch: the planning layer, the agent."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from scipy.sparse.csgraph import dijkstra
 
 import agents
 import mecanum_env
-from agents.learned.drive_network import DriveNetwork, PlanSettings, pixel_size
+from agents.learned.drive_network import DriveNetwork
 from agents.learned.drive_plan import EDGES, descend, distances, gradient, node_prices
 from agents.ppo import SHIPPED
-from mecanum_env.observation import draw_maps, map_frame
 
 assert mecanum_env
 
@@ -84,21 +83,6 @@ def test_prices_of_nodes_are_halved_between_neighbours():
     assert out[2, 0, 1] == pytest.approx(0.5) and out[3, 0, 1] == pytest.approx(0.4 * math.sqrt(2.0))
 
 
-@pytest.mark.parametrize("rooms", ["apartment", "rectangular"])
-def test_the_two_maps_tell_the_pixel(rooms):
-    env = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms)
-    for seed in range(3):
-        observation, _ = env.reset(seed=seed)
-        for _ in range(8):
-            observation, *_ = env.step(np.array([0.3, 0.1, 0.4], np.float32))
-        grid = env.unwrapped.backend.grid
-        pixel = pixel_size(observation["map_local"], observation["map_global"], observation["pose"])
-        assert pixel == pytest.approx(map_frame(grid)[2] / 32.0)
-        drawn = draw_maps(grid, env.unwrapped.belief.pose)
-        for key, value in drawn.items():
-            np.testing.assert_array_equal(value, observation[key])
-
-
 def test_the_agent_drives_and_keeps_to_the_network():
     env = gymnasium.make("mecanum_env/Explore-v0", rooms="rectangular")
     observation, info = env.reset(seed=3)
@@ -152,5 +136,5 @@ def test_files_that_are_no_policy_are_named(tmp_path):
     path.with_suffix(".json").write_text(json.dumps(about | {"format": "another"}))
     with pytest.raises(ValueError, match="format is not"):
         agents.make("ppo", config={"policy": str(path)})
-    with pytest.raises(ValueError, match=r"weight local.0.bias is missing"):
-        DriveNetwork({}, PlanSettings())
+    with pytest.raises(ValueError, match=r"weight map.0.bias is missing"):
+        DriveNetwork({})

@@ -126,7 +126,7 @@ class FolderRun:
     def _note_trial(
         self, at: dict[str, Any], result: dict[str, Any], cost: float, save: Callable[[], None]
     ) -> None:
-        """Add a trial to the curve, and ``save`` the weights where none in this stage cost less so far."""
+        """Add a trial to the curve; ``save`` the weights, of equals the last, if none in this stage cost less."""
         path = self.out / "curve.jsonl"
         lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         # A run killed after a trial repeats it: one line of it is enough.
@@ -138,7 +138,7 @@ class FolderRun:
         self._note({"steps": self._progress["steps"], **at, **noted})
         stage, best = at.get("stage", ""), self._progress["best"]
         # Seconds of a rehearsal are not those of the whole environment.
-        if best is None or self._progress["best_in"] != stage or cost < best:
+        if best is None or self._progress["best_in"] != stage or cost <= best:
             save()
             self._keep(best=cost, best_in=stage)
 

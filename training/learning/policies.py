@@ -16,6 +16,7 @@ from agents import ppo, ppo_frontier
 from agents.learned.choice import CANDIDATE, STATE
 from agents.learned.choice_network import apart
 from agents.learned.chooser import ChooserConfig
+from agents.learned.drive_memory import PlanSettings
 from agents.learned.policy_files import write_policy
 from slam.files import read_json
 from slam.settings import from_mapping, to_mapping
@@ -111,7 +112,7 @@ def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: A
     config = progress["config"]
     described = {
         "format": ppo.FORMAT, "uncertainty": config["uncertainty"],
-        "planning": {"goal_m": config["goal_m"], "turn_m": config["turn_m"]},
+        "planning": {name: config[name] for name in PlanSettings._fields},
         **_training(progress, curve),
     }  # fmt: skip
     write_policy(target, load_file(run / "best.safetensors"), described)

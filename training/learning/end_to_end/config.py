@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from agents.learned.drive_network import PlanSettings
+from agents.learned.drive_memory import PlanSettings
 from mecanum_env.config import NOISE_PRESETS
 from slam.settings import Config, Duration, Finite, Gap, Length, OneOf, PositiveShare, Seed, Within
 from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
@@ -17,7 +17,7 @@ __all__ = ["DriveConfig", "DriveLearningConfig", "DriveLessonsConfig", "DriveWor
 class DriveWorldConfig(RoomsConfig):
     """Where driving is trained; the rewards are PPO's."""
 
-    rooms: tuple[str, ...] = ("apartment", "rectangular")
+    rooms: tuple[str, ...] = ("apartment", "rectangular", "corridors", "maze", "cave")
     noise: str = "nominal"
     area_1_m2: Finite = 0.05
     time_1_s: Finite = -0.02
@@ -60,8 +60,9 @@ class DriveConfig(Config):
     policy: Annotated[str, OneOf(("drive",))] = "drive"  # what tells these files from those of ppo-frontier
     seed: Seed = 1
     uncertainty: bool = True  # whether the covariance and the landmarks are looked at
-    goal_m: Length = 3.0  # of PlanSettings
-    turn_m: Gap = 0.4
+    goal_m: Length = 8.0  # of PlanSettings
+    keep_m: Gap = 1.5
+    stall_m: Gap = 4.0
     world: DriveWorldConfig = field(default_factory=DriveWorldConfig)
     lessons: DriveLessonsConfig = field(default_factory=DriveLessonsConfig)
     learning: DriveLearningConfig = field(default_factory=DriveLearningConfig)
@@ -71,4 +72,4 @@ class DriveConfig(Config):
     @property
     def planning(self) -> PlanSettings:
         """What the planning layer is told."""
-        return PlanSettings(goal_m=self.goal_m, turn_m=self.turn_m)
+        return PlanSettings(goal_m=self.goal_m, keep_m=self.keep_m, stall_m=self.stall_m)

@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from agents.learned.drive_network import sectors
-from mecanum_env.observation import MAP_SIZE
 from training.learning.end_to_end.lessons import LOG_PRICE, NO_WAY
 from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork, shortest, step_prices
 
@@ -22,8 +21,7 @@ __all__ = ["Lessons", "control_batch", "learn_control", "learn_maps", "map_losse
 Lessons = Mapping[str, NDArray[Any]]
 
 _GOAL_WEIGHT = 5.0  # of a pixel that is a goal: few are
-_SMALL = 6  # pixels at the rim of a map that is called small
-_MARGIN = 6  # more than the convolutions look beyond a pixel
+_WAYS = 4
 _MIRRORED_NUMBERS = [*range(1, 20, 2), 33, 34]
 
 
@@ -31,16 +29,11 @@ def learn_maps(
     network: PlanNetwork, lessons: Lessons, *, steps: int, batch: int, rate: float, rng: np.random.Generator
 ) -> Iterator[dict[str, float]]:
     """Train the map network; what is said every hundred steps are the means of the losses since."""
-    n = len(lessons["pose"])
-    # Batches of maps that fill less of the image cost less time: those are taken together.
-    small = _rims(lessons["map_global"]) >= _SMALL
-    groups = np.flatnonzero(~small), np.flatnonzero(small)
 
     def losses(step: int) -> dict[str, Tensor]:
-        group = groups[int(rng.random() < len(groups[1]) / n)]
-        rows = np.sort(rng.choice(group, size=batch))
+        rows = np.sort(rng.integers(len(lessons["map"]), size=batch))
         found = map_losses(network, lessons, rows, mirrored=step % 2 == 1)
-        found["total"] = found["price"] + 10.0 * (found["goal_local"] + found["goal_global"]) + found["travel"]
+        found["total"] = found["price"] + 10.0 * found["goal"] + found["travel"]
         return found
 
     return _descend(network, losses, steps=steps, rate=rate, every=100)
@@ -49,31 +42,22 @@ def learn_maps(
 def map_losses(
     network: PlanNetwork, lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool
 ) -> dict[str, Tensor]:
-    """Return the losses on some lessons, as they are or with left and right exchanged."""
-    near, far, pose = lessons["map_local"][rows], lessons["map_global"][rows], lessons["pose"][rows].copy()
-    price, travel = lessons["price"][rows], lessons["travel"][rows]
-    goal_near, goal_far = (np.unpackbits(lessons[f"goal_{name}"][rows], axis=-1) for name in ("local", "global"))
+    """Return the losses on some lessons, as they are or mirrored."""
+    maps, price, travel = (lessons[key][rows] for key in ("map", "price", "travel"))
+    goal, start = np.unpackbits(lessons["goal"][rows], axis=-1), lessons["start"][rows].copy()
     if mirrored:
-        near, price, goal_near = near[..., ::-1], price[..., ::-1], goal_near[..., ::-1]
-        far, travel, goal_far = far[..., ::-1, :], travel[..., ::-1, :], goal_far[..., ::-1, :]
-        pose[:, 1] *= -1.0
-    # Local maps say more each: every other one is looked at.
-    near, price, goal_near = near[::2], price[::2], goal_near[::2]
-    rim = int(_rims(far).min())
-    middle = (..., slice(rim, MAP_SIZE - rim), slice(rim, MAP_SIZE - rim))
-    far, travel, goal_far = far[middle], travel[middle], goal_far[middle]
-    said, goal, steps, goal_overview = network(_tensor(near), _tensor(far))
-    prices = step_prices(steps, torch.from_numpy(lessons["pixel"][rows]))
-    start = torch.full(travel.shape, 1e6)
-    at = np.floor((pose[:, :2] + 1.0) * 0.5 * MAP_SIZE).astype(np.int64).clip(0, MAP_SIZE - 1)
-    start[np.arange(len(rows)), MAP_SIZE - 1 - rim - at[:, 1], at[:, 0] - rim] = 0.0
-    ways = _tensor(travel.astype(np.float32))
-    told = ways < 0.9 * NO_WAY
-    error = torch.log1p(shortest(prices, start)[told].clamp(max=1e5)) - torch.log1p(ways[told])
+        maps, price, travel, goal = (values[..., ::-1] for values in (maps, price, travel, goal))
+        start[:, 1] = maps.shape[-1] - 1 - start[:, 1]
+    said, odds = network(_tensor(maps))
+    # Distances take longer than all the rest: they are asked of every fourth.
+    ways, start, told = _tensor(travel[::_WAYS].astype(np.float32)), start[::_WAYS], said[::_WAYS]
+    ends = torch.full(ways.shape, 1e6)
+    ends[np.arange(len(start)), start[:, 0], start[:, 1]] = 0.0
+    reached = ways < 0.9 * NO_WAY
+    error = torch.log1p(shortest(step_prices(told), ends)[reached].clamp(max=1e5)) - torch.log1p(ways[reached])
     return {
         "price": functional.smooth_l1_loss(said, _tensor(price.astype(np.float32)) / LOG_PRICE, beta=0.3),
-        "goal_local": _goal_loss(goal, goal_near),
-        "goal_global": _goal_loss(goal_overview, goal_far),
+        "goal": _goal_loss(odds, goal),
         "travel": functional.smooth_l1_loss(error, torch.zeros_like(error), beta=0.2),
     }
 
@@ -102,14 +86,6 @@ def control_batch(lessons: Lessons, rows: NDArray[np.int64], *, mirrored: bool) 
         numbers[:, _MIRRORED_NUMBERS] *= -1.0
         wanted[:, 1:] *= -1.0
     return _tensor(sectors(scan.astype(np.float32))), _tensor(landmarks), _tensor(numbers), _tensor(wanted)
-
-
-def _rims(maps: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return for each map how many pixels at its rim, all around, are far from all that is known."""
-    known = maps[:, 1] > 0
-    used = np.asarray(known.any(axis=1) | known.any(axis=2))
-    first, last = used.argmax(axis=1), used[:, ::-1].argmax(axis=1)
-    return np.asarray(np.maximum(np.minimum(first, last) - _MARGIN, 0))
 
 
 def _goal_loss(logit: Tensor, goal: NDArray[np.uint8]) -> Tensor:

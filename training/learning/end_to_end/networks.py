@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.autograd import Function
+from torch.nn import functional
 
-from agents.learned.drive_network import LOG_PRICES, NUMBERS, SECTORS, STEP_LENGTHS
-from agents.learned.drive_plan import distances, gradient
+from agents.learned.drive_memory import CELL_M, CHANNELS, LOG_PRICES
+from agents.learned.drive_network import NUMBERS, SECTORS
+from agents.learned.drive_plan import EDGES, distances, gradient
 
 __all__ = ["ControlNetwork", "PlanNetwork", "shortest", "step_prices"]
+
+_OUTSIDE = 1e6  # price beyond the map
 
 
 class _Shortest(Function):
@@ -38,42 +43,40 @@ def shortest(prices: Tensor, goal: Tensor) -> Tensor:
     return cast("Tensor", _Shortest.apply(prices, goal))  # type: ignore[no-untyped-call]
 
 
-def step_prices(logs: Tensor, pixel: Tensor) -> Tensor:
-    """Return the prices of the steps ``(b, 4, n, m)``, of log prices a metre and the pixels' sides [m]."""
-    lengths = torch.from_numpy(STEP_LENGTHS)[None]
-    return pixel.view(-1, 1, 1, 1) * lengths * torch.exp(logs.clamp(*LOG_PRICES))
+def step_prices(logs: Tensor) -> Tensor:
+    """Return the prices of the steps ``(b, 4, n, m)``, of log prices a metre at the pixels ``(b, n, m)``.
+
+    As :func:`agents.learned.drive_plan.node_prices` has them.
+    """
+    price = torch.exp(logs.clamp(*LOG_PRICES))
+    rows, cols = price.shape[1:]
+    padded = functional.pad(price, (1, 1, 0, 1), value=_OUTSIDE)
+    steps = []
+    for row, col in EDGES:
+        there = padded[:, row : row + rows, col + 1 : col + 1 + cols]
+        steps.append(0.5 * CELL_M * math.hypot(row, col) * (price + there))
+    return torch.stack(steps, dim=1)
 
 
 class PlanNetwork(nn.Module):
-    """What the two maps say of prices and goals.
-
-    Of ``map_local``: the log price of a metre and the log odds of a goal, of each pixel. Of ``map_global``: the
-    log price of a metre along each of the four steps that a pixel owns, and the log odds of a goal.
-    """
+    """What the map says of each pixel: the log price of a metre there, and the log odds of a goal."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.local, self.overview = _stack(2), _stack(5)
+        width = 8
+        self.map = nn.Sequential(
+            nn.Conv2d(CHANNELS, width, 5, padding=2), nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=2, dilation=2), nn.ReLU(),
+            nn.Conv2d(width, width, 3, padding=4, dilation=4), nn.ReLU(),
+            nn.Conv2d(width, 2, 1),
+        )  # fmt: skip
 
-    def forward(self, map_local: Tensor, map_global: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return local prices ``(b, n, m)`` and goals, global prices ``(b, 4, n, m)`` and goals, as logarithms."""
-        near, far = self.local(_scaled(map_local)), self.overview(_scaled(map_global))
-        return near[:, 0], near[:, 1], far[:, :4], far[:, 4]
-
-
-def _scaled(maps: Tensor) -> Tensor:
-    # Twice as fast as the usual order on processors.
-    return (maps.float() / 128.0 - 1.0).contiguous(memory_format=torch.channels_last)
-
-
-def _stack(out: int) -> nn.Sequential:
-    width = 8
-    return nn.Sequential(
-        nn.Conv2d(3, width, 5, padding=2), nn.ReLU(),
-        nn.Conv2d(width, width, 3, padding=1), nn.ReLU(),
-        nn.Conv2d(width, width, 3, padding=2, dilation=2), nn.ReLU(),
-        nn.Conv2d(width, out, 1),
-    )  # fmt: skip
+    def forward(self, maps: Tensor) -> tuple[Tensor, Tensor]:
+        """Return prices ``(b, n, m)`` and goals, as logarithms, of maps ``(b, CHANNELS, n, m)`` of bytes."""
+        # Twice as fast as the usual order on processors.
+        said = self.map((maps.float() / 128.0 - 1.0).contiguous(memory_format=torch.channels_last))
+        return said[:, 0], said[:, 1]
 
 
 class ControlNetwork(nn.Module):

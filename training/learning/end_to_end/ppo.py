@@ -43,6 +43,7 @@ class DriveWorld(Families):
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode in rooms of the next draw."""
         observation, info = super().reset(seed=seed, options=options)
+        self._memory = self._network.memory(step_s=self.env.config.step_s)
         return self._inputs(observation), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -52,7 +53,7 @@ class DriveWorld(Families):
         return self._inputs(observation), reward, terminated, late and not terminated, info
 
     def _inputs(self, observation: Any) -> dict[str, NDArray[np.float32]]:
-        return self._network.inputs(observation, self._network.plan(observation))._asdict()
+        return self._network.inputs(observation, self._memory.way(self.env.belief))._asdict()
 
 
 class DrivePolicy(MultiInputActorCriticPolicy):

@@ -13,7 +13,7 @@ import agents
 from agents.learned.drive_network import DriveNetwork
 from mecanum_env.env import ExploreEnv
 from training.learning.end_to_end.config import DriveConfig
-from training.learning.end_to_end.lessons import FollowingTeacher, map_lesson
+from training.learning.end_to_end.lessons import FollowingTeacher, map_lessons
 
 __all__ = ["Episode", "Outcome", "give_lessons", "guided_lessons", "judge"]
 
@@ -23,7 +23,6 @@ _SEGMENT_S = (1.0, 5.0)  # how long one of the two drives
 _SHAKE = (0.4, 0.4, 1.0)  # how far a disturbance goes, of the limits
 _PAUSE_S = 10.0  # before the first disturbance, on average
 _MAPS_S = 1.0  # between two lessons on the maps
-_KEPT = ("map_local", "map_global", "pose")
 
 
 @dataclass(frozen=True)
@@ -67,14 +66,14 @@ def guided_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
 def give_lessons(episode: Episode) -> tuple[Rows, Rows, Outcome]:
     """Have student and teacher drive in turn; return the lessons on maps and on control, and how it went."""
     scene, network = _Scene(episode), episode.network
-    follow = FollowingTeacher(scene.env)
+    follow, memory = FollowingTeacher(scene.env), network.memory(step_s=scene.env.config.step_s)
     rows: list[dict[str, Any]] = []
     switch_at, teacher_drives = 0.0, True
     while not scene.over:
         scene.guide.looked(scene.env.belief)
         scene.note_maps()
         observation = scene.observation
-        way = network.plan(observation)
+        way = memory.way(scene.env.belief)
         inputs = network.inputs(observation, way)
         wanted = follow(way.path, scene.action, observation, scene.env.belief)
         scan, landmarks = (x.astype(np.float16) for x in (observation["scan"], inputs.landmarks))
@@ -132,8 +131,7 @@ class _Scene(_Drive):
     def note_maps(self) -> None:
         """Keep a lesson on the maps, if one is due."""
         if self.time_s >= self._maps_at:
-            seen = {key: self.observation[key] for key in _KEPT}
-            self.maps.append(seen | map_lesson(self.guide, self.env))
+            self.maps += map_lessons(self.guide, self.env, self.rng)
             self._maps_at = self.time_s + _MAPS_S
 
     def step(self, action: NDArray[np.float32]) -> None:
@@ -153,8 +151,9 @@ class _Scene(_Drive):
 def judge(episode: Episode) -> Outcome:
     """Drive an episode by the network alone, and return how it went."""
     drive, network = _Drive(episode), episode.network
+    memory = network.memory(step_s=drive.env.config.step_s)
     while not drive.over:
-        drive.step(network.twist(network.inputs(drive.observation, network.plan(drive.observation))))
+        drive.step(network.twist(network.inputs(drive.observation, memory.way(drive.env.belief))))
     return drive.outcome
 
 

@@ -147,7 +147,8 @@ class DriveRun(FolderRun):
             for seed in range(FIRST_VALIDATION_SEED, FIRST_VALIDATION_SEED + config.evaluation.episodes)
         ]
         result = summary(jobs, list(pool.map(judge, jobs)))
-        self._note_trial(at, result, -result["score"], partial(self._save, "best"))
+        # What differs by less than a hundredth is chance: of those the weights that have practised most are kept.
+        self._note_trial(at, result, -round(result["score"], 2), partial(self._save, "best"))
 
     def _save(self, name: str) -> None:
         atomic_write(self.out / f"{name}.safetensors", save(self.weights))

@@ -18,12 +18,14 @@ from safetensors.numpy import load_file  # noqa: E402
 
 import agents  # noqa: E402
 import mecanum_env  # noqa: E402
+from agents.learned.drive_memory import CELL_M, LOG_PRICES  # noqa: E402
 from agents.learned.drive_network import NUMBERS, SECTORS, DriveNetwork, Inputs, sectors  # noqa: E402
+from agents.learned.drive_plan import node_prices  # noqa: E402
 from agents.ppo import load_drive_policy  # noqa: E402
 from slam.settings import from_mapping  # noqa: E402
 from training.learning.end_to_end.config import DriveConfig  # noqa: E402
-from training.learning.end_to_end.lessons import FollowingTeacher, map_lesson  # noqa: E402
-from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork, shortest  # noqa: E402
+from training.learning.end_to_end.lessons import FollowingTeacher, map_lessons  # noqa: E402
+from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork, shortest, step_prices  # noqa: E402
 from training.learning.end_to_end.run import DriveRun  # noqa: E402
 from training.learning.policies import export_run  # noqa: E402
 
@@ -47,14 +49,16 @@ def test_numpy_and_torch_agree():
     torch.manual_seed(0)
     plan, steer = PlanNetwork(), ControlNetwork()
     rng = np.random.default_rng(0)
-    maps = rng.integers(0, 256, (2, 3, 64, 64)).astype(np.uint8)
+    maps = rng.integers(0, 256, (4, 50, 70)).astype(np.uint8)
     with torch.no_grad():
-        price, goal, steps, far = plan(*torch.from_numpy(maps[:, None]))
+        price, goal = plan(torch.from_numpy(maps[None]))
     light = DriveNetwork(arrays(plan) | arrays(steer))
-    near = light.of_map("local", maps[0])
-    np.testing.assert_allclose(near, torch.cat([price, goal]).numpy(), atol=1e-4)
-    overview = light.of_map("overview", maps[1])
-    np.testing.assert_allclose(overview, torch.cat([steps[0], far]).numpy(), atol=1e-4)
+    np.testing.assert_allclose(light.of_map(maps), torch.cat([price, goal]).numpy(), atol=1e-4)
+    logs = torch.from_numpy(rng.normal(size=(1, 7, 9)).astype(np.float32))
+    steps = node_prices(np.exp(logs[0].clamp(*LOG_PRICES).numpy()), CELL_M)
+    inside = steps < 1e3
+    np.testing.assert_allclose(step_prices(logs)[0].numpy()[inside], steps[inside], rtol=1e-5)
+    assert (step_prices(logs)[0].numpy()[~inside] > 1e3).all()
     scan = sectors(rng.uniform(size=360).astype(np.float32))
     rows = rng.normal(size=(32, 5)).astype(np.float32)
     rows[:, 4] = np.arange(32) < 9
@@ -81,16 +85,17 @@ def test_lessons_on_maps_lie_where_the_maps_are():
     guide.reset(env.belief)
     for _ in range(30):
         observation, *_ = env.step(guide.act(observation, env.belief))
-    lesson = map_lesson(guide, env)
-    price = np.exp(lesson["price"] / 70.0)
-    walls = (observation["map_local"][0] > 200) & (observation["map_local"][1] > 0)
-    assert (price[walls] > 20.0).mean() > 0.95
-    goals = np.unpackbits(lesson["goal_local"], axis=-1).astype(bool)
-    # Frontier has what is known on one side of it.
-    assert goals.any() and (observation["map_local"][1][goals] > 0).mean() > 0.5
-    x, y = (observation["pose"][:2] + 1.0) * 32.0
-    nearest = np.unravel_index(lesson["travel"].argmin(), (64, 64))
-    assert abs(nearest[0] - (63 - int(y))) <= 1 and abs(nearest[1] - int(x)) <= 1
+    for lesson in map_lessons(guide, env, np.random.default_rng(0)):
+        price = np.exp(lesson["price"] / 70.0)
+        seen, goals = lesson["map"], np.unpackbits(lesson["goal"], axis=-1).astype(bool)
+        assert (price[(seen[0] > 200) & (seen[1] > 0)] > 20.0).mean() > 0.95
+        # Frontier has what is known on one side of it.
+        assert goals.any() and (seen[1][goals] > 0).mean() > 0.5
+        start = tuple(lesson["start"])
+        assert lesson["travel"][start] == 0.0 and price[start] < 3.0
+        # A step to the side costs what lies between.
+        beside = start[0], start[1] + 1
+        assert lesson["travel"][beside] <= 0.1 * max(price[start], price[beside]) + 0.01
 
 
 def test_the_teacher_goes_on_from_what_was_sent():
