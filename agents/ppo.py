@@ -35,8 +35,10 @@ class PpoConfig(Config):
     """Which policy."""
 
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
-    patience_s: Duration = 30.0  # with nothing new in sight, until the place is held for explored
-    hopeful_s: Duration = 300.0  # the same while it is on the way to what is rather a goal than none
+    # With nothing new in sight, and on the way to nothing that is rather a goal than none, until the place is held
+    # for explored …
+    patience_s: Duration = 30.0
+    hopeful_s: Duration = 300.0  # … and with nothing new in sight, whatever it is on the way to
     new_m2: Positive = 0.3  # what counts for new
 
 
@@ -63,9 +65,8 @@ class Ppo(Agent):
 
     def _forget(self) -> None:
         self._memory = self._network.memory(step_s=self._step_s)
-        self._hopes = True
         self._sent = np.zeros(3, np.float32)
-        self._time = self._news_at = 0.0
+        self._time = self._news_at = self._hoped_at = 0.0
         self._known_m2 = 0.0
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
@@ -85,7 +86,9 @@ class Ppo(Agent):
             return self._sent.copy()
         seen = self._complete(observation, belief)
         way = self._memory.way(belief)
-        self._goal, self._hopes = _goal(way, belief), way.likely
+        self._goal = _goal(way, belief)
+        if way.likely:
+            self._hoped_at = self._time
         self._sent = self._network.twist(self._network.inputs(seen, way))
         return self._sent.copy()
 
@@ -97,9 +100,10 @@ class Ppo(Agent):
             known = float(np.count_nonzero(belief.grid.classes() == FREE)) * belief.grid.resolution**2
             if known >= self._known_m2 + self.config.new_m2:
                 self._known_m2, self._news_at = known, self._time
-            waited, config = self._time - self._news_at, self.config
-            patience = config.hopeful_s if self._hopes else config.patience_s
-            self._status = "covered" if waited > patience else "driving"
+            without_news = self._time - self._news_at
+            without_hope = min(without_news, self._time - self._hoped_at)
+            given_up = without_hope > self.config.patience_s or without_news > self.config.hopeful_s
+            self._status = "covered" if given_up else "driving"
         return self.ended
 
     def _complete(self, observation: Mapping[str, Any] | None, belief: Belief) -> dict[str, Any]:

@@ -42,6 +42,7 @@ _HERE_M = 0.3  # nearer goals are none: from here the robot looks already
 _KEPT_M = 0.6  # around the goal that it is on the way to
 _STALLS_M = 1.2  # around the goal that it does not come nearer to
 _STALL_S = 2.0  # that it may take to, before the goal is doubted
+_HOPE_S = 10.0  # … and before it is held for none
 _WALL = 3.0  # log price from which on the robot's middle cannot be there: a way ends before, and looks from there
 _NEARER = 0.2  # price [m] that a way must fall by in a second, for that
 
@@ -112,12 +113,12 @@ class MapMemory:
         if self._target is not None:
             place, distance = self._away(*self._target, _STALLS_M)
             self._stalled[place] += np.float32(stalled_s) * (distance < _STALLS_M)
-            np.maximum(self._stalled[place], 0.0, out=self._stalled[place])
         self._window = _used(self._known)
         goal = self._goal_m + np.float32(self._settings.stall_m) * np.maximum(
             self._stalled - np.float32(_STALL_S), 0.0
         )
-        self._doubt = goal[self._window].copy()
+        hopeful = (self._goal_m < self._settings.goal_m * math.log(2.0)) & (self._stalled < _HOPE_S)
+        self._likely = hopeful[self._window]
         if self._target is not None:
             kept, distance = self._away(*self._target, _KEPT_M)
             goal[kept] -= np.float32(self._settings.keep_m) * (distance < _KEPT_M)
@@ -128,11 +129,11 @@ class MapMemory:
         self._cost_then = float(self._best[self._pixel(pose)])
 
     def _stalled_for(self, pose: Array) -> float:
-        """Return the time since the last look, less what getting as much nearer to the goal may take [s]."""
+        """Return the time since the last look, less what getting nearer to the goal since then may take [s]."""
         if self._target is None:
             return 0.0
         nearer = self._cost_then - float(self._best[self._pixel(pose)])
-        return self._every * self._step_s - max(nearer, 0.0) / _NEARER
+        return max(self._every * self._step_s - max(nearer, 0.0) / _NEARER, 0.0)
 
     def _read(self, grid: OccupancyGrid, x: float, y: float) -> None:
         """Let the network read what has changed since it last looked: what was drawn, and where it came near."""
@@ -191,7 +192,7 @@ class MapMemory:
         way = descend(self._parent, *start)
         places = self._corner + (way[:, ::-1] + 0.5) * self._cell
         self._target = float(places[-1, 0]), float(places[-1, 1])
-        likely = bool(self._doubt[tuple(way[-1])] < self._settings.goal_m * math.log(2.0))
+        likely = bool(self._likely[tuple(way[-1])])
         along = self._log_price[self._window][way[:, 0], way[:, 1]]
         # From where it stands it may leave, whatever that is.
         walls = np.flatnonzero((along > _WALL) & (np.hypot(*(places - pose[:2]).T) > _LEAVES_M))
