@@ -21,6 +21,8 @@ from hypothesis import strategies as st
 
 import agents
 import slam
+from agents.active import ActiveConfig
+from agents.ppo_frontier import PpoFrontierConfig
 from mecanum_env import parallel_env, rooms
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig, LidarConfig, NoiseConfig, RewardConfig, RobotConfig
@@ -148,12 +150,16 @@ def test_what_is_allowed_can_be_shown() -> None:
 Make = Callable[[dict[str, Any]], Any]
 
 
+WITH_POLICY: dict[str, type[Config]] = {"active": ActiveConfig, "ppo-frontier": PpoFrontierConfig}
+"""What agents take that read settings of a policy beside; their ``config_type`` is the driver's."""
+
+
 def makers() -> Iterator[tuple[str, type[Config], Make, Callable[[Any], None]]]:
     """Yield everything that a configuration makes: its name, the class, how it is made, and used."""
     for name in slam.names():
         yield f"slam {name}", slam.config_type(name), partial(_slam, name), use_backend
     for name in agents.names():
-        cls = agents.make(name).config_type
+        cls = WITH_POLICY.get(name) or agents.make(name).config_type
         if cls is not None:
             yield f"agent {name}", cls, partial(_agent, name), use_agent
     for part, cls in (

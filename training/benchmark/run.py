@@ -30,7 +30,8 @@ from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
-from training.runs.running import parts_of, versions
+from training.runs.running import versions
+from training.runs.typed import parts_of
 from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = ["BenchmarkPlan", "EpisodesFailed", "benchmark"]

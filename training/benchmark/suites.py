@@ -14,9 +14,8 @@ from mecanum_env.team.config import TeamConfig
 from slam.settings import unknown_name
 from training.episodes.team import read_team
 from training.runs.errors import BadInput, bad_input
-from training.runs.options import whole_numbers
 from training.runs.provenance import short_digest
-from training.runs.running import parts_of
+from training.runs.typed import parts_of, whole_numbers
 
 __all__ = [
     "FLOOR_PLANS",

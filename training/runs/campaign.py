@@ -17,7 +17,8 @@ from training.runs.cluster import Cluster, RayPool, ray_pool
 from training.runs.errors import BadInput, Interrupted, check_writable
 from training.runs.processes import ProcessPool, process_pool
 from training.runs.progress import Progress
-from training.runs.running import parts_of, versions, write_json
+from training.runs.running import versions, write_json
+from training.runs.typed import parts_of
 
 __all__ = [
     "Pool",

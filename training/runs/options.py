@@ -12,8 +12,6 @@ import typer
 from typer.core import TyperCommand
 
 from training.runs.compiling import compiling_shown
-from training.runs.errors import BadInput
-from training.runs.running import parts_of
 
 if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
@@ -21,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out",
     "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts",
-    "UnknownStarts", "Workers", "whole_numbers", "workers_of",
+    "UnknownStarts", "Workers", "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1
@@ -123,13 +121,3 @@ def workers_of(workers: int | None, ray: str | None) -> Whose:
     from training.runs.cluster import find_cluster
 
     return find_cluster(ray, workers)
-
-
-def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
-    """Return the numbers of ``25,50,100``, as typed for an option, each once and in order."""
-    words = parts_of(text)
-    if all(word.isascii() and word.isdigit() and len(word) < 9 for word in words):
-        numbers = sorted(set(map(int, words)))
-        if low <= numbers[0] and numbers[-1] <= high:
-            return numbers
-    raise BadInput(f"{option} {text!r} must be whole numbers in {low} … {high}, for instance 25,50,100")

@@ -17,7 +17,7 @@ import numpy as np
 from slam.formats import atomic_write
 from training.runs.signals import interrupt_flag
 
-__all__ = ["parts_of", "plain", "versions", "write_json", "written_together"]
+__all__ = ["plain", "versions", "write_json", "written_together"]
 
 _LIBRARIES = ("mecanum-slam", "gymnasium", "numpy", "numba", "opencv-python-headless", "pymunk")
 
@@ -61,8 +61,3 @@ def plain(value: Any) -> Any:
 def write_json(path: Path, value: Any) -> None:
     """Write a value as indented JSON, the file whole or not at all."""
     atomic_write(path, json.dumps(value, indent=1, ensure_ascii=False) + "\n")
-
-
-def parts_of(text: str) -> list[str]:
-    """Return the parts of a list as typed, separated by commas, each once and in order."""
-    return list(dict.fromkeys(part.strip() for part in text.split(",")))

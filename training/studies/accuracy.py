@@ -25,7 +25,8 @@ from training.figures.tables import csv_table, markdown_table, number
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
-from training.runs.running import parts_of, write_json
+from training.runs.running import write_json
+from training.runs.typed import parts_of
 
 __all__ = ["study", "summarise"]
 

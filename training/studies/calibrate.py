@@ -21,7 +21,7 @@ from slam.settings import check_name
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
 from training.runs.options import Json, Seed
-from training.runs.running import parts_of
+from training.runs.typed import parts_of
 
 __all__ = ["compare", "study", "table"]
 

@@ -13,8 +13,8 @@ from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number, text_table
 from training.replay.picture import draw_replay
 from training.runs.errors import BadInput
-from training.runs.options import whole_numbers
 from training.runs.rows import resume
+from training.runs.typed import whole_numbers
 
 
 def test_columns_line_up() -> None:

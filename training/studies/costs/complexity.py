@@ -26,9 +26,9 @@ from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import whole_numbers
 from training.runs.rows import resume
 from training.runs.running import write_json
+from training.runs.typed import whole_numbers
 from training.studies.circle_world import not_observing
 
 __all__ = ["REFERENCE", "SEEN", "complexity", "exponent", "run_job", "table"]

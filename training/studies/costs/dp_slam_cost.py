@@ -27,8 +27,9 @@ from slam.types import Odometry, Scan
 from training.figures.charts import INK, chart, label, png
 from training.figures.tables import text_table
 from training.runs.errors import bad_input, check_writable
-from training.runs.options import Out, Seed, whole_numbers
+from training.runs.options import Out, Seed
 from training.runs.running import write_json
+from training.runs.typed import whole_numbers
 
 __all__ = ["cost", "record", "study"]
 

@@ -29,7 +29,8 @@ from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
 from training.runs.options import Out, Seed
 from training.runs.rows import resume
-from training.runs.running import parts_of, write_json
+from training.runs.running import write_json
+from training.runs.typed import parts_of
 
 __all__ = ["explore", "study", "table"]
 

@@ -22,7 +22,8 @@ from training.runs.campaign import backend_names, installed_version, keep_settin
 from training.runs.errors import bad_input
 from training.runs.options import Backends, MaxSteps, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
-from training.runs.running import parts_of, write_json
+from training.runs.running import write_json
+from training.runs.typed import parts_of
 from training.studies.recovery.faults import FAULTS
 from training.studies.recovery.figures import draw_recovery, draw_reliability, false_alarms, reliability, sum_up
 from training.studies.recovery.runs import Job, Row, run_job

@@ -17,7 +17,8 @@ from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.options import Out, Ray, Seed, workers_of
 from training.runs.rows import resume
-from training.runs.running import parts_of, write_json
+from training.runs.running import write_json
+from training.runs.typed import parts_of
 from training.studies.reliability.files.part import FILES
 from training.studies.reliability.kills.part import KILLS
 from training.studies.reliability.page import page

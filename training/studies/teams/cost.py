@@ -16,7 +16,8 @@ from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import tell_goal
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
-from training.runs.options import Seeds, whole_numbers
+from training.runs.options import Seeds
+from training.runs.typed import whole_numbers
 from training.studies.exploring import AGENT
 
 __all__ = ["measure", "study"]
