@@ -24,7 +24,7 @@ FEWEST_BACK = 2
 
 _FEWEST_RECENT = 3  # landmarks that the last scans showed, below which none is missed
 # Log-odds [nat] by which a scan fits worse, or better. Where brisk-tour drives in apartments, corridors and mazes,
-# one scan in eighteen is worse by the first. In five kinds of rooms none of 263 explanations that were wrong had two
+# one scan in eighteen is worse by the first. In five kinds of rooms none of 263 wrong explanations had two
 # landmarks more and came up to the second; of 5187 right ones, of robots driven at random, five in six did.
 _WORSE_NAT, _SURE_NAT = 30.0, 80.0
 _LATELY = 6  # scans for which wheels that spun are not believed
