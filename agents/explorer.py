@@ -79,6 +79,8 @@ class Explorer(Driver):
         self._within_m = self._least_within_m  # [weighted m] that the next choice is likely to ask ways for
         self._ending = "covered"  # why there is nothing left to choose, once there is nothing
         self._track = Track()  # sensor poses that frontiers were seen from
+        self._doubts = 0  # how often it has changed its mind …
+        self._doubts_on = 0  # … since so many cells were known
 
     @abstractmethod
     def pick(self, candidates: Candidates, belief: Belief) -> int:
@@ -94,7 +96,7 @@ class Explorer(Driver):
             self._target = None
             self._status = self._ending
             return None
-        index = self.pick(candidates, belief)
+        index = self._kept(self.pick(candidates, belief), candidates, belief)
         target = candidates.frontiers.targets[index]
         row, column = candidates.cells[index].tolist()
         path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
@@ -110,6 +112,24 @@ class Explorer(Driver):
         self._target = target
         self._status = "driving"
         return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
+
+    def _kept(self, picked: int, candidates: Candidates, belief: Belief) -> int:
+        """Return the candidate to go to: the one picked, or the current one after too many changes of mind.
+
+        What is picked depends on where the robot stands. So two goals may send it to and fro between them for ever.
+        """
+        current, known = candidates.current, belief.grid.known_cells
+        if (known - self._doubts_on) * belief.grid.resolution**2 >= self.config.patience.progress_m2:
+            self._doubts, self._doubts_on = 0, known
+        if current is None or picked == current:
+            return picked
+        apart = math.hypot(*(candidates.frontiers.targets[picked] - candidates.frontiers.targets[current]).tolist())
+        if apart <= self.config.patience.same_m:
+            return picked
+        if self._doubts >= self.config.patience.doubts:
+            return current
+        self._doubts += 1
+        return picked
 
     def _seen_from(self, belief: Belief) -> bool:
         """Whether the robot is where beams fall densely on the target; where they do not it may vanish unseen."""

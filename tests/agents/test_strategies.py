@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import agents
+from agents.nearest_frontier import NearestFrontier
 from mecanum_env.config import RobotConfig
 from slam.grids.occupancy import FREE, UNKNOWN
 from tests.agents.grids import belief_of, drive, fill, half_known, room, two_rooms
@@ -168,3 +169,26 @@ def test_a_door_that_the_margin_for_an_unsure_position_closes_is_gone_through(na
         assert goal.pose[0] > 4.5
     assert agent.choose(belief_of(two_rooms(0.4), (1.0, 2.0, 0.0), sigma=1.0)) is None
     assert agent.status == "unreachable"
+
+
+class Fickle(NearestFrontier):
+    """Wants what is farthest, wherever it stands: on its way it changes its mind again and again."""
+
+    def pick(self, candidates, belief):
+        return int(np.argmax(np.where(np.isfinite(candidates.costs), candidates.costs, -1.0)))
+
+
+@pytest.mark.parametrize(("doubts", "ends"), [(5, True), (10_000, False)])
+def test_a_robot_does_not_go_to_and_fro_between_two_goals_for_ever(doubts, ends):
+    classes = room(12.0, 4.0)
+    fill(classes, 0.0, 0.0, 1.0, 4.0, UNKNOWN)
+    fill(classes, 11.0, 0.0, 12.0, 4.0, UNKNOWN)
+    pose = np.array([5.5, 2.0, 0.0])
+    agent = Fickle({"frontiers": SHORT, "patience": {"doubts": doubts, "looks": 1}})
+    agent.reset(belief_of(classes, tuple(pose)))
+    for _ in range(1200):
+        belief = belief_of(classes, tuple(pose))
+        pose = drive(pose, agent.act(None, belief), RobotConfig())
+        if agent.goal is None:
+            break
+    assert (agent.goal is None) is ends
