@@ -116,15 +116,15 @@ class Explorer(Driver):
     def _kept(self, picked: int, candidates: Candidates, belief: Belief) -> int:
         """Return the candidate to go to: the one picked, or the current one after too many changes of mind.
 
-        What is picked depends on where the robot stands. So two goals may send it to and fro between them for ever.
+        What is picked depends on where the robot stands: between two goals it may go to and fro for ever.
         """
         current, known = candidates.current, belief.grid.known_cells
         if (known - self._doubts_on) * belief.grid.resolution**2 >= self.config.patience.progress_m2:
             self._doubts, self._doubts_on = 0, known
         if current is None or picked == current:
             return picked
-        apart = math.hypot(*(candidates.frontiers.targets[picked] - candidates.frontiers.targets[current]).tolist())
-        if apart <= self.config.patience.same_m:
+        targets = candidates.frontiers.targets
+        if math.hypot(*(targets[picked] - targets[current]).tolist()) <= self.config.patience.same_m:
             return picked
         if self._doubts >= self.config.patience.doubts:
             return current
