@@ -30,6 +30,7 @@ from slam.types import LINE, Array, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
+_SETTLED_M = 1e-4  # a wall whose r changes by less [m/rad] needs no new coordinates
 _PAIR = (1, 2, 0)  # where x, y and θ stand in work space: θ first, since walls alone need the others
 
 
@@ -84,6 +85,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         )  # fmt: skip
         self._beside.correct(n, match, self._h, w, self._s, self.nis_dof, reset=True)
         if self.nis_dof:
+            _turn_columns(self._beside.cross, n, self._delta)
             self._turned += float(self._delta[2])
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
@@ -110,7 +112,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         far, size = state_rows(self._far, robot=False), change.left.shape[1]
         x, delta, columns = self._map_x.copy(), change.x - self._map_x, np.zeros((3, len(change.x)))
         x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
-        _retract(x, int(far.max()) + 1, delta, self._map_marks, columns)
+        _retract(x, int(far.max()) + 1, delta, self._map_marks, columns, math.inf)
         a, robot = np.zeros((3, size)), [2, 0, 1]
         a[:, far] = columns[:, far]
         # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
@@ -144,7 +146,8 @@ def invariant_update(
 
     The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
     + V Aᵀ (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
-    x and y, A's column and −V's. ``marks`` tells walls from points; ``delta`` ``(≥ n,)`` is work space;
+    x and y, A's column and −V's; what of it is by a wall's own α follows. ``marks`` tells walls from points;
+    ``delta`` ``(≥ n,)`` holds after it, where a wall's r stands in the state, what it changes by that α, else 0;
     ``limits`` are the standard filter's.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
@@ -158,7 +161,7 @@ def invariant_update(
     delta[:n] = 0.0
     add_combination(delta, n, s[:rows, rows], w)
     a, minus_v = w[rows : rows + 6 : 2], w[rows + 1 : rows + 6 : 2]
-    walls = _retract(x, n, delta, marks, a)
+    walls = _retract(x, n, delta, marks, a, _SETTLED_M)
     # V = P_:r + ½ A P_rr, P being what it is after the update, P − Wᵀ W.
     for q in range(0 if walls else 2, 3):
         v = minus_v[_PAIR[q]]
@@ -167,16 +170,46 @@ def invariant_update(
         add_combination(v, n, w[:rows, q], w)
     _add_half(a, minus_v, n, walls)
     downdate(p, n, w, w, rows, 3 if walls else 1)
+    if walls:
+        _turn(p, n, delta)
     return rows, nis
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array) -> bool:
+def _turn(p: Array, n: int, levers: Array) -> None:
+    """P ← G P Gᵀ of an upper triangle, G adding a wall's α, times its lever ``(≥ n,)``, to its r."""
+    for j in range(4, n, 2):
+        i, g = j - 1, levers[j]
+        if g != 0.0:
+            p[j, j] += g * (2.0 * p[i, j] + g * p[i, i])
+            p[i, j] += g * p[i, i]
+            for k in range(i):
+                p[k, j] += g * p[k, i]
+            for k in range(j + 1, n):
+                p[j, k] += g * p[i, k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn_columns(cross: Array, n: int, levers: Array) -> None:
+    """C ← C Gᵀ, with the G of :func:`_turn`."""
+    for j in range(4, n, 2):
+        if levers[j] != 0.0:
+            for k in range(cross.shape[0]):
+                cross[k, j] += levers[j] * cross[k, j - 1]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array, settled_m: float) -> bool:
     """Apply a correction along the exponential, write A's columns by θ, x and y, tell whether there are walls.
 
-    x⁺ = Exp(t) x̂ + V(t) (δ − J x̂ t) for the robot's position and every point, with t = δθ; a wall's α and r are
-    added to (a correction of the heading alone leaves it where it is). A's column by θ is J times how far a point
-    moved; a wall's r changes coordinates by Δnᵀ [I, −J p̂].
+    x⁺ = Exp(t) x̂ + V(t) (δ − J x̂ t) for the robot's position and every point, with t = δθ. A wall is corrected
+    where it is seen from: it is n⁺ᵀ p⁺ from the origin to the robot and from there r̂ − n̂ᵀ p̂ and what the
+    correction changes that by. (A correction of the heading alone leaves it where it is.) r̂ + δr would turn it
+    about its foot, from which it may be a hundred metres away: that is off by ½ nᵀ p δα², always outwards.
+
+    A's column by θ is J times how far a point moved. Of a wall r − nᵀ p, as seen from the robot, keeps its meaning,
+    so that r changes coordinates by Δn of the position and by g = Δ(J n)ᵀ p̂ of the wall's own α; ``delta`` holds
+    that g where r stands. Where it is below ``settled_m`` [m/rad], 0 stands there, and r − nᵀ (p − J p̂ θ) is kept.
     """
     t = delta[2]
     c, s = math.cos(t), math.sin(t)
@@ -190,11 +223,17 @@ def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array) -> bool:
     for k in range(-1, (n - 3) // 2):
         i = 0 if k < 0 else 3 + 2 * k
         if k >= 0 and marks[k, 0] == LINE:
-            alpha = x[i]
-            x[i], x[i + 1] = wrap_scalar(alpha + delta[i]), x[i + 1] + delta[i + 1]
-            dx, dy = math.cos(x[i]) - math.cos(alpha), math.sin(x[i]) - math.sin(alpha)
+            nx, ny = math.cos(x[i]), math.sin(x[i])
+            x[i] = wrap_scalar(x[i] + delta[i])
+            dx, dy = math.cos(x[i]) - nx, math.sin(x[i]) - ny
+            moved_x, moved_y = x[0] - robot_x, x[1] - robot_y  # n⁺ᵀ p⁺ − nᵀ p = Δnᵀ p + n⁺ᵀ Δp
+            x[i + 1] += delta[i + 1] + dx * robot_x + dy * robot_y - (nx * robot_y - ny * robot_x) * delta[i]
+            x[i + 1] += (nx + dx) * moved_x + (ny + dy) * moved_y - nx * delta[0] - ny * delta[1]
+            lever = dx * robot_y - dy * robot_x
+            settled = abs(lever) < settled_m
             a[0, i] = a[1, i] = a[2, i] = 0.0
-            a[0, i + 1], a[1, i + 1], a[2, i + 1] = dx * robot_y - dy * robot_x, dx, dy
+            a[0, i + 1], a[1, i + 1], a[2, i + 1] = lever if settled else 0.0, dx, dy
+            delta[i + 1] = 0.0 if settled else lever
             walls = True
             continue
         px, py = x[i], x[i + 1]
@@ -203,6 +242,8 @@ def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array) -> bool:
         x[i + 1] = s * px + c * py + vb * dx + va * dy
         a[0, i], a[0, i + 1] = -(x[i + 1] - py), x[i] - px
         a[1, i] = a[1, i + 1] = a[2, i] = a[2, i + 1] = 0.0
+        if k >= 0:
+            delta[i + 1] = 0.0
     x[2] = wrap_scalar(x[2] + t)
     a[0, 2] = a[1, 2] = a[2, 2] = 0.0
     return walls

@@ -19,7 +19,7 @@ from slam.gaussian.lanes import LANES, add_product, aligned_zeros, first, load, 
 from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
-from slam.types import Array
+from slam.types import LINE, Array
 
 __all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "work_space"]
 
@@ -70,6 +70,10 @@ def whiten(
     """Write W = L⁻¹ H P into ``w``; return the number of rows.
 
     ``s`` holds in row k, from the diagonal on, 1 / L_kk, the rest of L's column k and, after that, (L⁻¹ ν)_k.
+
+    Of a wall only the piece that is seen is measured, and where it turns out to be at an angle t to what is expected,
+    its foot lies elsewhere. So distance and R are taken as if the piece had been extended in the direction expected:
+    else whatever is seen askew by noise, farther than it is, is believed the more (docs/reference/ekf.md, Walls).
     """
     rows = 0
     for j in range(3):  # the robot's block is read as rows, so both its triangles are
@@ -84,14 +88,17 @@ def whiten(
         if match[k] >= 0:
             rho, bearing = predicted(x, match[k], z[k, 5], offset, h[a // 2])
             s[a, rows], s[a + 1, rows] = z[k, 0] - rho, wrap_scalar(z[k, 1] - bearing)
+            if z[k, 5] == LINE:
+                s[a, rows] += 0.5 * z[k, 0] * s[a + 1, rows] ** 2
             a += 2
     _h_times_rows(h, p, n, w, rows)
     a = 0
     for k in range(z.shape[0]):
         if match[k] >= 0:
             _innovation_columns(w, 3 + 2 * match[k], h[a // 2], a, s)
-            s[a, a] += z[k, 2]
-            s[a, a + 1] += z[k, 3]
+            shift = z[k, 0] * s[a + 1, rows] if z[k, 5] == LINE else 0.0  # of the foot along the wall, d t
+            s[a, a] += z[k, 2] + shift * (2.0 * z[k, 3] + shift * z[k, 4])
+            s[a, a + 1] += z[k, 3] + shift * z[k, 4]
             s[a + 1, a + 1] += z[k, 4]
             a += 2
     cholesky(s, rows)

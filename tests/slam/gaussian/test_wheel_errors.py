@@ -16,7 +16,7 @@ from slam.gaussian.joint_gaussian import add_landmark, landmark_by_pose
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap
-from slam.invariant import InvariantEkfSlam, invariant_update
+from slam.invariant import InvariantEkfSlam, _turn_columns, invariant_update
 from slam.motion import LastingErrors, OdometryNoise, jacobians, move
 from slam.settings import from_mapping
 from slam.types import LINE
@@ -195,9 +195,11 @@ def test_update_and_reset_with_walls_are_those_of_one_large_state() -> None:
         wheels.cov[:], wheels.cross[:, :9] = joint[9:14, 9:14], joint[9:14, :9]
         got, p = x.copy(), np.triu(joint[:9, :9])
         h, w, s = work_space(3, 9)
-        rows, _ = invariant_update(got, p, 9, z, np.arange(3), OFFSET, marks, h, w, s, np.zeros(9))
+        levers = np.zeros(9)
+        rows, _ = invariant_update(got, p, 9, z, np.arange(3), OFFSET, marks, h, w, s, levers)
         wheels.correct(9, np.arange(3), h, w, s, rows, reset=True)
-        gamma = transform(got) @ np.linalg.inv(transform(x))
+        _turn_columns(wheels.cross, 9, levers)
+        gamma = transform(got, x[:2]) @ np.linalg.inv(transform(x, x[:2]))
         np.testing.assert_allclose(wheels.mean, plain_x[9:14], atol=1e-12)
         np.testing.assert_allclose(wheels.cov, plain_p[9:14, 9:14], atol=1e-12)
         np.testing.assert_allclose(wheels.cross[:, :9], plain_p[9:14, :9] @ gamma.T, atol=1e-9)
