@@ -202,14 +202,14 @@ def _turn_columns(cross: Array, n: int, levers: Array) -> None:
 def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array, settled_m: float) -> bool:
     """Apply a correction along the exponential, write A's columns by θ, x and y, tell whether there are walls.
 
-    x⁺ = Exp(t) x̂ + V(t) (δ − J x̂ t) for the robot's position and every point, with t = δθ. A wall is corrected
-    where it is seen from: it is n⁺ᵀ p⁺ from the origin to the robot and from there r̂ − n̂ᵀ p̂ and what the
-    correction changes that by. (A correction of the heading alone leaves it where it is.) r̂ + δr would turn it
-    about its foot, from which it may be a hundred metres away: that is off by ½ nᵀ p δα², always outwards.
+    x⁺ = Exp(t) x̂ + V(t) (δ − J x̂ t) for the robot's position and every point, with t = δθ. A wall turns about
+    where the robot is: r⁺ = r̂ + δr + Δnᵀ (p̂ + ½ δp) − (J n̂)ᵀ p̂ δα, which is right to second order for a wall that
+    turns alone and for one that turns with the robot. (A correction of the robot alone leaves it where it is.)
+    r̂ + δr would turn it about its foot, which may be a hundred metres away: ½ nᵀ p δα² too far out, always.
 
-    A's column by θ is J times how far a point moved. Of a wall r − nᵀ p, as seen from the robot, keeps its meaning,
-    so that r changes coordinates by Δn of the position and by g = Δ(J n)ᵀ p̂ of the wall's own α; ``delta`` holds
-    that g where r stands. Where it is below ``settled_m`` [m/rad], 0 stands there, and r − nᵀ (p − J p̂ θ) is kept.
+    A's column by θ is J times how far a point moved. Of a wall the distance r − nᵀ p from the robot keeps its
+    meaning, so r changes coordinates by Δn of the position and by g = Δ(J n)ᵀ p̂ of the wall's own α; ``delta``
+    holds that g where r stands. If g is below ``settled_m`` [m/rad], r − nᵀ (p − J p̂ θ) does, and 0 stands there.
     """
     t = delta[2]
     c, s = math.cos(t), math.sin(t)
@@ -219,6 +219,7 @@ def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array, settled_m: 
     else:
         va, vb = 1.0 - t * t / 6.0, 0.5 * t - t * t * t / 24.0
     robot_x, robot_y = x[0], x[1]
+    middle_x, middle_y = robot_x + 0.5 * delta[0], robot_y + 0.5 * delta[1]
     walls = False
     for k in range(-1, (n - 3) // 2):
         i = 0 if k < 0 else 3 + 2 * k
@@ -226,9 +227,7 @@ def _retract(x: Array, n: int, delta: Array, marks: Array, a: Array, settled_m: 
             nx, ny = math.cos(x[i]), math.sin(x[i])
             x[i] = wrap_scalar(x[i] + delta[i])
             dx, dy = math.cos(x[i]) - nx, math.sin(x[i]) - ny
-            moved_x, moved_y = x[0] - robot_x, x[1] - robot_y  # n⁺ᵀ p⁺ − nᵀ p = Δnᵀ p + n⁺ᵀ Δp
-            x[i + 1] += delta[i + 1] + dx * robot_x + dy * robot_y - (nx * robot_y - ny * robot_x) * delta[i]
-            x[i + 1] += (nx + dx) * moved_x + (ny + dy) * moved_y - nx * delta[0] - ny * delta[1]
+            x[i + 1] += delta[i + 1] + dx * middle_x + dy * middle_y - (nx * robot_y - ny * robot_x) * delta[i]
             lever = dx * robot_y - dy * robot_x
             settled = abs(lever) < settled_m
             a[0, i] = a[1, i] = a[2, i] = 0.0

@@ -71,9 +71,9 @@ def whiten(
 
     ``s`` holds in row k, from the diagonal on, 1 / L_kk, the rest of L's column k and, after that, (L⁻¹ ν)_k.
 
-    Of a wall only the piece that is seen is measured, and where it turns out to be at an angle t to what is expected,
-    its foot lies elsewhere. So distance and R are taken as if the piece had been extended in the direction expected:
-    else whatever is seen askew by noise, farther than it is, is believed the more (docs/reference/ekf.md, Walls).
+    What is measured of a wall is the piece that is seen. Where that lies at an angle t to the wall expected, the
+    feet of the two differ by more than a linear model knows of. So distance and R are those of the piece drawn out
+    in the direction expected (docs/reference/ekf.md, Walls).
     """
     rows = 0
     for j in range(3):  # the robot's block is read as rows, so both its triangles are
