@@ -71,9 +71,8 @@ def whiten(
 
     ``s`` holds in row k, from the diagonal on, 1 / L_kk, the rest of L's column k and, after that, (L⁻¹ ν)_k.
 
-    What is measured of a wall is the piece that is seen. Where that lies at an angle t to the wall expected, the
-    feet of the two differ by more than a linear model knows of. So distance and R are those of the piece drawn out
-    in the direction expected (docs/reference/ekf.md, Walls).
+    A wall's foot seems too far by ½ d e² where its direction is seen wrong by e, whatever R says of the two. So
+    much is taken off, as far as the innovation tells of that e (docs/reference/ekf.md, Walls).
     """
     rows = 0
     for j in range(3):  # the robot's block is read as rows, so both its triangles are
@@ -88,17 +87,18 @@ def whiten(
         if match[k] >= 0:
             rho, bearing = predicted(x, match[k], z[k, 5], offset, h[a // 2])
             s[a, rows], s[a + 1, rows] = z[k, 0] - rho, wrap_scalar(z[k, 1] - bearing)
-            if z[k, 5] == LINE:
-                s[a, rows] += 0.5 * z[k, 0] * s[a + 1, rows] ** 2
             a += 2
     _h_times_rows(h, p, n, w, rows)
     a = 0
     for k in range(z.shape[0]):
         if match[k] >= 0:
             _innovation_columns(w, 3 + 2 * match[k], h[a // 2], a, s)
-            shift = z[k, 0] * s[a + 1, rows] if z[k, 5] == LINE else 0.0  # of the foot along the wall, d t
-            s[a, a] += z[k, 2] + shift * (2.0 * z[k, 3] + shift * z[k, 4])
-            s[a, a + 1] += z[k, 3] + shift * z[k, 4]
+            if z[k, 5] == LINE:
+                expected = s[a + 1, a + 1]
+                share = z[k, 4] / (z[k, 4] + expected)  # of the innovation that is the observation's own
+                s[a, rows] -= 0.5 * z[k, 0] * share * (share * s[a + 1, rows] ** 2 + expected)
+            s[a, a] += z[k, 2]
+            s[a, a + 1] += z[k, 3]
             s[a + 1, a + 1] += z[k, 4]
             a += 2
     cholesky(s, rows)
