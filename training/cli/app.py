@@ -25,7 +25,7 @@ from training.cli.study import study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
 from training.runs.options import Command
-from training.runs.signals import INTERRUPTED, TERMINATED, heed_sigterm
+from training.runs.signals import INTERRUPTED, TERMINATED, forget_interrupt, heed_sigterm
 
 __all__ = ["app", "main"]
 
@@ -91,6 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; what goes wrong is one line on standard error."""
     with heed_sigterm() as ended:
         code = _run(list(sys.argv[1:] if argv is None else argv))
+    forget_interrupt()
     # Amid an import it may come out as any error.
     return TERMINATED if ended.is_set() and code in (1, INTERRUPTED) else code
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import secrets
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,8 +63,15 @@ class FolderRun:
         path = out / "progress.json"
         if path.exists():
             self._progress |= read_json(path, nan=True)
+            self._catch_up()
         if self._progress["config"] != settings:
             raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+
+    def _catch_up(self) -> None:
+        """Take the last chunk for learned where the run was killed after its checkpoint, before the note of it."""
+        checkpoint = self.out / "checkpoint.zip"
+        if checkpoint.exists() and (steps := _steps_of(checkpoint)) > self._progress["steps"]:
+            self._progress |= {"chunk": self._progress["chunk"] + 1, "steps": steps}
 
     def train(self) -> None:
         """Train to the end; a run broken off anywhere goes on from its last checkpoint, a finished one is left."""
@@ -159,6 +167,15 @@ def save_model(model: OnPolicyAlgorithm, path: Path) -> None:
     """Write a zip of stable-baselines3, whole or not at all."""
     with replacing(path) as new:
         model.save(new)
+
+
+def _steps_of(path: Path) -> int:
+    """Return the steps that a zip of :func:`save_model` has learned from."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return int(json.loads(archive.read("data"))["num_timesteps"])
+    except (zipfile.BadZipFile, OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no checkpoint of a run; choose another --out") from error
 
 
 def words(values: dict[str, Any]) -> str:

@@ -107,6 +107,31 @@ def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed
     assert times[0] == times[1]
 
 
+@pytest.mark.parametrize("chunk", [1, 2, 3])  # in a rehearsal, at its end, and after it
+def test_a_run_killed_between_a_checkpoint_and_its_note_is_the_one_that_was_not(tmp_path, rehearsed, chunk):
+    class Dies(Run):
+        def _keep(self, **progress):
+            if progress.get("chunk") == chunk:
+                raise Killed
+            super()._keep(**progress)
+
+    with pytest.raises(Killed):
+        Dies(from_mapping(TrainConfig, REHEARSED), tmp_path, workers=1, log=lambda _: None).train()
+    run(tmp_path, config=REHEARSED, workers=1)
+    for name in ("checkpoint.zip", "best.zip"):
+        same_weights(read_zip(rehearsed[0] / name), read_zip(tmp_path / name))
+    steps = [json.loads((out / "progress.json").read_text())["steps"] for out in (rehearsed[0], tmp_path)]
+    assert steps[0] == steps[1] == 48
+
+
+def test_a_checkpoint_that_is_none_is_refused(tmp_path):
+    with pytest.raises(Killed):
+        run(tmp_path, kill_after="ppo, chunk 1 ", workers=1)
+    (tmp_path / "checkpoint.zip").write_bytes(b"no zip")
+    with pytest.raises(ValueError, match=r"checkpoint\.zip is no checkpoint of a run"):
+        run(tmp_path, workers=1)
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_the_configurations_that_come_with_the_package_are_valid(path):
     _read(path.stem, None)

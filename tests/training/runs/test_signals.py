@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -64,3 +66,26 @@ def test_sigterm_amid_an_import_that_fails_of_it_is_sigterm(monkeypatch: pytest.
 
     monkeypatch.setattr("typer.main.get_command", half_imported)
     assert main(["study"]) == 143
+
+
+_INTERRUPTED_AMID_AN_EXEC = """
+import os, signal, sys, time
+import slam.files
+from training.cli.app import app, main
+
+@app.command()
+def dataclass_is_made():
+    exec("os.kill(os.getpid(), signal.SIGTERM); time.sleep(1.0)")
+
+sys.exit(main(["dataclass-is-made"]))
+"""
+
+
+def test_an_interrupt_amid_an_exec_leaves_the_exit_code_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "interrupted.py").write_text(_INTERRUPTED_AMID_AN_EXEC)
+    where = {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    done = subprocess.run(
+        [sys.executable, "-m", "interrupted"], capture_output=True, text=True, env=os.environ | where, check=False
+    )
+    assert done.returncode == 143  # not SIGINT's
+    assert done.stderr == "mecanum dataclass-is-made: interrupted before the results were written\n"

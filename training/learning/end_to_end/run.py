@@ -14,6 +14,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import safe_open
 from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -49,6 +50,8 @@ class DriveRun(FolderRun):
         checkpoint = self.out / "checkpoint.safetensors"
         if checkpoint.exists():
             weights = load_file(checkpoint)
+            # Killed after the checkpoint, before the note of it, the round is done all the same.
+            self._progress["round"] = max(self._progress["round"], _rounds_of(checkpoint))
             for network in (self._plan, self._control):
                 network.load_state_dict({name: torch.from_numpy(weights[name]) for name in network.state_dict()})
         while self._progress["round"] <= len(self.config.lessons.teacher_shares):
@@ -83,7 +86,7 @@ class DriveRun(FolderRun):
             ):  # fmt: skip
                 self._say(f"round {number}: " + words(line))
             self._evaluate(pool, {"round": number})
-        self._save("checkpoint")
+        self._save("checkpoint", number + 1)
         self._keep(round=number + 1)
         self._say(f"round {number} of {len(self.config.lessons.teacher_shares)} done")
 
@@ -133,7 +136,7 @@ class DriveRun(FolderRun):
                 if self._progress["chunk"] > 0:
                     self._control.load_state_dict(policy.network.state_dict())
                     self._evaluate(pool, {"steps": self._progress["steps"]})
-                    self._save("checkpoint")
+                    self._save("checkpoint", self._progress["round"])
 
             self._learn(model, env, ppo, every=config.evaluation.every, try_out=try_out, prepare=prepare)
         finally:
@@ -150,8 +153,8 @@ class DriveRun(FolderRun):
         # What differs by less than a hundredth is chance: of those the weights that have practised most are kept.
         self._note_trial(at, result, -round(result["score"], 2), partial(self._save, "best"))
 
-    def _save(self, name: str) -> None:
-        atomic_write(self.out / f"{name}.safetensors", save(self.weights))
+    def _save(self, name: str, rounds: int = 0) -> None:
+        atomic_write(self.out / f"{name}.safetensors", save(self.weights, {"rounds": str(rounds)}))
 
 
 def summary(jobs: list[Episode], outcomes: list[Outcome]) -> dict[str, Any]:
@@ -171,6 +174,12 @@ def summary(jobs: list[Episode], outcomes: list[Outcome]) -> dict[str, Any]:
     found["collisions"] = float(np.mean([end.collisions for end in outcomes]))
     found["score"] = float(np.mean(shares)) - 0.5 * found["collisions"] - 0.1 * float(np.mean(times))
     return found
+
+
+def _rounds_of(path: Path) -> int:
+    """Return how many rounds a checkpoint's weights have learned from."""
+    with safe_open(path, "numpy") as file:
+        return int((file.metadata() or {}).get("rounds", 0))
 
 
 def _gathered(paths: Iterable[Path]) -> dict[str, NDArray[Any]]:

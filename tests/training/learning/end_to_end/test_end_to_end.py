@@ -123,24 +123,40 @@ def no_workers(count: int) -> Iterator[InThisProcess]:
     yield InThisProcess()
 
 
-def run(out: Path, *, kill_at: str = "", **changes) -> None:
+def run(out: Path, *, kill_at: str = "", die_before: dict | None = None, **changes) -> None:
+    class Dies(DriveRun):
+        def _keep(self, **progress):
+            if die_before and die_before.items() <= progress.items():
+                raise Killed
+            super()._keep(**progress)
+
     def log(text: str) -> None:
         if kill_at and text.startswith(kill_at):
             raise Killed
 
-    DriveRun(from_mapping(DriveConfig, SMALL | changes), out, workers=1, log=log).train()
+    Dies(from_mapping(DriveConfig, SMALL | changes), out, workers=1, log=log).train()
+
+
+def same_checkpoint(one: Path, other: Path) -> None:
+    first, second = (load_file(out / "checkpoint.safetensors") for out in (one, other))
+    assert first.keys() == second.keys()
+    for name, weights in first.items():
+        np.testing.assert_array_equal(weights, second[name])
 
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, monkeypatch):
     monkeypatch.setattr("training.learning.folder.worker_pool", no_workers)
     run(tmp_path / "whole")
+    for at in ({"round": 1}, {"round": 2}, {"chunk": 1}):  # after a checkpoint, before the note of it
+        with pytest.raises(Killed):
+            run(tmp_path / "between", die_before=at)
+    run(tmp_path / "between")
+    same_checkpoint(tmp_path / "whole", tmp_path / "between")
     for moment in ("round 1: lessons", "round 1 of 2 done", "ppo, chunk 1 of 2"):
         with pytest.raises(Killed):
             run(tmp_path / "parts", kill_at=moment)
     run(tmp_path / "parts")
-    one, other = (load_file(tmp_path / name / "checkpoint.safetensors") for name in ("whole", "parts"))
-    for name, weights in one.items():
-        np.testing.assert_array_equal(weights, other[name])
+    same_checkpoint(tmp_path / "whole", tmp_path / "parts")
     lines = [json.loads(line) for line in (tmp_path / "whole" / "curve.jsonl").read_text().splitlines()]
     assert [line.get("round", line.get("steps")) for line in lines] == [1, 2, 32]
     with pytest.raises(ValueError, match="another configuration"):

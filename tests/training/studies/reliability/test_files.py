@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from training.cli import main
+from training.runs.errors import BadInput
 from training.studies.reliability.command import PARTS
 from training.studies.reliability.files import child, guard
+from training.studies.reliability.files.forked import run_forked
 from training.studies.reliability.files.mutations import MUTATIONS, mutated, mutated_cells
 from training.studies.reliability.files.readers import READERS, Reader
 from training.studies.reliability.files.samples import landmarks
@@ -39,7 +41,7 @@ def test_a_sample_of_every_reader_is_read_or_refused_in_one_line(name: str, tmp_
             assert row["end"] in ("read", "refused"), row
 
 
-@pytest.mark.parametrize("name", [name for name in QUICK if name != "configs"])
+@pytest.mark.parametrize("name", QUICK)
 def test_sound_files_are_read(name: str, tmp_path: Path) -> None:
     reader = READERS[name]
     entry, names = reader.variants[0]
@@ -68,6 +70,21 @@ def test_every_mutation_changes_something() -> None:
     content = landmarks()["landmarks.db"]
     assert isinstance(content, bytes)
     assert any(mutated_cells(content, rng)[0] != content for _ in range(5))
+
+
+def test_the_command_is_run_on_a_file_and_says_so_in_a_line(tmp_path: Path) -> None:
+    reader = READERS["configs"]
+    sound = tmp_path / "sound.toml"
+    sound.write_bytes(reader.sound()["config.toml"])  # type: ignore[arg-type]
+    reader.read(sound, reader.every - 1)
+    assert (tmp_path / "out").is_dir()
+    bad = tmp_path / "bad.toml"
+    bad.write_text("rooms = 3\n", "utf-8")
+    with pytest.raises(BadInput, match=r"^mecanum explore: .*rooms"):
+        reader.read(bad, reader.every - 1)
+    code, said = run_forked(["explore", "--floor-plan", str(tmp_path / "none.png")])
+    assert code == 2 and said.startswith("mecanum explore: ") and said.count("\n") == 1
+    assert run_forked(["--version"]) == (0, "")
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,14 @@ def test_what_is_doubled_or_gone_is_seen(folder: Path) -> None:
     assert any("metrics.json" in line and "absent" in line for line in differences(results(folder), whole))
 
 
+def test_a_training_run_that_was_begun_anew_is_seen(tmp_path: Path) -> None:
+    progress = tmp_path / "progress.json"
+    progress.write_text('{"steps": 3, "identity": "a"}')
+    whole, names = results(tmp_path), kept(tmp_path)
+    progress.write_text('{"steps": 3, "identity": "b"}')
+    assert differences(results(tmp_path), whole) == [] and names - kept(tmp_path) == {"a"}
+
+
 def test_half_a_file_is_seen(folder: Path) -> None:
     assert damaged(folder) == []
     (folder / "metrics.json").write_text(json.dumps({"coverage": 0.5})[:-3])

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import agents
 import slam
@@ -16,6 +17,7 @@ from mecanum_env.env import ExploreEnv
 from training.studies.reliability.steps.items import NOISES, ROOMS, TEAMS, Item, items
 from training.studies.reliability.steps.nonsense import no_actions, refuse
 from training.studies.reliability.steps.part import STEPS
+from training.studies.reliability.steps.quick import QuickSpace, surely_covariance
 from training.studies.reliability.steps.runs import run, work
 from training.studies.reliability.steps.watch import Findings, Watch, _check_cov
 
@@ -29,14 +31,23 @@ def test_items_in_short(item: Item) -> None:
 
 
 def test_every_value_of_every_factor_is_drawn_and_more_steps_are_more_of_the_same() -> None:
-    drawn = items(60_000, 3)
-    assert items(90_000, 3)[:60] == drawn and sum(item.steps for item in drawn) == 60_000
-    many = items(300_000, 3)
+    drawn = items(250_000, 3)
+    assert sum(item.steps for item in drawn) == 250_000
+    many = items(1_500_000, 3)
+    assert many[: len(drawn) - 1] == drawn[:-1]
     assert {item.driver for item in many} >= set(agents.names())
     assert {item.rooms for item in many} == set(ROOMS) and {item.slam for item in many} == set(slam.names())
     assert {item.noise for item in many} == set(NOISES) and {item.team for item in many} == {*TEAMS, "-"}
-    assert len({item.seed for item in many}) == 300 and min(item.seed for item in many) >= 10_000
-    assert sum(item.again for item in many) == 15
+    assert len({item.seed for item in many}) == len(many) and min(item.seed for item in many) >= 10_000
+    assert sum(item.again for item in many) == len(range(5, len(many), 20))
+
+
+def test_items_have_fewer_steps_where_one_is_dear() -> None:
+    singles = [item for item in items(3_000_000, 0) if item.kind == "single"]
+    dear = [item.steps for item in singles if item.driver == "next-best-view"]
+    easy = ("ekf", "flip", 3000)
+    cheap = [item.steps for item in singles if (item.slam, item.driver, item.limit) == easy]
+    assert 20 <= max(dear) < 1000 < 4000 < min(cheap)
 
 
 def test_other_seeds_give_other_digests_and_the_same_gives_the_same() -> None:
@@ -110,6 +121,41 @@ def test_a_wall_that_is_passed_is_found(watched: Any) -> None:
     state[:2] = x0, 0.5 * (y0 + y1)
     watch.step(*step([0, 0, 0]))
     assert {"a wall was passed", "a surface is deep in the body"} <= set(found.wrong)
+
+
+def test_what_is_quickly_told_to_be_seen_as_it_should_be_is_so(watched: Any) -> None:
+    env, _, step, _ = watched
+    space, (seen, _, _) = env.observation_space, step([0, 0, 0])
+    quick = QuickSpace(space)
+    assert quick.surely_contains(seen) and space.contains(seen)
+    for key, value in seen.items():
+        without = {name: other for name, other in seen.items() if name != key}
+        for bad in (value.astype(np.float64), value[..., :-1], value.tolist(), None):
+            assert not quick.surely_contains(without | {key: bad})
+        assert not quick.surely_contains(without) and not quick.surely_contains(seen | {"more": value})
+        for number in (np.nan, np.inf, 1e7, -1e7) if value.dtype == np.float32 else ():
+            one = value.copy()
+            one.flat[-1] = number
+            assert not quick.surely_contains(seen | {key: one}) and not space.contains(seen | {key: one})
+    box = spaces.Dict({"few": spaces.Box(0, 3, (2,), np.uint8)})
+    assert not QuickSpace(box).surely_contains({"few": np.array([0, 4], np.uint8)})
+
+
+def test_what_is_quickly_told_to_be_a_covariance_is_one() -> None:
+    rng, told = np.random.default_rng(0), 0
+    for size in (1, 3, 3, 3, 20, 60):
+        for _ in range(50):
+            root = rng.normal(size=(size, int(rng.integers(1, 2 * size + 1))))
+            cov = root @ root.T * 10.0 ** rng.integers(-12, 12)
+            cov = 0.5 * (cov + cov.T) - 10.0 ** rng.integers(-14, 0) * np.abs(cov).max() * np.eye(size)
+            if surely_covariance(cov):
+                told += 1
+                assert np.linalg.eigvalsh(cov)[0] >= -1e-12 * np.abs(cov).max()
+            for bad in (np.nan, np.inf, np.nextafter(cov[-1, 0], np.inf) if size > 1 else -1.0):
+                broken = cov.copy()
+                broken[-1, 0] = bad
+                assert not surely_covariance(broken)
+    assert told > 50
 
 
 def test_covariances_are_judged() -> None:

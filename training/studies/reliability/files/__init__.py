@@ -2,5 +2,6 @@
 
 ``samples`` are sound files, ``results`` those that long runs go on from; ``mutations`` damages them; ``hostile``,
 ``hostile_logs``, ``hostile_bags`` and ``hostile_stores`` are made to do harm. ``readers`` says who reads what,
-``child`` does so within bounds of memory, ``guard`` watches its time, ``part`` counts.
+``forked`` runs the command on one, ``child`` reads within bounds of memory, ``guard`` watches its time, ``part``
+counts.
 """

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import gzip
 import importlib.util
-import subprocess
-import sys
 import tempfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +27,7 @@ from training.studies.reliability.files import (
     results,
     samples,
 )
+from training.studies.reliability.files.forked import load_command, run_forked
 from training.studies.reliability.files.mutations import mutated, mutated_cells
 from training.studies.reliability.files.samples import Files, put
 
@@ -71,6 +70,7 @@ class Reader:
 
     def warm_up(self) -> None:
         """Load and compile what only a first call does: that is not the file's time."""
+        load_command()
         entry, names = self.variants[0]
         with tempfile.TemporaryDirectory() as folder:
             self.use(Case("sound", {name: self.sound()[name] for name in names}, entry).put(Path(folder)))
@@ -109,13 +109,12 @@ class Reader:
         if self.command is None or not self.by_command(index):
             self.use(path)
             return
-        argv = [sys.executable, "-m", "training.cli", *self.command(path, path.parent / "out")]
-        done = subprocess.run(argv, capture_output=True, text=True, errors="replace", check=False)
-        lines = [line for line in done.stderr.splitlines() if line.startswith("mecanum")]
-        if done.returncode == 2 and len(lines) == 1:
+        code, said = run_forked(self.command(path, path.parent / "out"))
+        lines = [line for line in said.splitlines() if line.startswith("mecanum")]
+        if code == 2 and len(lines) == 1:
             raise BadInput(lines[0])
-        if done.returncode:
-            raise RuntimeError(f"exit code {done.returncode}: {done.stderr[-300:]}")
+        if code:
+            raise RuntimeError(f"exit code {code}: {said[-300:]}")
 
 
 def _damaged(name: str, data: bytes, rng: np.random.Generator) -> tuple[str, bytes, list[str]]:

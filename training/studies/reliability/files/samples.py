@@ -167,7 +167,7 @@ def park() -> Files:
 @cache
 def configs() -> Files:
     """Return an environment's configuration, with the [run] table of an episode."""
-    run = '\n[run]\nagent = "random"\nseed = 3\nmax_steps = 2\nstart = [0.0, 0.0, 0.0]\n'
+    run = '\n[run]\nagent = "random"\nseed = 3\nmax_steps = 2\nstart = [2.0, 2.0, 0.0]\n'
     return {"config.toml": (to_toml(EnvConfig(rooms="rectangular")) + run).encode()}
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 __all__ = ["damaged", "differences", "kept", "results"]
 
-_CLOCK = re.compile(r"wall(_time)?_s$|(^|_)ms(_|$)|realtime|took|command")
+_CLOCK = re.compile(r"wall(_time)?_s$|(^|_)ms(_|$)|realtime|took|command|^identity$")  # an identity is drawn
 _TOLD = (".html", ".md", ".png", ".v2", ".0")  # pictures and pages, with times in them: whether they are there
 
 
@@ -51,10 +51,11 @@ def damaged(folder: Path) -> list[str]:
 
 
 def kept(folder: Path) -> set[str]:
-    """Return the rows that a command has kept so far."""
+    """Return the rows that a command has kept so far, and what it calls itself."""
     stores = [str(row) for path in folder.glob("*.sqlite") for row in _database(path).get("episodes", [])]
     lines = [line for path in folder.glob("episodes.jsonl") for line in _lines(path)]
-    return {*stores, *map(str, lines)}
+    names = [json.loads(path.read_text("utf-8"))["identity"] for path in folder.glob("progress.json")]
+    return {*stores, *map(str, lines), *names}
 
 
 def differences(one: Any, other: Any, at: str = "") -> list[str]:

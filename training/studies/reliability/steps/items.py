@@ -53,8 +53,18 @@ _DRIVERS = {
     "frontier": ("uniform", "constant", "extreme", "nonsense"),
 }  # fmt: skip
 
-_AT_ONCE = 1000  # steps of an item
+_AT_ONCE = 4000  # steps of an item that takes as long as most
 _LEAST = 20
+_MOST = 4  # times as many steps where one takes less
+
+# Of the processor, in thousandths of a second: only how many steps an item has hangs on them.
+_TYPICAL_MS, _STEP_MS, _RESET_MS = 1.0, 0.3, 40.0
+_BACKEND_MS = {
+    "truth": 0.05, "odometry": 0.05, "fastslam1": 0.4, "fastslam2": 0.6, "dp-slam": 1.0, "graph-slam": 1.0,
+}  # fmt: skip
+_OTHER_BACKEND_MS = 0.2
+_AGENT_MS = {"random": 0.1, "next-best-view": 4.0, "rrt": 2.0, "ppo-frontier": 2.0, "team-frontier": 2.0}
+_OTHER_AGENT_MS = 1.0
 
 
 class Item(NamedTuple):
@@ -90,23 +100,40 @@ class _Deck:
 
 
 def items(steps: int, seed: int) -> list[Item]:
-    """Return items of so many steps in all, those of a larger number the same and more of them."""
+    """Return items of so many steps in all, those of a larger number the same and more of them.
+
+    Each takes about as long as another: where a step is dear, there are fewer of them.
+    """
     each = min(max(steps // 50, _LEAST), _AT_ONCE)
     rng = np.random.default_rng([seed, 0])
     rooms_, backends, noises = _Deck(ROOMS, rng), _Deck(slam.names(), rng), _Deck(tuple(NOISES), rng)
     robots, teams, limits = _Deck(ROBOTS, rng), _Deck(tuple(TEAMS), rng), _Deck((60, 250, 3000), rng)
     drivers = {kind: _Deck(names, rng) for kind, names in _DRIVERS.items()}
-    made = []
-    for k in range(-(-steps // each)):
+    made: list[Item] = []
+    left = steps
+    while left > 0:
+        k = len(made)
         kind = KINDS[k % len(KINDS)]
         backend, team = backends.draw(), teams.draw() if kind == "team" else "-"
         if team == "joint" or (team in ("unknown starts", "unsure starts") and backend not in _JOINT_COV):
             backend = "ekf-lines"
-        made.append(Item(
+        item = Item(
             kind, rooms_.draw(), backend, noises.draw(), robots.draw(), drivers[kind].draw(), team, limits.draw(),
-            int(rng.integers(10_000, 2**31)), min(each, steps - k * each), int(k % 20 == 5),
-        ))  # fmt: skip
+            int(rng.integers(10_000, 2**31)), 0, int(k % 20 == 5),
+        )  # fmt: skip
+        share = min(_TYPICAL_MS / _step_ms(item), _MOST)
+        made.append(item._replace(steps=min(max(round(each * share), _LEAST), left)))
+        left -= made[-1].steps
     return made
+
+
+def _step_ms(item: Item) -> float:
+    """Return about how long a step of an item takes, resets and what is run twice in it."""
+    by_agent = item.kind == "frontier" or item.driver in agents.names()
+    driver = _AGENT_MS.get(item.driver, _OTHER_AGENT_MS) if by_agent else 0.0
+    twice = (item.kind == "batch") + (item.driver == "nonsense") + 1
+    step = _STEP_MS + _BACKEND_MS.get(item.slam, _OTHER_BACKEND_MS) + driver + _RESET_MS / item.limit
+    return twice * step
 
 
 def settings(item: Item, folder: Path) -> dict[str, Any]:
