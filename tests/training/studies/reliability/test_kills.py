@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from training.studies.reliability.kills import killing
+from training.studies.reliability.kills.alone import argv_of
 from training.studies.reliability.kills.commands import COMMANDS, installed
 from training.studies.reliability.kills.killing import Moment, Run, run
 from training.studies.reliability.kills.part import KILLS, _judged
@@ -125,3 +126,9 @@ def test_a_run_is_killed_when_its_folder_changes_and_nothing_of_it_goes_on(
     done = run([str(tmp_path / "out")], tmp_path / "out", Moment(signal=signal.SIGKILL, changes=3))
     assert done.code == -9 and done.killed and len(list((tmp_path / "out").iterdir())) < 50
     assert len(done.left) == 1 and "time.sleep" in done.left[0]
+
+
+def test_a_command_is_told_to_go_on_only_where_there_is_something_to_go_on_with(tmp_path: Path) -> None:
+    assert "--resume" not in argv_of("train", tmp_path)
+    (tmp_path / "progress.json").touch()
+    assert "--resume" in argv_of("train", tmp_path)

@@ -26,8 +26,8 @@ def undisturbed(name: str) -> tuple[dict[str, Any], Run]:
         return results(out), done
 
 
-def argv_of(name: str, out: Path, *, again: bool = False) -> Sequence[str]:
-    """Return the arguments of a command that writes to a folder; ``again`` where it goes on."""
+def argv_of(name: str, out: Path) -> Sequence[str]:
+    """Return the arguments of a command that writes to a folder, or goes on with what it holds."""
     command = COMMANDS[name]
     words = [word.replace("{in}", str(inputs())) for word in command.argv]
-    return [*words, *(command.again if again else ()), "--out", str(out)]
+    return [*words, *(command.again if (out / command.begun).exists() else ()), "--out", str(out)]

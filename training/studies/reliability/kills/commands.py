@@ -43,7 +43,8 @@ class KilledCommand:
     """A command line: ``{in}`` stands for :func:`inputs`, ``--out FOLDER`` comes behind it."""
 
     argv: Sequence[str]
-    again: Sequence[str] = ()  # put behind it where it goes on
+    again: Sequence[str] = ()  # put behind it where it goes on: where the folder holds ``begun``
+    begun: str = "settings.json"
     goes_on: bool = True  # what was kept before is kept; else it begins anew
     needs: str | None = None  # a module
 
@@ -60,7 +61,10 @@ COMMANDS: dict[str, KilledCommand] = {
     "replay": KilledCommand(argv=("replay", "{in}/log.clf", "--slam", "graph-slam"), goes_on=False),
     "study": KilledCommand(argv=_STUDY),
     "train": KilledCommand(
-        argv=("train", "--config", "{in}/train.toml", "--workers", "1"), again=("--resume",), needs="sb3_contrib"
+        argv=("train", "--config", "{in}/train.toml", "--workers", "1"),
+        again=("--resume",),
+        begun="progress.json",
+        needs="sb3_contrib",
     ),
     "ray": KilledCommand(argv=(*_BENCHMARK, "--ray", "local", "--workers", "2"), needs="ray"),
 }

@@ -43,7 +43,7 @@ def _work(job: Job) -> Row:
         before: set[str] = set()
         for k in range(kills):
             moment = _moment(rng, alone, k + index)
-            done = run(argv_of(name, place / "out", again=k > 0), place / "out", moment)
+            done = run(argv_of(name, place / "out"), place / "out", moment)
             row["seconds"] += done.seconds
             row["wrong"] += [f"kill {k} ({moment}): {line}" for line in _judged(done, moment)]
             if done.code == 0:
@@ -52,7 +52,7 @@ def _work(job: Job) -> Row:
             row["codes"].append(done.code)
             before = _left(place, COMMANDS[name].goes_on, before, row["wrong"])
         else:
-            done = run(argv_of(name, place / "out", again=kills > 0), place / "out")
+            done = run(argv_of(name, place / "out"), place / "out")
             row["seconds"] += done.seconds
             row["wrong"] += [f"at last: {line}" for line in _judged(done, None)]
         row["rows_kept"] = len(before)

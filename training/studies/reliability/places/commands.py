@@ -63,9 +63,9 @@ def _judged(name: str, end: tuple[int, str]) -> list[str]:
     return wrong
 
 
-def _whole(name: str, out: Path, *, again: bool) -> list[str]:
+def _whole(name: str, out: Path) -> list[str]:
     """Run a command where nothing is in the way, and hold it against one that nothing ever was."""
-    code, said = _end(_start(argv_of(name, out, again=again)))
+    code, said = _end(_start(argv_of(name, out)))
     if code:
         return [f"{name} ends with {code} once nothing is in the way: {said[-300:]}"]
     for path in out.iterdir():
@@ -117,7 +117,7 @@ def full_disk(seed: int) -> list[str]:
                 left = folder / "copy" / "out"
                 wrong += _judged(f"{name} on {size}", end)
                 wrong += [f"{name} on {size}: {line}" for line in (damaged(left) if left.exists() else ())]
-                wrong += _whole(name, left, again=left.exists())
+                wrong += _whole(name, left)
     return wrong
 
 
@@ -135,7 +135,7 @@ def small_files(seed: int) -> list[str]:
             wrong += [
                 f"{name} with files of {most} bytes: {line}" for line in (damaged(out) if out.exists() else ())
             ]
-            wrong += _whole(name, out, again=out.exists())
+            wrong += _whole(name, out)
     return wrong
 
 
@@ -184,7 +184,7 @@ def locked_store(seed: int) -> list[str]:
                 wrong += _judged("benchmark on a locked store", end)
             elif end[0]:
                 wrong.append(f"benchmark on a store that was locked for {held_s} s ends with {end}")
-        wrong += _whole("benchmark", out, again=True)
+        wrong += _whole("benchmark", out)
     return wrong
 
 
@@ -213,7 +213,7 @@ def clock_set_back(seed: int) -> list[str]:
                 wrong.append(f"{name} ends with {code}: {said[-300:]}")
             for path in (*out.rglob("*"), out):
                 os.utime(path, (time.time() + _TEN_YEARS_S,) * 2)
-            wrong += _whole(name, out, again=True)
+            wrong += _whole(name, out)
     return wrong
 
 
