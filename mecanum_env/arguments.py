@@ -24,7 +24,7 @@ from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.registry import check as check_rooms
 from mecanum_env.sensing.calibration import backend_settings
 from slam.backend import Backend
-from slam.files import quoted
+from slam.files import plain_name, quoted
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
@@ -92,7 +92,8 @@ def make_config(
     made = dataclasses.replace(base, **changes)
     plan = made.floor_plan
     require(
-        plan is None or Path(plan).is_file(), f"floor_plan {plan} does not exist, or is no file; check the path"
+        plan is None or Path(plan).is_file(),
+        f"floor_plan {plain_name(str(plan))} does not exist, or is no file; check the path",
     )
     with argument("rooms" if "rooms_config" in changes else "rooms_config"):
         check_rooms(made.rooms, made.rooms_config)

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from agents.learned.choice import Choice, mirrored
+from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored
 from agents.learned.layers import Layers
 from slam.types import Floats
 
@@ -67,17 +67,22 @@ class ChoiceNetwork(Layers):
         return np.asarray(centred / scale * self._weights[name + ".weight"] + self._weights[name + ".bias"])
 
     def _check(self) -> None:
-        width = len(self._weights["norm.bias"])
-        self._expect({
-            "patch_2.weight": (width, 2 * width), "token.weight": (width, width), "norm.weight": (width,),
-            "score.weight": (1, width), "score.bias": (1,),
-        })  # fmt: skip
+        width, seen = len(self._weights["norm.bias"]), self._weights["patch_1.weight"].shape[-1]
+        linear = {
+            "row": (width, len(CANDIDATE)), "state": (width, len(STATE)), "patch_1": (2 * width, seen),
+            "patch_2": (width, 2 * width), "token": (width, width), "score": (1, width),
+        }  # fmt: skip
+        norms = ["norm"]
         for k in range(self._layers):
-            self._expect({
-                f"layers.{k}.qkv.weight": (3 * width, width), f"layers.{k}.out.weight": (width, width),
-                f"layers.{k}.up.weight": (2 * width, width), f"layers.{k}.down.weight": (width, 2 * width),
-                f"layers.{k}.reach": (self._heads,),
-            })  # fmt: skip
+            norms += [f"layers.{k}.norm_1", f"layers.{k}.norm_2"]
+            linear |= {
+                f"layers.{k}.qkv": (3 * width, width), f"layers.{k}.out": (width, width),
+                f"layers.{k}.up": (2 * width, width), f"layers.{k}.down": (width, 2 * width),
+            }  # fmt: skip
+            self._expect({f"layers.{k}.reach": (self._heads,)})
+        self._expect({f"{name}.weight": shape for name, shape in linear.items()})
+        self._expect({f"{name}.bias": shape[:1] for name, shape in linear.items()})
+        self._expect({f"{name}.{kind}": (width,) for name in norms for kind in ("weight", "bias")})
 
 
 class ChoiceEnsemble:

@@ -29,8 +29,7 @@ def resume(
     Parameters
     ----------
     store
-        Lines of JSON, ``[job, row, checksum]``. A line that was cut off or damaged is a job to be done again; of
-        one without a checksum nothing is known but that it is JSON.
+        Lines of JSON, ``[job, row, checksum]``. A line that was cut off or damaged is a job to be done again.
     jobs, work, workers, what, apart
         See :func:`training.runs.campaign.run_all`; rows are what JSON can hold.
 
@@ -73,8 +72,8 @@ def _kept(store: Path) -> Iterator[tuple[str, Any]]:
         while line := file.readline(_LONGEST_LINE):
             try:
                 found = parse_json(line, what="a row", nan=True)
-                job, row, *checksum = found
-                if not checksum or checksum == [zlib.crc32(json.dumps([job, row]).encode())]:
+                job, row, checksum = found
+                if checksum == zlib.crc32(json.dumps([job, row]).encode()):
                     yield _text(job), row
             except (ValueError, TypeError):
                 continue

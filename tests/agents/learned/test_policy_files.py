@@ -8,9 +8,13 @@ import shutil
 from pathlib import Path
 
 import pytest
+from safetensors.numpy import load_file
 
 import agents
+from agents.learned.choice_network import ChoiceNetwork, apart
 from agents.ppo import SHIPPED
+
+POLICIES = SHIPPED.parent
 
 
 @pytest.fixture
@@ -37,6 +41,19 @@ def test_weights_that_are_no_numbers_are_refused(policy: Path) -> None:
     for byte in (b"\xff", b"\x7c"):  # nan, and infinity
         policy.write_bytes(sound[:begin] + byte * (len(sound) - begin))
         refused(policy, "no finite number" if byte == b"\xff" else "policy")
+
+
+def test_every_weight_that_choices_are_scored_with_has_to_be_there_and_to_fit() -> None:
+    about = json.loads((POLICIES / "ppo-frontier.json").read_text())
+    weights = apart(load_file(POLICIES / "ppo-frontier.safetensors"))[0]
+    heads = int(about["heads"])
+    ChoiceNetwork(weights, heads=heads)
+    for name in weights:
+        if not name.startswith("value_"):  # what a choice is worth is for training alone
+            with pytest.raises(ValueError, match=rf"^weight {name} is missing"):
+                ChoiceNetwork({other: w for other, w in weights.items() if other != name}, heads=heads)
+            with pytest.raises(ValueError, match=r"^weight .* has the shape"):
+                ChoiceNetwork(weights | {name: weights[name][..., None]}, heads=heads)
 
 
 @pytest.mark.parametrize("kind", ["BF16", "F8_E4M3", "I64", "BOOL", "F64", "OBJECT", ""])

@@ -68,6 +68,11 @@ def test_an_origin_is_on_earth(origin: str, tmp_path: Path) -> None:
     refused(write_map(tmp_path, origin=origin), "origin must be")
 
 
+def test_the_name_of_a_plan_that_is_not_there_is_written_out() -> None:
+    with pytest.raises(ValueError, match=r"floor_plan a\\x00\\x1b\.png does not exist"):
+        ExploreEnv(floor_plan="a\0\x1b.png")
+
+
 def test_noise_is_no_plan(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 2, (400, 400)).astype(np.uint8) * 255
     cv2.imwrite(str(tmp_path / "noise.png"), noise)
