@@ -170,17 +170,22 @@ class Relocaliser:
         turns = math.ceil(2.0 * math.pi / config.spacing_rad)
         scores = np.zeros((len(near), turns), np.float32)
         _score(highest, likelihood.x0, likelihood.y0, likelihood.cell_m, few, near, scores)
-        found: list[Array] = []
         best_turn = scores.argmax(axis=1)
         best = scores[np.arange(len(near)), best_turn]
+        headings = [wrap_scalar(2.0 * math.pi * turn / turns) for turn in range(turns)]
+        chosen: list[tuple[float, float, float]] = []
         # Of each position its best heading, and all others at the best positions.
         for k in np.argsort(-best, kind="stable")[: 40 * config.candidates].tolist():
+            x, y = near[k].tolist()
+            beside = [other[2] for other in chosen if math.hypot(x - other[0], y - other[1]) <= config.apart_m]
             for turn in np.argsort(-scores[k], kind="stable")[:8].tolist():
-                pose = np.array([near[k, 0], near[k, 1], wrap_scalar(2.0 * math.pi * turn / turns)])
-                if all(self._apart(pose, other) for other in found):
-                    found.append(pose)
-            if len(found) >= 3 * config.candidates:
+                theta = headings[turn]
+                if all(abs(wrap_scalar(theta - other)) > config.apart_rad for other in beside):
+                    chosen.append((x, y, theta))
+                    beside.append(theta)
+            if len(chosen) >= 3 * config.candidates:
                 break
+        found = [np.array(pose) for pose in chosen]
         order = sorted(found, key=lambda pose: -self._lattice_score(scores, near, pose, turns))
         return order[: config.candidates]
 

@@ -9,6 +9,7 @@ import pytest
 
 from slam.geometry import wrap
 from slam.grids.occupancy import OccupancyGrid
+from slam.grids.scan_matching import body_points
 from slam.health.relocalisation import RelocalisationConfig, Relocaliser
 from slam.types import Scan
 from tests.slam.simulated import ANGLE_MIN, ANGLES, BEAMS, INCREMENT, room_scan
@@ -54,6 +55,17 @@ def test_a_scan_is_found_from_anywhere(radius: float) -> None:
         assert place.good
         assert np.hypot(*(place.pose - pose)[:2]) < 0.04
         assert abs(float(wrap(place.pose[2] - pose[2]))) < 0.01
+
+
+def test_places_that_are_looked_at_lie_apart_from_each_other() -> None:
+    grid = grid_of(l_scan, ((1.0, 1.0), (5.0, 1.5), (2.0, 4.0)))
+    config = RelocalisationConfig()
+    finder = Relocaliser(config, grid, 0.0)
+    points = body_points(l_scan(np.array([2.5, 4.0, 0.4])), config.matching, offset_m=0.0)
+    likelihood = finder._field_around(np.zeros(3), math.inf)
+    found = finder._candidates(likelihood, finder._free, points)
+    assert len(found) == config.candidates
+    assert all(finder._apart(a, b) for k, a in enumerate(found) for b in found[:k])
 
 
 def test_a_rectangle_has_two_places_for_every_scan() -> None:
