@@ -73,8 +73,12 @@ class GivingWay:
         config = self.config
         idle = speed_m_s is None
         mate = self.nearest(belief, config.idle_near_m if idle else config.near_m)
-        if mate is None or (mate.goal is None if idle else speed_m_s is not None and speed_m_s > _SLOW_M_S):
+        if mate is None or (idle and mate.goal is None):
             self._held_s = 0.0
+            return None
+        if speed_m_s is not None and speed_m_s > _SLOW_M_S:
+            # Two that stand before each other get a little way on now and then.
+            self._held_s = max(self._held_s - step_s, 0.0)
             return None
         self._held_s += step_s
         behind = idle or (mate.robot < belief.robot and mate.goal is not None)

@@ -110,9 +110,10 @@ class Commuter(Explorer):
         return True
 
 
+@pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize("bay", [3.0, 4.2])
 @pytest.mark.parametrize("order", [1, -1])
-def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order):
+def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed):
     """Wherever the bay is, and whoever of the two has right of way."""
     left, right = bay, bay + 1.6
     walls = [
@@ -125,7 +126,7 @@ def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order):
     starts = np.array([[0.8, 0.6, 0.0], [8.2, 0.6, 0.0]])[::order]
     plan = FloorPlan(name="bay", walls=np.array(walls), free=free, resolution=0.05, start=tuple(starts[0]))
     team = Team(robots=2, floor_plan=plan)
-    observed = team.reset(seed=0, options={"start_poses": starts})
+    observed = team.reset(seed=seed, options={"start_poses": starts})
     crew = {}
     for member in team.members:
         crew[member.number] = agent = Commuter(step_s=0.1)
