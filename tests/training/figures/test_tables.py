@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -61,7 +62,9 @@ def test_rows_are_resumed_and_a_line_cut_off_is_done_again(tmp_path: Path) -> No
     store = tmp_path / "new" / "rows.jsonl"
     assert resume(store, [("a", 1), ("a", 2)], double, workers=1) == {("a", 1): [2], ("a", 2): [4]}
     first, second = store.read_text().splitlines()
-    store.write_text(f"{json.dumps([['b', 3], [7]])}\n{first}\n{second[:9]}")
+    kept = [["b", 3], [7]]
+    other = json.dumps([*kept, zlib.crc32(json.dumps(kept).encode())])
+    store.write_text(f"{other}\n{first}\n{second[:9]}")
     rows = resume(store, [("b", 3), ("a", 2)], double, workers=1)
     assert rows == {("b", 3): [7], ("a", 2): [4]} and list(rows) == [("b", 3), ("a", 2)]
     assert resume(store, [("a", 2), ("a", 1)], pytest.fail, workers=1) == {("a", 2): [4], ("a", 1): [2]}
