@@ -112,6 +112,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         far, size = state_rows(self._far, robot=False), change.left.shape[1]
         x, delta, columns = self._map_x.copy(), change.x - self._map_x, np.zeros((3, len(change.x)))
         x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
+        # Walls far away were settled long ago.
         _retract(x, int(far.max()) + 1, delta, self._map_marks, columns, math.inf)
         a, robot = np.zeros((3, size)), [2, 0, 1]
         a[:, far] = columns[:, far]

@@ -32,6 +32,16 @@ def chosen(name: str, classes: np.ndarray, x: float, y: float, config: dict | No
     return agent.choose(belief)
 
 
+def driven(agent: agents.Agent, classes: np.ndarray, pose: np.ndarray, steps: int) -> np.ndarray:
+    """Let an agent drive over a map that stands still, until it has no goal; return its last pose ``(3,)``."""
+    agent.reset(belief_of(classes, tuple(pose)))
+    for _ in range(steps):
+        pose = drive(pose, agent.act(None, belief_of(classes, tuple(pose))), RobotConfig())
+        if agent.goal is None:
+            break
+    return pose
+
+
 @pytest.mark.parametrize("name", WEIGHING)
 def test_a_hall_farther_away_before_a_nook_nearby(name):
     assert chosen("nearest-frontier", nook_and_hall(), 4.8, 1.5).pose[0] < 4.8
@@ -69,12 +79,7 @@ def test_a_frontier_that_never_yields_ends_it(name):
     fill(classes, 4.5, 1.5, 5.0, 2.5, UNKNOWN)
     pose = np.array([1.0, 2.0, 0.0])
     agent = agents.make(name, config={"frontiers": SHORT})
-    agent.reset(belief_of(classes, tuple(pose)))
-    for _ in range(400):
-        belief = belief_of(classes, tuple(pose))
-        pose = drive(pose, agent.act(None, belief), RobotConfig())
-        if agent.goal is None:
-            break
+    pose = driven(agent, classes, pose, 400)
     assert agent.status == "covered"
     assert pose[0] > 2.5  # it did go there
 
@@ -185,10 +190,5 @@ def test_a_robot_does_not_go_to_and_fro_between_two_goals_for_ever(doubts, ends)
     fill(classes, 11.0, 0.0, 12.0, 4.0, UNKNOWN)
     pose = np.array([5.5, 2.0, 0.0])
     agent = Fickle({"frontiers": SHORT, "patience": {"doubts": doubts, "looks": 1}})
-    agent.reset(belief_of(classes, tuple(pose)))
-    for _ in range(1200):
-        belief = belief_of(classes, tuple(pose))
-        pose = drive(pose, agent.act(None, belief), RobotConfig())
-        if agent.goal is None:
-            break
+    driven(agent, classes, pose, 1200)
     assert (agent.goal is None) is ends
