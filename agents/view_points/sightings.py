@@ -41,8 +41,8 @@ class SensorModel(Config):
     corner_sigma_m: Sigma = 0.004  # … and what remains however near it is
     wall_length_m: Length = 0.6  # least of a wall to be taken for one
     wall_beams: Positive = 10.0
-    wall_sigma_m: Sigma = 0.0003  # that straight walls are not
-    wall_sigma_rad: Sigma = 0.0002
+    wall_sigma_m: Sigma = 0.0002  # that straight walls are not
+    wall_sigma_rad: Sigma = 0.00005
 
 
 def expected_sightings(

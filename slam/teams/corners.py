@@ -38,8 +38,8 @@ class CornerConfig(Config):
     gate: Annotated[float, Within("(0, 1)")] = 0.997  # probability of χ² of the distance from the wall
     crossing_rad: Angle = 0.96  # least angle between two walls that make a corner
     # The end of a surface lies between two beams: a uniform error, of a twelfth of the squared spacing. The filter
-    # takes all of that, sixteen times (FeatureConfig.edge_sigma and wall_lasting_scans) …
-    end_share: Share = 1.0 / (12.0 * 16.0)
+    # takes all of that, four times (FeatureConfig.edge_sigma and wall_lasting_scans) …
+    end_share: Share = 1.0 / (12.0 * 4.0)
     end_sigma_m: Length = 0.0075  # … for this, which is much the same however often the end is seen
 
 

@@ -74,7 +74,8 @@ def test_a_piece_of_an_arc_is_turned_into_the_line_of_its_landmark(seed: int) ->
     marks[0, 10] = at
     off = abs(z[0, 1] - (alpha - pose[2]))
     straighten(x, OFFSET, z, np.zeros(1, np.int64), marks, curvature_model(FeatureConfig()))
-    assert abs(z[0, 1] - (alpha - pose[2])) <= 0.005 * off + 1e-9
+    # A curvature within its σ is hardly believed: the wall is more likely straight.
+    assert abs(z[0, 1] - (alpha - pose[2])) <= 0.005 * off + math.sqrt(1e-9) * abs(beyond)
     assert z[0, 0] == pytest.approx(r - e @ sensor, abs=0.002)  # of 7 cm that the arc departs by
     assert marks[0, 9] / marks[0, 8] == pytest.approx(kappa)
 

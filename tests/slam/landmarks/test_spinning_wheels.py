@@ -44,8 +44,10 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
     assert not suspected(off, 1, 1)  # and what is not seen explains nothing
     assert not suspected(off, 0, 4, recent=2)
     wheels.note(scan, off, 5, matched(1, 4))  # nothing to compare with: the fit there is bad
-    assert suspected(off, 1, 4)
-    assert wheels.explain(200.0, 50.0)
+    assert suspected(off, 3, 2)
+    assert not wheels.explain(530.0, 500.0)
+    assert suspected(off, 2, 3)
+    assert wheels.explain(530.0, 500.0)  # most landmarks are missed: less will do
     assert suspected(here, 5, 0)  # they did, lately
 
 
