@@ -47,8 +47,7 @@ class FeatureConfig(Config):
     edge_jump_m: Gap = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: Gap = 0.2  # farthest apart that two beams may meet the surface there
     # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen
-    # so that the average pose NEES/3 is near 1 in five kinds of rooms (training seeds 200-239), as the noise is and
-    # three times that, and on three floors.
+    # for an average pose NEES/3 of 0.7 to 1.2 in five kinds of rooms (training seeds 200-239) and on three floors.
     sigma_floor_m: Sigma = 0.0003
     # Of a surface that is a landmark itself, where the backend takes walls.
     wall_length_m: Length = 0.6

@@ -23,11 +23,11 @@ FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
 
 _FEWEST_RECENT = 3  # landmarks that the last scans showed, below which none is missed
-# Log-odds [nat] by which a scan fits worse; by which it must fit better, and where fewer than half of the landmarks
-# are still matched. Of 692 explanations that robots driven at random needed 610 come up to that (rooms with straight
-# walls, training seeds 200-205), of 314 not needed none; through the doors of 20 drives on floors 5 of 645 do, which
-# are the view that changed, and 23 would if the least were enough for two thirds. All 692 were right. In caves
-# every tenth is wrong, half of those by more than 80 nat.
+# Log-odds [nat] by which a scan fits worse; by which it must fit better, and where less than half of the landmarks
+# are still matched. Of 692 explanations that robots driven at random needed 610 come up to that, of 314 not needed
+# none (rooms with straight walls, training seeds 200-205): all were right. At the doors of 20 drives on floors,
+# where it is the view that changed, 5 of 645 do, and 23 would if two thirds were few enough. In caves every tenth
+# is wrong, half of those by more than 80 nat.
 _WORSE_NAT, _SURE_NAT, _MOST_MISSED_NAT = 30.0, 80.0, 20.0
 _LATELY = 6  # scans for which wheels that spun are not believed
 
