@@ -103,8 +103,10 @@ class Explorer(Driver):
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
-            if self._target is not None and candidates.current is None and self._seen_from(belief):
+            gone = self._target is not None and candidates.current is None
+            if gone and (self._doubts >= self.config.patience.doubts or self._seen_from(belief)):
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
+                assert self._target is not None
                 self._troubles.note(self._target).looks += 1
             cost = float(candidates.costs[index])
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
@@ -116,12 +118,16 @@ class Explorer(Driver):
     def _kept(self, picked: int, candidates: Candidates, belief: Belief) -> int:
         """Return the candidate to go to: the one picked, or the current one after too many changes of mind.
 
-        What is picked depends on where the robot stands: between two goals it may go to and fro for ever.
+        What is picked depends on where the robot stands, and far beams let frontiers come and go: between two
+        goals it may go to and fro for ever.
         """
         current, known = candidates.current, belief.grid.known_cells
         if (known - self._doubts_on) * belief.grid.resolution**2 >= self.config.patience.progress_m2:
             self._doubts, self._doubts_on = 0, known
-        if current is None or picked == current:
+        if current is None:
+            self._doubts += self._target is not None  # it is gone, and nothing has been found by it
+            return picked
+        if picked == current:
             return picked
         targets = candidates.frontiers.targets
         if math.hypot(*(targets[picked] - targets[current]).tolist()) <= self.config.patience.same_m:
@@ -159,8 +165,8 @@ class Explorer(Driver):
         if self._ending == "unreachable" and not np.isfinite(found.costs).any():
             sure = self._cost_maps.of(belief, sigma_m=0.0)
             found = self._candidates_on(sure)
-        # Between two beams there may be a door.
-        if self._sparse and self._ending == "covered" and not np.isfinite(found.costs).any():
+        # Between two beams there may be a door, or the way to what is left.
+        if self._sparse and self._ending in ("covered", "unreachable") and not np.isfinite(found.costs).any():
             finest = self._frontier_config.finest(found.cost_map.resolution)
             found = self._candidates_on(found.cost_map, finest)
         return self._own_part(found, belief) if belief.teammates else found

@@ -23,7 +23,7 @@ from slam.types import Array
 __all__ = ["Driver", "DriverConfig"]
 
 _LOST = 0.1  # health of a belief below which it is no good for driving
-_FIRST_LOOK_S = 1.0
+_LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
 class DriverConfig(Protocol):
@@ -64,6 +64,7 @@ class Driver(Agent):
         self._time = 0.0
         self._chosen_at = -math.inf
         self._chosen_on = 0  # known cells
+        self._had_one_at = 0.0  # when there was a goal to give up, or the start
         self._target: Array | None = None  # the frontier point behind the goal
         self._deadline = math.inf
         self._arrived_for = 0.0
@@ -94,7 +95,10 @@ class Driver(Agent):
             self._status = "giving way"
             return self._to_action(self._follower.follow(observation, belief))
         if self._due(belief):
+            had_one = self._goal is not None
             self._goal = self.choose(belief)
+            if had_one:
+                self._had_one_at = self._time
             self._chosen_at, self._chosen_on = self._time, belief.grid.known_cells
             if self._goal is not None:
                 # Who sees all round need not turn to look.
@@ -102,8 +106,8 @@ class Driver(Agent):
                 self._follower.set_path(self._goal.path, None if all_round else float(self._goal.pose[2]))
         self._time += self._step_s
         if self._goal is None:
-            if self._status == "unreachable" and self._time < _FIRST_LOOK_S:
-                self._status = "looking"  # the first scans may have lost the beams that show the way out
+            if self._status == "unreachable" and self._time < self._had_one_at + _LOOK_S:
+                self._status = "looking"
             self._follower.reset()
             self._anchored_at = self._time
             return np.zeros(3, dtype=np.float32)
