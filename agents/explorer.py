@@ -90,7 +90,7 @@ class Explorer(Driver):
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
-        if self._is_last(candidates, belief):
+        if self._stands_by_it(candidates, belief):
             return self._goal
         if not np.isfinite(candidates.costs).any():
             self._target = None
@@ -103,10 +103,8 @@ class Explorer(Driver):
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
-            gone = self._target is not None and candidates.current is None
-            if gone and (self._doubts >= self.config.patience.doubts or self._seen_from(belief)):
+            if self._target is not None and candidates.current is None and self._seen_from(belief):
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
-                assert self._target is not None
                 self._troubles.note(self._target).looks += 1
             cost = float(candidates.costs[index])
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
@@ -142,9 +140,14 @@ class Explorer(Driver):
         assert self._target is not None
         return not self._sparse or math.hypot(*(self._target - belief.pose[:2]).tolist()) <= self._dense_m
 
-    def _is_last(self, candidates: Candidates, belief: Belief) -> bool:
-        """Whether nothing is left, and the target gone for no better reason than beams that lie far apart."""
-        if self._target is None or self._goal is None or np.isfinite(candidates.costs).any():
+    def _stands_by_it(self, candidates: Candidates, belief: Belief) -> bool:
+        """Whether the target vanished between beams that lie far apart, and is gone to all the same.
+
+        That is so where nothing else is left, and after too many changes of mind.
+        """
+        if self._target is None or self._goal is None or candidates.current is not None:
+            return False
+        if np.isfinite(candidates.costs).any() and self._doubts < self.config.patience.doubts:
             return False
         return not (self._seen_from(belief) or self._follower.blocked) and self._time < self._deadline
 

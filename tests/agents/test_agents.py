@@ -318,6 +318,7 @@ def test_the_policy_over_view_points_is_driven_as_the_tour_that_it_is_compared_w
     [
         (1, LidarConfig(beams=90), 0.005),
         (4, LidarConfig(beams=90), 0.005),  # once, for a moment, there is no way out
+        (5, LidarConfig(beams=90), 0.005),
         (11, LidarConfig(beams=90), 0.005),  # frontiers that come and go
         (12, LidarConfig(beams=90), 0.005),  # the way to what is left is a gap between beams
         (5, LidarConfig(), 0.3),
