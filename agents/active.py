@@ -97,7 +97,7 @@ class ActiveSlam(PpoFrontier):
     # ---- looking first ---------------------------------------------------------------------------------------
 
     def _look(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
-        """Stand for a step; a goal is there from the beginning, if there is one at all."""
+        """Stand for a step; a goal is there from the beginning, if the first scan shows one."""
         assert self._looked_s is not None
         self._wheels.look(observation, belief)
         self._keep_watch(belief)
@@ -105,8 +105,7 @@ class ActiveSlam(PpoFrontier):
             self._goal = self.choose(belief)
         self._looked_s += self._step_s
         self._gentle.stand()
-        if self._goal is not None:
-            self._status = "looking"
+        self._status = "looking"
         return np.zeros(3, dtype=np.float32)
 
     def _looks_on(self, belief: Belief) -> bool:

@@ -217,6 +217,18 @@ def test_enclosed_robot_stays():
     assert ready("nearest-frontier", belief).choose(belief_of(classes, (4.0, 4.0, 0.0))) is not None
 
 
+@pytest.mark.parametrize("name", ["nearest-frontier", "brisk-tour", "active", "ppo-frontier"])
+def test_a_first_scan_that_lost_many_beams_is_no_reason_to_stop(name: str) -> None:
+    env = ExploreEnv(rooms="cave", noise=NoiseConfig(dropout=0.3))
+    observation, _ = env.reset(seed=313)
+    agent = agents.make(name, lidar=env.config.lidar, step_s=env.config.step_s)
+    agent.reset(env.belief, 313)
+    for _ in range(40):
+        observation, *_ = env.step(agent.act(observation, env.belief))
+        assert not agent.ended
+    assert agent.goal is not None
+
+
 @pytest.mark.parametrize(("depth_m", "chosen"), [(4.0, True), (0.3, False)])
 def test_a_narrow_opening_far_away_is_gone_to_at_last(depth_m, chosen):
     """0.7 m wide, less the walls' nearness, and 9 m away: too far for a niche, but there may be a room behind."""
