@@ -223,7 +223,7 @@ def test_a_first_scan_that_lost_many_beams_is_no_reason_to_stop(name: str) -> No
     observation, _ = env.reset(seed=313)
     agent = agents.make(name, lidar=env.config.lidar, step_s=env.config.step_s)
     agent.reset(env.belief, 313)
-    for _ in range(40):
+    for _ in range(60):  # `active` looks for up to five seconds
         observation, *_ = env.step(agent.act(observation, env.belief))
         assert not agent.ended
     assert agent.goal is not None
