@@ -24,6 +24,7 @@ class Agreement(NamedTuple):
 
     on_walls: int  # ended in an occupied cell, or beside one
     sharp: int  # of those, ended in it
+    blurred: int  # of those, ended before it, in a cell that is known to be free, or right behind it
     in_the_open: int  # ended among cells that are known to be free
 
     @property
@@ -36,6 +37,16 @@ class Agreement(NamedTuple):
         """Share of the beams that speak against the pose; 0 where none said anything."""
         beams = self.on_walls + self.in_the_open
         return self.in_the_open / beams if beams else 0.0
+
+    @property
+    def sharpness(self) -> float:
+        """Share of the beams that end right to the cell, of those that tell; 1 where none does.
+
+        A wall that was seen from far away is drawn in pieces: what ends beside one, in a cell hardly seen yet,
+        may have ended on the next.
+        """
+        tell = self.sharp + self.blurred
+        return self.sharp / tell if tell else 1.0
 
 
 def agreement(
@@ -79,9 +90,9 @@ def _around(log_odds: NDArray[np.int8], row: int, col: int) -> tuple[int, bool]:
 def _count_beams(
     log_odds: NDArray[np.int8], row0: int, col0: int, resolution: float, ranges: Array, angle_min: float,
     increment: float, range_max: float, x: float, y: float, theta: float, stride: int,
-) -> tuple[int, int, int]:  # fmt: skip
+) -> tuple[int, int, int, int]:  # fmt: skip
     rows, cols = log_odds.shape
-    on_walls, sharp, in_the_open = 0, 0, 0
+    on_walls, sharp, blurred, in_the_open = 0, 0, 0, 0
     # Directions of the beams one after the other, each turned on from the one before it.
     c, s = math.cos(theta + angle_min), math.sin(theta + angle_min)
     turn_c, turn_s = math.cos(stride * increment), math.sin(stride * increment)
@@ -92,15 +103,19 @@ def _count_beams(
             reach = r / resolution + 0.25  # what stopped the beam lies behind where it returned from
             col, row = int(u0 + c * reach), int(v0 + s * reach)
             if 0 < row < rows - 1 and 0 < col < cols - 1:
-                if log_odds[row, col] >= OCCUPIED_FROM:  # as most are
+                value = log_odds[row, col]
+                if value >= OCCUPIED_FROM:  # as most are
                     on_walls += 1
                     sharp += 1
                 else:
                     highest, known = _around(log_odds, row, col)
-                    on_walls += highest >= OCCUPIED_FROM
+                    if highest >= OCCUPIED_FROM:
+                        on_walls += 1
+                        before = log_odds[int(v0 + s * (reach - 1.0)), int(u0 + c * (reach - 1.0))]
+                        blurred += value <= FREE_UP_TO or before >= OCCUPIED_FROM
                     in_the_open += highest <= FREE_UP_TO and known
         c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
-    return on_walls, sharp, in_the_open
+    return on_walls, sharp, blurred, in_the_open
 
 
 def agrees(grid: OccupancyGrid, body: Array, offset_m: float, scan: Scan, beams: int) -> bool:
@@ -123,10 +138,10 @@ def _agrees(
 ) -> bool:  # fmt: skip
     theta = body[2]
     x, y = body[0] + offset * math.cos(theta), body[1] + offset * math.sin(theta)
-    on_walls, sharp, in_the_open = _count_beams(
+    on_walls, sharp, blurred, in_the_open = _count_beams(
         log_odds, row0, col0, resolution, ranges, angle_min, increment, range_max, x, y, theta, stride
     )
-    return in_the_open <= 0.03 * on_walls and sharp >= 0.9 * on_walls
+    return in_the_open <= 0.03 * on_walls and sharp >= 0.9 * (sharp + blurred)
 
 
 def through_walls(

@@ -114,22 +114,18 @@ class HealthMonitor:
 
     def doubtful(self, seen: Agreement) -> bool:
         """Tell whether a scan speaks against the pose that it was looked at from."""
-        on_walls, sharp, in_the_open = seen
-        beams = on_walls + in_the_open
-        if beams < self.config.fewest_beams:
+        if seen.beams < self.config.fewest_beams:
             return False
-        return in_the_open > self.config.doubt_against * beams or sharp < self.config.doubt_sharp * on_walls
+        return seen.against > self.config.doubt_against or seen.sharpness < self.config.doubt_sharp
 
     def take(self, seen: Agreement, variance: float) -> None:
         """Take in what a scan says, the ends of its beams being known to ``variance`` [m²]."""
         c = self.config
-        on_walls, sharp, in_the_open = seen
-        beams = on_walls + in_the_open
         odds = self._odds + self._prior_odds
-        if beams >= c.fewest_beams:
-            ratio = self._against[_bin(in_the_open / beams, c.against_edges)]
-            if on_walls:
-                ratio += self._sharp[_bin(sharp / on_walls, c.sharp_edges)]
+        if seen.beams >= c.fewest_beams:
+            ratio = self._against[_bin(seen.against, c.against_edges)]
+            if seen.sharp + seen.blurred:
+                ratio += self._sharp[_bin(seen.sharpness, c.sharp_edges)]
             odds *= math.exp(c.scan_weight * ratio / (1.0 + variance / c.blur_m**2))
         self._odds = min(max(odds, _LEAST_ODDS), 1e6)
         self._judge()

@@ -29,7 +29,7 @@ def room_grid() -> OccupancyGrid:
 def simply(grid: OccupancyGrid, pose: tuple[float, float, float], scan: Scan, stride: int) -> Agreement:
     """The same, cell by cell."""
     classes = grid.classes()
-    on_walls = sharp = in_the_open = 0
+    on_walls = sharp = blurred = in_the_open = 0
     for k in range(0, len(scan.ranges), stride):
         r = scan.ranges[k]
         if not r <= scan.range_max:
@@ -43,9 +43,14 @@ def simply(grid: OccupancyGrid, pose: tuple[float, float, float], scan: Scan, st
         if (classes[around] == OCCUPIED).any():
             on_walls += 1
             sharp += classes[row, col] == OCCUPIED
+            last = np.array(
+                [[pose[0] + (reach - 0.05) * math.cos(angle), pose[1] + (reach - 0.05) * math.sin(angle)]]
+            )
+            before = classes[tuple(grid.to_cells(last)[0])]
+            blurred += classes[row, col] != OCCUPIED and (classes[row, col] == FREE or before == OCCUPIED)
         elif (classes[around] == FREE).all() and (grid.log_odds[around] != 0).all():
             in_the_open += 1
-    return Agreement(on_walls, int(sharp), in_the_open)
+    return Agreement(on_walls, int(sharp), int(blurred), in_the_open)
 
 
 @settings(max_examples=30)
@@ -66,8 +71,25 @@ def test_the_right_pose_agrees_and_the_map_of_nothing_says_nothing(true: tuple[f
     assert seen.against == 0.0
     assert seen.beams > 80
     empty = agreement(OccupancyGrid(0.05), true, scan, 90)
-    assert empty == Agreement(0, 0, 0)
+    assert empty == Agreement(0, 0, 0, 0)
     assert empty.against == 0.0
+
+
+def test_a_wall_drawn_in_pieces_does_not_blur_a_scan() -> None:
+    classes = np.full((60, 100), FREE, np.int8)
+    classes[:, 70:] = UNKNOWN
+    classes[::3, 70] = OCCUPIED  # every third cell of the wall at x = 3.5 to 3.55 m
+    grid = OccupancyGrid.from_classes(classes, 0.05, (0.0, 0.0))
+    angles = np.arange(-4, 5) * 0.02  # a cell of the wall each
+
+    def seen(wall_m: float) -> Agreement:
+        scan = Scan((wall_m - 1.0) / np.cos(angles), angles[0], 0.02, 8.0)
+        return agreement(grid, (1.0, 1.525, 0.0), scan, 9)
+
+    assert seen(3.51) == Agreement(on_walls=9, sharp=3, blurred=0, in_the_open=0)
+    assert seen(3.46) == Agreement(on_walls=9, sharp=0, blurred=9, in_the_open=0)
+    assert seen(3.56) == Agreement(on_walls=9, sharp=0, blurred=3, in_the_open=0)  # through what is drawn of it
+    assert (seen(3.51).sharpness, seen(3.46).sharpness, seen(3.56).sharpness) == (1.0, 0.0, 0.0)
 
 
 def test_beams_that_lie_far_apart_do_not_speak_of_what_stands_between() -> None:

@@ -13,8 +13,8 @@ from slam.health.monitor import HealthConfig, HealthMonitor
 
 CONFIG = HealthConfig()
 agreements = st.builds(
-    lambda walls, sharp, free: Agreement(walls, min(walls, sharp), free),
-    st.integers(0, 100), st.integers(0, 100), st.integers(0, 100),
+    lambda sharp, blurred, unseen, free: Agreement(sharp + blurred + unseen, sharp, blurred, free),
+    st.integers(0, 50), st.integers(0, 50), st.integers(0, 50), st.integers(0, 100),
 )  # fmt: skip
 
 
@@ -31,7 +31,7 @@ def test_health_is_a_probability_and_no_larger_than_that_of_being_fine(
 def test_one_step_is_bayes_rule() -> None:
     monitor = HealthMonitor(CONFIG)
     monitor.restart(0.5)
-    monitor.take(Agreement(50, 20, 50), 0.0)  # half in the open, two fifths sharp: the last and the first bin
+    monitor.take(Agreement(50, 20, 30, 50), 0.0)  # half in the open, two fifths sharp: the last and the first bin
     lost = CONFIG.against_lost[-1] * CONFIG.sharp_lost[0]
     fine = CONFIG.against_fine[-1] * CONFIG.sharp_fine[0]
     prior = 1.0 + CONFIG.lost_per_scan  # odds, with what may have happened since the last scan
@@ -43,18 +43,18 @@ def test_one_step_is_bayes_rule() -> None:
 def test_a_wide_covariance_excuses_what_a_scan_says() -> None:
     sure, unsure = HealthMonitor(CONFIG), HealthMonitor(CONFIG)
     for _ in range(8):
-        sure.take(Agreement(50, 20, 50), 1e-6)
-        unsure.take(Agreement(50, 20, 50), 1.0)
+        sure.take(Agreement(50, 20, 30, 50), 1e-6)
+        unsure.take(Agreement(50, 20, 30, 50), 1.0)
     assert sure.fine < 0.5 * unsure.fine
 
 
 def test_few_beams_say_nothing() -> None:
     monitor = HealthMonitor(CONFIG)
     before = monitor.fine
-    monitor.take(Agreement(0, 0, CONFIG.fewest_beams - 1), 0.0)
+    monitor.take(Agreement(0, 0, 0, CONFIG.fewest_beams - 1), 0.0)
     assert monitor.fine == pytest.approx(before, abs=2e-5)
-    assert not monitor.doubtful(Agreement(0, 0, CONFIG.fewest_beams - 1))
-    assert monitor.doubtful(Agreement(0, 0, CONFIG.fewest_beams))
+    assert not monitor.doubtful(Agreement(0, 0, 0, CONFIG.fewest_beams - 1))
+    assert monitor.doubtful(Agreement(0, 0, 0, CONFIG.fewest_beams))
 
 
 def test_large_innovations_lower_it() -> None:
