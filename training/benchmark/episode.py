@@ -51,7 +51,9 @@ class EpisodeJob:
     seed: int
     agent: str
     slam: str
-    noise: str
+    noise: str | None  # None: the robot's, or the configuration's
+    robot: str | None = None
+    config: Path | None = None
     rooms: str | None = None
     floor_plan: Path | None = None
     max_steps: int | None = None  # None: as `mecanum explore` has it, by the place's area
@@ -66,7 +68,8 @@ class EpisodeJob:
         """What :func:`training.episodes.explore.prepare` is asked for; nothing is written to ``out``."""
         return {
             "out": Path(tempfile.gettempdir()), "agent": self.agent, "rooms": self.rooms, "slam": self.slam,
-            "noise": self.noise, "seed": self.seed, "floor_plan": self.floor_plan, "max_steps": self.max_steps,
+            "robot": self.robot, "noise": self.noise, "config": self.config, "seed": self.seed,
+            "floor_plan": self.floor_plan, "max_steps": self.max_steps,
         }  # fmt: skip
 
 

@@ -23,11 +23,12 @@ from training.benchmark import suites
 from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
 from training.benchmark.figures import Group, group_rows, with_regrets
 from training.benchmark.output import FILES, Report, markdown, write_tables
-from training.benchmark.suites import SPLITS, Place, Suite
+from training.benchmark.suites import NOMINAL, SPLITS, Place, Suite
 from training.benchmark.team_episode import TeamJob, run_job
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.room_pictures import parse_seeds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
+from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import code_digest, short_digest
 from training.runs.running import versions
@@ -68,12 +69,14 @@ class BenchmarkPlan:
     baseline: str | None  # the agent that the others are compared with
     max_steps: int | None
     teams: tuple[TeamConfig | None, ...] = (None,)  # None: one robot alone
+    robot: str | None = None  # a preset, with its lidar and noise
+    config: Path | None = None  # a file that says what robot, lidar, noise, rewards, … are like
 
     @classmethod
     def parse(
         cls, *, suite: str | None, agents: str, slam: str | None, split: str = "test", seeds: str | None = None,
         baseline: str | None = None, floor_plans: Path | None = None, max_steps: int | None = None,
-        teams: tuple[TeamConfig | None, ...] = (None,),
+        teams: tuple[TeamConfig | None, ...] = (None,), robot: str | None = None, config: Path | None = None,
     ) -> BenchmarkPlan:  # fmt: skip
         """Check options as typed; :class:`BadInput` says what is allowed."""
         with bad_input():
@@ -86,17 +89,32 @@ class BenchmarkPlan:
             if suite is None:
                 suite = "apartments" if floor_plans is None else suites.FLOOR_PLANS
             which = suites.choose(suite, floor_plans=floor_plans)
+            make_config(config=config, robot=robot)
         if baseline is None and DEFAULT_BASELINE in names:
             baseline = DEFAULT_BASELINE
         return cls(
             suites=which, agents=names, backends=backends, split=split, seeds=chosen, baseline=baseline,
-            max_steps=max_steps, teams=teams,
+            max_steps=max_steps, teams=teams, robot=robot, config=config and config.absolute(),
         )  # fmt: skip
 
     def settings(self) -> dict[str, Any]:
         """Return what every row depends on, whichever it is."""
         limit: Any = self.max_steps or {"least": LEAST_STEPS, "per_m2": STEPS_PER_M2}
-        return {"max_steps": limit, **versions()}
+        world: dict[str, Any] = {} if self.robot is None else {"robot": self.robot}
+        if self.config is not None:
+            world["config"] = read_config(self.config, {})[0]
+        return {"max_steps": limit, **world, **versions()}
+
+    def _world(self, suite: Suite, place: Place) -> dict[str, Any]:
+        """Return robot, noise, rooms and configuration of the episodes of a suite at a place.
+
+        A robot, or a configuration, has a noise of its own, which stands for the nominal one.
+        """
+        own = suite.noise == NOMINAL and (self.robot is not None or self.config is not None)
+        return {
+            "robot": self.robot, "config": self.config, "noise": None if own else suite.noise,
+            "rooms": place.rooms,
+        }  # fmt: skip
 
     @cached_property
     def jobs(self) -> tuple[EpisodeJob, ...]:
@@ -104,8 +122,8 @@ class BenchmarkPlan:
         seeds = {suite.name: self.seeds or tuple(suite.seeds(self.split)) for suite in self.suites}
         found = [
             (rank, _job(
-                team, suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend, noise=suite.noise,
-                rooms=place.rooms, floor_plan=place.floor_plan, max_steps=self.max_steps,
+                team, suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend,
+                floor_plan=place.floor_plan, max_steps=self.max_steps, **self._world(suite, place),
             ))
             for suite in self.suites
             for place in suite.places
@@ -128,7 +146,7 @@ class BenchmarkPlan:
         modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
         common = json.dumps(self.settings(), sort_keys=True)
         places = {(suite.name, place.name): place for suite in self.suites for place in suite.places}
-        configs = {(s.name, backend): _config_text(s, backend) for s in self.suites for backend in self.backends}
+        configs = {(s.name, b): self._config_text(s, b) for s in self.suites for b in self.backends}
 
         @cache
         def digest(suite: str, place: str, agent: str, backend: str, team: TeamConfig | None) -> str:
@@ -158,7 +176,11 @@ class BenchmarkPlan:
             run["baseline"] = self.baseline
         if teams := [to_mapping(team) for team in self.teams if team is not None]:
             run["teams"] = teams
-        return _config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
+        return self._config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
+
+    def _config_text(self, suite: Suite, backend: str) -> str:
+        config = make_config(slam=backend, **self._world(suite, suite.places[0]))
+        return tomli_w.dumps(to_mapping(config))
 
 
 def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
@@ -250,12 +272,6 @@ def _behind_agent(name: str) -> tuple[str, str]:
     policy: Path | None = getattr(agent, "policy_path", None)
     files = [] if policy is None else [policy, policy.with_suffix(".json")]
     return type(agent).__module__, short_digest(file.read_bytes() for file in files)
-
-
-def _config_text(suite: Suite, backend: str) -> str:
-    place: Place = suite.places[0]
-    config = make_config(rooms=place.rooms, slam=backend, noise=suite.noise)
-    return tomli_w.dumps(to_mapping(config))
 
 
 def _described(plan: BenchmarkPlan) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from training.runs.typed import parts_of, whole_numbers
 
 __all__ = [
     "FLOOR_PLANS",
+    "NOMINAL",
     "SLIPPERY",
     "SPLITS",
     "Place",
@@ -38,6 +39,9 @@ SPLITS: dict[str, range] = {
 
 FLOOR_PLANS = "floor-plans"
 """The suite of the plans in ``--floor-plans DIR``."""
+
+NOMINAL = "nominal"
+"""The noise of the suites that are not slippery, where neither a robot nor a configuration says another."""
 
 SLIPPERY = "-slippery"
 """What the names of the suites with the slippery noise end in."""
@@ -141,7 +145,7 @@ def _read(path: Path) -> Place:
 
 def _make(name: str, plans: tuple[Place, ...]) -> Suite:
     base = name.removesuffix(SLIPPERY)
-    noise = "nominal" if base == name else "slippery"
+    noise = NOMINAL if base == name else "slippery"
     places = plans if base == FLOOR_PLANS else (Place(name=_ROOMS[base], rooms=_ROOMS[base]),)
     return Suite(name=name, noise=noise, places=places)
 

@@ -39,6 +39,11 @@ def benchmark(
         Path | None,
         typer.Option(metavar="DIR", help="Folder of ROS maps or images: the suites floor-plans(-slippery)."),
     ] = None,
+    robot: opt.Robot = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.toml", help="Configuration of the world: another lidar, robot, noise, …"),
+    ] = None,
     baseline: Annotated[
         str | None,
         typer.Option(help="Agent to compare the others with.  [default: nearest-frontier, if it is one of them]"),
@@ -88,6 +93,7 @@ def benchmark(
       mecanum benchmark --suite apartments,apartments-slippery --slam ekf,invariant-ekf --workers 2 --out out/two
       mecanum benchmark --suite all --split validation --out out/validation --json
       mecanum benchmark --floor-plans plans --agents nearest-frontier --out out/plans
+      mecanum benchmark --config my_lidar.toml --agents brisk-tour --out out/my_lidar
       mecanum benchmark --suite all --ray 10.0.0.5:6379 --out out/cluster --parquet
       mecanum benchmark --robots 1,2,3,5 --communication range,none --agents brisk-tour --out out/teams --report
       mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
@@ -96,10 +102,10 @@ def benchmark(
     if protocol is not None or maps is not None:
         suites_only = {
             "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
-            "--baseline": baseline, "--max-steps": max_steps, "--report": report or None,
-            "--parquet": parquet or None, "--robots": None if robots == "1" else robots,
-            "--communication": communication, "--range": range_m, "--starts": starts,
-            "--unknown-starts": unknown_starts or None,
+            "--robot": robot, "--config": config, "--baseline": baseline, "--max-steps": max_steps,
+            "--report": report or None, "--parquet": parquet or None,
+            "--robots": None if robots == "1" else robots, "--communication": communication, "--range": range_m,
+            "--starts": starts, "--unknown-starts": unknown_starts or None,
         }  # fmt: skip
         _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
         assert maps is not None
@@ -120,7 +126,7 @@ def benchmark(
 
     plan = task.BenchmarkPlan.parse(
         suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
-        floor_plans=floor_plans, max_steps=max_steps,
+        floor_plans=floor_plans, max_steps=max_steps, robot=robot, config=config,
         teams=teams_of(
             robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
         ),

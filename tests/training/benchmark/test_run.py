@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import agents
+from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS
 from tests.training.benchmark.small import alive, children, contents, count, measure, small
 from tests.training.cli.test_bad_input import refused
 from training.benchmark import run as benchmark
@@ -24,6 +25,7 @@ from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, r
 from training.benchmark.figures import METRICS
 from training.benchmark.store import FILE
 from training.cli import main
+from training.episodes.explore import prepare
 from training.truth import known_map
 
 # ---- the command -----------------------------------------------------------------------------------------------
@@ -64,6 +66,29 @@ def test_the_planner_that_knows_the_map_stands_beside_the_agents(
     result = measure(small(tmp_path, "--agents", "nearest-frontier,known-map", "--report", seeds="0:0"), capsys)
     assert result["rooms"].keys() == {"nearest-frontier", "known-map"}
     assert "are no agents" in (tmp_path / "report.html").read_text("utf-8")
+
+
+@pytest.mark.usefixtures("here")
+def test_another_robot_or_lidar_is_what_explores_and_has_a_folder_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lidar = tmp_path / "lidar.toml"
+    lidar.write_text("[lidar]\nbeams = 90\n\n[noise]\nrange_sigma_m = 0.02\n", "utf-8")
+    command = small(tmp_path / "out", "--config", str(lidar), seeds="0")
+    measure(command, capsys)
+    used = tomllib.loads((tmp_path / "out" / "config.toml").read_text("utf-8"))
+    assert (used["lidar"]["beams"], used["noise"]["range_sigma_m"], used["rooms"]) == (90, 0.02, "rectangular")
+    plan = benchmark.BenchmarkPlan.parse(
+        suite="rooms,rooms-slippery", agents="random", slam=None, robot="cavity", config=lidar
+    )
+    nominal, slippery = (prepare(**job.options).config for job in plan.jobs[:2])
+    assert nominal.robot == slippery.robot == ROBOT_PRESETS["cavity"]
+    assert (nominal.noise, slippery.noise) == (NOISE_PRESETS["cavity"], NOISE_PRESETS["slippery"])
+    assert "choose another --out" in refused(small(tmp_path / "out", seeds="0"), capsys)
+    lidar.write_text("[lidar]\nbeams = 91\n", "utf-8")
+    assert "choose another --out" in refused(command, capsys)
+    assert "valid: " in refused(small(tmp_path / "new", "--robot", "youbo"), capsys)
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.usefixtures("here")
@@ -138,7 +163,7 @@ def test_an_episode_that_fails_does_not_stop_the_others(
 def test_killed_in_the_middle_and_run_again_it_has_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:
     """No row twice, missing or different; from two workers as from one; and no worker outlives its parent."""
     root = Path(__file__).resolve().parents[3]
-    killed, whole, seeds = tmp_path / "killed", tmp_path / "whole", "0:19"
+    killed, whole, seeds = tmp_path / "killed", tmp_path / "whole", "0:59"
     run = subprocess.Popen(
         [sys.executable, "-m", "training.cli", *small(killed, "--workers", "2", seeds=seeds)],
         cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, stderr=subprocess.DEVNULL,
@@ -150,14 +175,14 @@ def test_killed_in_the_middle_and_run_again_it_has_the_rows_of_an_undisturbed_ru
     run.send_signal(signal.SIGKILL)
     assert run.wait() == -signal.SIGKILL
     before = contents(killed)
-    assert 3 <= len(before) < 20
+    assert 3 <= len(before) < 60
     began = time.monotonic()
     while any(map(alive, workers)) and time.monotonic() - began < 60:
         time.sleep(0.02)
     assert not any(map(alive, workers))
     assert main(small(killed, seeds=seeds)) == main(small(whole, seeds=seeds)) == 0
     after = contents(killed)
-    assert len(after) == 20 and after == contents(whole)
+    assert len(after) == 60 and after == contents(whole)
     assert before.items() <= after.items()
 
 
