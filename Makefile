@@ -9,7 +9,7 @@ RLLIB := $(VENV)/rllib
 SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
-AGENTS := known-map,nearest-frontier,cost-utility,next-best-view,rrt,tour,brisk-tour,active,explore-and-return,random,ppo-frontier,ppo
+AGENTS := nearest-frontier,cost-utility,next-best-view,rrt,tour,brisk-tour,active,explore-and-return,random,ppo-frontier,ppo
 API_TESTS := $(wildcard tests/mecanum_env/test_env*.py) tests/mecanum_env/vector
 
 # The libraries' own threads only get in each other's way here: tests run in processes of their own.

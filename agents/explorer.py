@@ -81,6 +81,8 @@ class Explorer(Driver):
         self._track = Track()  # sensor poses that frontiers were seen from
         self._doubts = 0  # how often it has changed its mind …
         self._doubts_on = 0  # … since so many cells were known
+        self._cost = 0.0  # [weighted m] of the way to the target when it was last chosen
+        self._detours = 0  # how often that way has turned out to be closed
 
     @abstractmethod
     def pick(self, candidates: Candidates, belief: Belief) -> int:
@@ -102,14 +104,19 @@ class Explorer(Driver):
         path = self._path(candidates.cost_map, candidates.travel, (row, column), belief)
         look = target + self.config.frontiers.beyond_m * candidates.frontiers.normals[index] - path[-1]
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
+        cost = float(candidates.costs[index])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
             if self._target is not None and candidates.current is None and self._seen_from(belief):
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
                 self._troubles.note(self._target).looks += 1
-            cost = float(candidates.costs[index])
+            self._detours = 0
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
             self._arrived_for = 0.0
-        self._target = target
+        elif cost > self._cost + self.config.patience.detour_m:
+            self._detours += 1
+            if self._detours > self.config.patience.doubts:
+                self._deadline = -math.inf  # open from afar and closed from near by, now one way, now the other
+        self._target, self._cost = target, cost
         self._status = "driving"
         return Goal(pose=np.array([*path[-1], geometry.wrap_scalar(heading)]), path=path)
 
