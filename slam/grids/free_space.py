@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.grids.scan_drawing import IN_FREE, WORD
+from slam.grids.scan_drawing import IN_BETWEEN, IN_FREE, WORD
 from slam.types import Array
 
 __all__ = ["SUBCELL_BITS", "crossings_of", "fill_inside", "mark_free"]
@@ -32,18 +32,42 @@ def crossings_of(rows: int, vertices: int) -> NDArray[np.int64]:
 def mark_free(
     mask: NDArray[np.uint8], polygon: NDArray[np.int32], crossings: NDArray[np.int64], beams: Array, ranges: Array,
     rays: Array, surface: NDArray[np.int16], x: float, y: float, theta: float, resolution: float,
-    range_max: float, mask_row: int, mask_col: int, full_circle: bool,
+    range_max: float, mask_row: int, mask_col: int, full_circle: bool, dense: float,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
     """Mark the cells that a scan from (x, y, θ) saw free; return what :func:`_outline` does.
 
     Nothing is marked where the polygon has fewer than three vertices. ``crossings`` is from :func:`crossings_of`.
+    What lies farther off than ``dense`` [cells], and under no beam, is marked as between two.
     """
     count, top, left, bottom, right = _outline(
         polygon, beams, ranges, rays, surface, x, y, theta, resolution, range_max, mask_row, mask_col, full_circle
     )
     if count >= 3:
         fill_inside(mask, polygon, count, crossings, top, bottom)
+        if dense < range_max / resolution:
+            x0, y0 = x / resolution - mask_col - 0.5, y / resolution - mask_row - 0.5
+            _mark_between(mask, beams, x0, y0, dense, top, left, bottom, right)
     return count, top, left, bottom, right
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mark_between(
+    mask: NDArray[np.uint8], beams: Array, x0: float, y0: float, dense: float, top: int, left: int, bottom: int,
+    right: int,
+) -> None:  # fmt: skip
+    for row in range(top, bottom + 1):
+        for col in range(left, right + 1):
+            if mask[row, col] == IN_FREE and (col - x0) ** 2 + (row - y0) ** 2 > dense * dense:
+                mask[row, col] = IN_BETWEEN
+    for i in range(beams.shape[1]):
+        length = math.hypot(beams[0, i], beams[1, i])
+        if not length > dense:  # lost, or near by
+            continue
+        step_x, step_y = beams[0, i] / length, beams[1, i] / length
+        for k in range(int(dense), int(length) + 1):
+            row, col = int(y0 + k * step_y + 0.5), int(x0 + k * step_x + 0.5)
+            if mask[row, col] == IN_BETWEEN:  # not the rim
+                mask[row, col] = IN_FREE
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from slam.grids.free_space import crossings_of, mark_free
 from slam.grids.scan_drawing import (
+    APART_M,
     CLASS_OF,
     FREE,
     MAX_LOG_ODDS,
@@ -251,7 +252,7 @@ class OccupancyGrid:
         mask_col = (math.floor(x / resolution) - reach) & -WORD
         count, r0, c0, r1, c1 = mark_free(
             mask, self._polygon, self._crossings, beams, scan.ranges, self._rays, surface, x, y, theta, resolution,
-            scan.range_max, mask_row, mask_col, self._full_circle,
+            scan.range_max, mask_row, mask_col, self._full_circle, self._dense,
         )  # fmt: skip
         if count < 3:
             if body is not None:
@@ -267,7 +268,7 @@ class OccupancyGrid:
         self._change_count, known, entropy = draw(
             mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
             self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
-            body_y - self._row0, body_x - self._col0, radius,
+            body_y - self._row0, body_x - self._col0, radius, self._dense,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
@@ -289,6 +290,7 @@ class OccupancyGrid:
         angles = scan.angle_min + increment * np.arange(n)
         self._rays = np.stack([np.cos(angles), np.sin(angles)])
         self._full_circle = n * increment > 2 * math.pi - 1.5 * increment
+        self._dense = APART_M / increment / self.resolution  # [cells] up to where beams lie close together
         self._polygon = np.empty((n + 1, 2), np.int32)
         self._beams = np.empty((4, n))
         self._reach = math.ceil(scan.range_max / self.resolution) + 3

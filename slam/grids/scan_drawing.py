@@ -23,7 +23,8 @@ OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 
 WORD = 8  # cells that the kernel updates together
 WINDOW = 64  # cells that it looks at together: vectors of bytes
-IN_FREE, IN_SURFACE = 1, 2  # marks in the scan's own mask
+IN_FREE, IN_SURFACE, IN_BETWEEN, IN_BRIDGE = 1, 2, 3, 4  # marks in the scan's own mask
+APART_M = 0.14  # [m] between two beams, beyond which a thin wall may stand between them unseen
 
 
 def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]:
@@ -52,7 +53,11 @@ _ENTROPY_UNITS = float(1 << 26)  # to a bit
 def _steps() -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """Return, for each mark × 256 + byte of a cell: its byte afterwards, and what the sums gain."""
     old = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.int64)
-    new = np.stack([old, np.maximum(old + MISS, MIN_LOG_ODDS), np.minimum(old + HIT, MAX_LOG_ODDS)])
+    # Between two beams that lie far apart nothing was seen: that much is likely where nothing is known, no more.
+    between = np.where(old <= 0, np.minimum(old, FREE_UP_TO), old)
+    bridge = np.where(old >= FREE_UP_TO, np.maximum(old, OCCUPIED_FROM), old)
+    free, surface = np.maximum(old + MISS, MIN_LOG_ODDS), np.minimum(old + HIT, MAX_LOG_ODDS)
+    new = np.stack([old, free, surface, between, bridge])
     new[1:][new[1:] == 0] = -1  # zero means never observed
     before, after = old & 255, new & 255
     probability = PROBABILITY_BYTE.astype(np.int64)
@@ -71,8 +76,11 @@ NO_SURFACE = np.zeros(0, np.int16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16]) -> None:
-    """Mark the cells that beams ended in, and those between two hits on one straight surface."""
+def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], dense: float) -> None:
+    """Mark the cells that beams ended in, and those between two hits on one straight surface.
+
+    Between hits farther off than ``dense`` [cells] there may be a gap.
+    """
     n = beams.shape[1]
     joined = surface.shape[0] == n
     last_x = last_y = 0.0
@@ -86,9 +94,14 @@ def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int
         if here >= 0 and here == last_surface:
             dx, dy = px - last_x, py - last_y
             steps = int(max(abs(dx), abs(dy)) * 1.5)
+            near = beams[0, i] ** 2 + beams[1, i] ** 2 <= dense * dense
             for k in range(1, steps + 1):
                 f = k / (steps + 1)
-                mask[np.uint32(last_y + f * dy), np.uint32(last_x + f * dx)] = IN_SURFACE
+                row, col = np.uint32(last_y + f * dy), np.uint32(last_x + f * dx)
+                if near:
+                    mask[row, col] = IN_SURFACE
+                elif mask[row, col] != IN_SURFACE:
+                    mask[row, col] = IN_BRIDGE
         last_x, last_y, last_surface = px, py, here
 
 
@@ -126,8 +139,10 @@ def _take_unsettled(
             any_unsettled = False
             for k in range(u(WINDOW)):
                 mark, cell = mask[i, j + k], cells[row, col + k]
-                unsettled = ((mark == IN_FREE) & (cell != _SURELY_FREE)) | (
-                    (mark == IN_SURFACE) & (cell != _SURELY_OCCUPIED)
+                unsettled = (
+                    ((mark == IN_FREE) & (cell != _SURELY_FREE))
+                    | ((mark == IN_SURFACE) & (cell != _SURELY_OCCUPIED))
+                    | (mark >= IN_BETWEEN)
                 )
                 unsettled_marks[n, k] = mark if unsettled else 0
                 any_unsettled |= unsettled
@@ -203,13 +218,13 @@ def draw(
     mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
     left: int, bottom: int, right: int, log_odds: NDArray[np.int8], visited: NDArray[np.uint8], lattice_row: int,
     lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
-    x: float, radius: float,
+    x: float, radius: float, dense: float,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Do the rest in one call: surfaces into the mask, the mask into the grid, and the body.
 
     Arguments and return value are those of :func:`mark_surfaces`, :func:`fuse` and :func:`mark_disc`.
     """
-    mark_surfaces(mask, beams, surface)
+    mark_surfaces(mask, beams, surface, dense)
     mark_disc(visited, overview, shift, y, x, radius)
     return fuse(
         mask, mask_row, mask_col, top, left, bottom, right, log_odds, lattice_row, lattice_col, overview, shift,

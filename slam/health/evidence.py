@@ -1,6 +1,7 @@
 """What a scan says for or against a map and a pose: beams that end on its walls, and beams that end in the open.
 
-Cells that the map does not know say nothing. So does a beam that returned nothing, or was lost.
+Cells that the map does not know say nothing, nor do those that were only ever between two beams, or a beam that
+returned nothing or was lost.
 """
 
 from __future__ import annotations
@@ -49,29 +50,15 @@ class Agreement(NamedTuple):
         return self.sharp / tell if tell else 1.0
 
 
-def agreement(
-    grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int, *, dense: bool = False
-) -> Agreement:
-    """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ).
-
-    With ``dense`` only those speak that end where the scan's beams lie close together: what stood between two that
-    lie farther apart was drawn as free.
-    """
+def agreement(grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan: Scan, beams: int) -> Agreement:
+    """Return what at most ``beams`` evenly spaced beams of a scan say, the sensor at a pose (x, y, θ)."""
     row0, col0 = grid.lattice_origin
     x, y, theta = sensor_pose
     ranges, angle_min, increment, range_max, _ = scan
     return Agreement(*_count_beams(
-        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment,
-        _dense(range_max, increment) if dense else range_max, x, y, theta, len(ranges) // beams or 1,
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, x, y, theta,
+        len(ranges) // beams or 1,
     ))  # fmt: skip
-
-
-_APART_M = 0.14
-
-
-def _dense(range_max: float, increment: float) -> float:
-    """Return up to which range [m] two beams lie closer together than that."""
-    return min(range_max, _APART_M / increment)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -112,8 +99,8 @@ def _count_beams(
                     if highest >= OCCUPIED_FROM:
                         on_walls += 1
                         before = log_odds[int(v0 + s * (reach - 1.0)), int(u0 + c * (reach - 1.0))]
-                        blurred += value <= FREE_UP_TO or before >= OCCUPIED_FROM
-                    in_the_open += highest <= FREE_UP_TO and known
+                        blurred += value < FREE_UP_TO or before >= OCCUPIED_FROM
+                    in_the_open += highest < FREE_UP_TO and known
         c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
     return on_walls, sharp, blurred, in_the_open
 
@@ -126,8 +113,8 @@ def agrees(grid: OccupancyGrid, body: Array, offset_m: float, scan: Scan, beams:
     ranges, angle_min, increment, range_max, _ = scan
     row0, col0 = grid.lattice_origin
     return bool(_agrees(
-        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, _dense(range_max, increment),
-        body, offset_m, len(ranges) // beams or 1,
+        grid.log_odds, row0, col0, grid.resolution, ranges, angle_min, increment, range_max, body, offset_m,
+        len(ranges) // beams or 1,
     ))  # fmt: skip
 
 

@@ -78,9 +78,9 @@ class Recovery:
         x, y, theta = body
         offset = self._offset_m
         sensor = (x + offset * math.cos(theta), y + offset * math.sin(theta), theta)
-        seen = agreement(grid, sensor, scan, self.config.beams, dense=True)
+        seen = agreement(grid, sensor, scan, self.config.beams)
         if seen.beams < self.config.fewest_beams:  # in the open few beams return: all that there are
-            return agreement(grid, sensor, scan, len(scan.ranges), dense=True)
+            return agreement(grid, sensor, scan, len(scan.ranges))
         return seen
 
     def give_up(self) -> None:

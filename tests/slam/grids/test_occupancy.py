@@ -15,12 +15,16 @@ from slam.features.extraction import FeatureExtractor
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.grids.scan_drawing import (
     ENTROPY_BIT,
+    FREE_UP_TO,
     HIT,
+    IN_BETWEEN,
+    IN_BRIDGE,
     IN_FREE,
     IN_SURFACE,
     MAX_LOG_ODDS,
     MIN_LOG_ODDS,
     MISS,
+    OCCUPIED_FROM,
     WINDOW,
     WORD,
     fuse,
@@ -104,7 +108,7 @@ def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share:
     top, bottom = 3, 35
     mask = np.zeros((rows, cols + WINDOW), np.uint8)
     box = (slice(top, bottom + 1), slice(left, right + 1))
-    mask[box] = rng.choice([0, IN_FREE, IN_SURFACE], mask[box].shape)
+    mask[box] = rng.choice([0, IN_FREE, IN_SURFACE, IN_BETWEEN, IN_BRIDGE], mask[box].shape)
     marks = np.zeros(grid.shape, np.uint8)
     marks[row + top : row + bottom + 1, col + left : col + right + 1] = mask[box]
 
@@ -117,6 +121,8 @@ def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share:
 
     after = np.where(marks == IN_FREE, np.maximum(before + MISS, MIN_LOG_ODDS), before)
     after = np.where(marks == IN_SURFACE, np.minimum(before + HIT, MAX_LOG_ODDS), after)
+    after = np.where((marks == IN_BETWEEN) & (before <= 0), np.minimum(before, FREE_UP_TO), after)
+    after = np.where((marks == IN_BRIDGE) & (before >= FREE_UP_TO), np.maximum(before, OCCUPIED_FROM), after)
     after[(marks != 0) & (after == 0)] = -1
     np.testing.assert_array_equal(grid.log_odds, after)
     assert not mask.any()
@@ -130,6 +136,55 @@ def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share:
     kept = grid.overview_sums.copy()
     grid._build_overview()
     np.testing.assert_array_equal(kept, grid.overview_sums)
+
+
+def around_the_sensor(cells: int, kind: int) -> OccupancyGrid:
+    return OccupancyGrid.from_classes(
+        np.full((2 * cells, 2 * cells), kind, np.int8), 0.05, (-0.05 * cells, -0.05 * cells)
+    )
+
+
+@pytest.mark.parametrize(("beams", "erased"), [(90, False), (360, True)])
+def test_a_wall_s_end_between_two_beams_that_lie_far_apart_is_not_erased(beams: int, erased: bool) -> None:
+    grid = around_the_sensor(200, FREE)
+    between = np.array([[5.0 * math.cos(math.radians(2.0)), 5.0 * math.sin(math.radians(2.0))]])  # beams at 0°, 4°
+    row, col = grid.to_cells(between)[0]
+    grid.log_odds[row - 1 : row + 2, col : col + 20] = MAX_LOG_ODDS
+    scan = Scan(np.full(beams, np.inf), 0.0, 2 * math.pi / beams, 8.0)
+    for _ in range(20):
+        grid.integrate(np.zeros(3), scan)
+    assert (grid.classes()[row, col] == FREE) == erased
+    # What nothing is known of is taken for free between beams, too, though not for certain.
+    unknown = OccupancyGrid()
+    for _ in range(20):
+        unknown.integrate(np.zeros(3), scan)
+    at = tuple(unknown.to_cells(between)[0])
+    assert unknown.classes()[at] == FREE
+    assert unknown.log_odds[at] == (MIN_LOG_ODDS if erased else FREE_UP_TO)
+    on_beam = tuple(unknown.to_cells(np.array([[5.0, 0.01]]))[0])
+    assert unknown.log_odds[on_beam] == MIN_LOG_ODDS
+
+
+@pytest.mark.parametrize("beams", [90, 360])
+def test_a_passage_that_was_driven_through_is_not_walled_up_from_afar(beams: int) -> None:
+    increment = 2 * math.pi / beams
+    angles = increment * np.arange(beams)
+    with np.errstate(divide="ignore"):
+        ranges = np.where(np.sin(angles) > 0.05, 1.0 / np.sin(angles), np.inf)  # the wall y = 1 m
+    surface = np.where(ranges <= 8.0, 0, -1).astype(np.int16)
+    passage = np.abs(np.cos(angles) * ranges - 4.5) < 0.5  # beams go through it
+    if beams == 90:
+        assert np.count_nonzero(passage & (ranges <= 8.0)) <= 1
+    ranges[passage], surface[passage] = np.nan, -1
+    scan = Scan(np.where(ranges <= 8.0, ranges, np.inf), 0.0, increment, 8.0)
+    grid = around_the_sensor(200, FREE)
+    blank = OccupancyGrid()
+    for _ in range(5):
+        grid.integrate(np.zeros(3), scan, surface)
+        blank.integrate(np.zeros(3), scan, surface)
+    middle = np.array([[4.5, 1.01]])
+    assert (grid.classes()[tuple(grid.to_cells(middle)[0])] == FREE) == (beams == 90)
+    assert blank.classes()[tuple(blank.to_cells(middle)[0])] == OCCUPIED  # where nothing is known it is a wall
 
 
 def test_every_reader_is_told_what_was_drawn_since_it_looked() -> None:
