@@ -92,21 +92,13 @@ def test_a_wall_drawn_in_pieces_does_not_blur_a_scan() -> None:
     assert (seen(3.51).sharpness, seen(3.46).sharpness, seen(3.56).sharpness) == (1.0, 0.0, 0.0)
 
 
-def test_beams_that_lie_far_apart_do_not_speak_of_what_stands_between() -> None:
+def test_what_was_only_ever_between_two_beams_says_nothing() -> None:
     grid = OccupancyGrid(0.05)
-    nothing = np.full(360, np.inf)
     for _ in range(3):
-        grid.integrate(
-            np.zeros(3), Scan(np.full(360, 7.9), -np.pi, np.radians(1.0), 8.0), np.full(360, -1, np.int16)
-        )
-    for apart_deg, far_m in ((1.0, 7.5), (4.0, 1.8), (4.0, 2.2)):
-        ranges = nothing[:: int(apart_deg)].copy()
-        ranges[::2] = far_m  # things in the open
-        scan = Scan(ranges, -np.pi, np.radians(apart_deg), 8.0)
-        seen = agreement(grid, (0.0, 0.0, 0.0), scan, len(ranges))
-        assert seen.in_the_open == len(ranges) // 2
-        dense = agreement(grid, (0.0, 0.0, 0.0), scan, len(ranges), dense=True)
-        assert dense.in_the_open == (seen.in_the_open if far_m * np.radians(apart_deg) < 0.14 else 0)
+        grid.integrate(np.zeros(3), Scan(np.full(90, np.inf), 0.0, np.radians(4.0), 8.0))
+    for away_m, told in ((1.5, 90), (5.0, 0)):  # 4° apart are 0.1 m, and 0.35 m
+        things = Scan(np.full(90, away_m), np.radians(2.0), np.radians(4.0), 8.0)  # in the open, half way
+        assert agreement(grid, (0.0, 0.0, 0.0), things, 90) == Agreement(0, 0, 0, told)
 
 
 def test_a_glance_at_the_body_s_pose_is_a_look_at_the_sensor_s() -> None:
