@@ -92,8 +92,6 @@ class Explorer(Driver):
         """Return the next view point and the way there, or ``None`` when no frontier can be reached."""
         candidates = self._candidates(belief)
         self._frontiers = candidates.frontiers.points
-        if self._stands_by_it(candidates, belief):
-            return self._goal
         if not np.isfinite(candidates.costs).any():
             self._target = None
             self._status = self._ending
@@ -106,7 +104,7 @@ class Explorer(Driver):
         heading = math.atan2(look[1], look[0]) if np.hypot(*look) > 0.05 else float(belief.pose[2])
         cost = float(candidates.costs[index])
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
-            if self._target is not None and candidates.current is None and self._seen_from(belief):
+            if self._target is not None and candidates.current is None:
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
                 self._troubles.note(self._target).looks += 1
             self._detours = 0
@@ -141,22 +139,6 @@ class Explorer(Driver):
             return current
         self._doubts += 1
         return picked
-
-    def _seen_from(self, belief: Belief) -> bool:
-        """Whether the robot is where beams fall densely on the target; where they do not it may vanish unseen."""
-        assert self._target is not None
-        return not self._sparse or math.hypot(*(self._target - belief.pose[:2]).tolist()) <= self._dense_m
-
-    def _stands_by_it(self, candidates: Candidates, belief: Belief) -> bool:
-        """Whether the target vanished between beams that lie far apart, and is gone to all the same.
-
-        That is so where nothing else is left, and after too many changes of mind.
-        """
-        if self._target is None or self._goal is None or candidates.current is not None:
-            return False
-        if np.isfinite(candidates.costs).any() and self._doubts < self.config.patience.doubts:
-            return False
-        return not (self._seen_from(belief) or self._follower.blocked) and self._time < self._deadline
 
     def _way_near(self, point: Array, belief: Belief) -> tuple[Array, float, float]:
         """Return the path ``(n, 2)`` [m] to the reachable place nearest to a point, its cost and that distance."""

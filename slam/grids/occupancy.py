@@ -22,6 +22,7 @@ from slam.grids.scan_drawing import (
     APART_M,
     CLASS_OF,
     FREE,
+    GAP_M,
     MAX_LOG_ODDS,
     MIN_LOG_ODDS,
     NO_SURFACE,
@@ -269,6 +270,7 @@ class OccupancyGrid:
             mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
             self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
             body_y - self._row0, body_x - self._col0, radius, self._dense,
+            GAP_M / resolution,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy

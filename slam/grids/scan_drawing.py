@@ -24,7 +24,8 @@ OCCUPIED_FROM, FREE_UP_TO = 13, -8  # p ≥ 0.65 and p ≤ 0.40
 WORD = 8  # cells that the kernel updates together
 WINDOW = 64  # cells that it looks at together: vectors of bytes
 IN_FREE, IN_SURFACE, IN_BETWEEN, IN_BRIDGE = 1, 2, 3, 4  # marks in the scan's own mask
-APART_M = 0.14  # [m] between two beams, beyond which a thin wall may stand between them unseen
+APART_M = 0.14  # between two beams, beyond which a thin wall may stand between them unseen
+GAP_M = 0.6  # between two hits so far apart, beyond which a passage may open between them unseen
 
 
 def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]:
@@ -76,10 +77,13 @@ NO_SURFACE = np.zeros(0, np.int16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], dense: float) -> None:
+def mark_surfaces(
+    mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], dense: float, gap: float
+) -> None:
     """Mark the cells that beams ended in, and those between two hits on one straight surface.
 
-    Between hits farther off than ``dense`` [cells] there may be a gap.
+    Farther off than ``dense`` [cells] there may be none between them; and where they are more than ``gap`` [cells]
+    apart nothing is said of what is between.
     """
     n = beams.shape[1]
     joined = surface.shape[0] == n
@@ -95,6 +99,8 @@ def mark_surfaces(mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int
             dx, dy = px - last_x, py - last_y
             steps = int(max(abs(dx), abs(dy)) * 1.5)
             near = beams[0, i] ** 2 + beams[1, i] ** 2 <= dense * dense
+            if not near and dx * dx + dy * dy > gap * gap:
+                steps = 0
             for k in range(1, steps + 1):
                 f = k / (steps + 1)
                 row, col = np.uint32(last_y + f * dy), np.uint32(last_x + f * dx)
@@ -218,13 +224,13 @@ def draw(
     mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
     left: int, bottom: int, right: int, log_odds: NDArray[np.int8], visited: NDArray[np.uint8], lattice_row: int,
     lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
-    x: float, radius: float, dense: float,
+    x: float, radius: float, dense: float, gap: float,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Do the rest in one call: surfaces into the mask, the mask into the grid, and the body.
 
     Arguments and return value are those of :func:`mark_surfaces`, :func:`fuse` and :func:`mark_disc`.
     """
-    mark_surfaces(mask, beams, surface, dense)
+    mark_surfaces(mask, beams, surface, dense, gap)
     mark_disc(visited, overview, shift, y, x, radius)
     return fuse(
         mask, mask_row, mask_col, top, left, bottom, right, log_odds, lattice_row, lattice_col, overview, shift,

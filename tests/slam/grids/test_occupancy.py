@@ -170,21 +170,25 @@ def test_a_passage_that_was_driven_through_is_not_walled_up_from_afar(beams: int
     increment = 2 * math.pi / beams
     angles = increment * np.arange(beams)
     with np.errstate(divide="ignore"):
-        ranges = np.where(np.sin(angles) > 0.05, 1.0 / np.sin(angles), np.inf)  # the wall y = 1 m
+        ranges = np.where(np.sin(angles) > 0.05, 1.02 / np.sin(angles), np.inf)  # the wall y = 1.02 m
     surface = np.where(ranges <= 8.0, 0, -1).astype(np.int16)
-    passage = np.abs(np.cos(angles) * ranges - 4.5) < 0.5  # beams go through it
+    passage = np.abs(np.cos(angles) * ranges - 4.5) < 0.5  # beams into it are lost
     if beams == 90:
-        assert np.count_nonzero(passage & (ranges <= 8.0)) <= 1
+        assert np.count_nonzero(passage) == 1
     ranges[passage], surface[passage] = np.nan, -1
-    scan = Scan(np.where(ranges <= 8.0, ranges, np.inf), 0.0, increment, 8.0)
+    scan = Scan(np.where(ranges > 8.0, np.inf, ranges), 0.0, increment, 8.0)
     grid = around_the_sensor(200, FREE)
     blank = OccupancyGrid()
     for _ in range(5):
         grid.integrate(np.zeros(3), scan, surface)
         blank.integrate(np.zeros(3), scan, surface)
-    middle = np.array([[4.5, 1.01]])
-    assert (grid.classes()[tuple(grid.to_cells(middle)[0])] == FREE) == (beams == 90)
-    assert blank.classes()[tuple(blank.to_cells(middle)[0])] == OCCUPIED  # where nothing is known it is a wall
+    passage_cell, wall_cell = (tuple(grid.to_cells(np.array([[x, 1.02]]))[0]) for x in (4.5, 2.5))
+    assert (grid.classes()[passage_cell] == FREE) == (beams == 90)
+    assert (grid.classes()[wall_cell] == FREE) == (beams == 90)
+    passage_cell, wall_cell = (tuple(blank.to_cells(np.array([[x, 1.02]]))[0]) for x in (4.5, 2.5))
+    assert blank.classes()[passage_cell] == (UNKNOWN if beams == 90 else OCCUPIED)
+    # Too narrow for a passage, and nothing is known of it: a wall, though not for certain.
+    assert blank.log_odds[wall_cell] == (OCCUPIED_FROM if beams == 90 else MAX_LOG_ODDS)
 
 
 def test_every_reader_is_told_what_was_drawn_since_it_looked() -> None:
