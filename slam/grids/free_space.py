@@ -55,6 +55,7 @@ def _mark_between(
     mask: NDArray[np.uint8], beams: Array, x0: float, y0: float, dense: float, top: int, left: int, bottom: int,
     right: int,
 ) -> None:  # fmt: skip
+    """Mark as between beams what is farther than ``dense`` [cells] from (x0, y0), but for the cells under one."""
     for row in range(top, bottom + 1):
         for col in range(left, right + 1):
             if mask[row, col] == IN_FREE and (col - x0) ** 2 + (row - y0) ** 2 > dense * dense:

@@ -269,8 +269,7 @@ class OccupancyGrid:
         self._change_count, known, entropy = draw(
             mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
             self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
-            body_y - self._row0, body_x - self._col0, radius, self._dense,
-            GAP_M / resolution,
+            body_y - self._row0, body_x - self._col0, radius, self._dense, GAP_M / resolution,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
@@ -292,7 +291,8 @@ class OccupancyGrid:
         angles = scan.angle_min + increment * np.arange(n)
         self._rays = np.stack([np.cos(angles), np.sin(angles)])
         self._full_circle = n * increment > 2 * math.pi - 1.5 * increment
-        self._dense = APART_M / increment / self.resolution  # [cells] up to where beams lie close together
+        # [cells] up to where beams lie close together; a scan of one beam may have no increment.
+        self._dense = APART_M / max(abs(increment), 1e-9) / self.resolution
         self._polygon = np.empty((n + 1, 2), np.int32)
         self._beams = np.empty((4, n))
         self._reach = math.ceil(scan.range_max / self.resolution) + 3
