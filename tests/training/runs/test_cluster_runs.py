@@ -26,7 +26,7 @@ from training.cli import main
 pytest.importorskip("ray", reason="needs the extra `ray`")
 
 ROOT = Path(__file__).resolve().parents[3]
-EPISODES = 24
+EPISODES = 96  # over two seconds of work, even on a fast machine: there is time to kill it
 
 
 @dataclass
