@@ -29,8 +29,8 @@ class PatienceConfig(Config):
     avoid_s: Duration = 20.0  # how long a goal that did not work out is put last; doubled each time
     attempts: Count = 3  # at one goal that does not work out
     doubts: Count = 5  # changes of mind, after which a goal is kept until …
-    detour_m: Length = 3.0  # by which a way grows that turns out to be closed; after as many the goal is put off
     progress_m2: NotNegative = 1.0  # … so much more has come to light
+    detour_m: Length = 3.0  # by which a way grows that turns out to be closed; after `doubts` the goal is put off
     slowest_m_s: Rate = 0.15  # a goal gets 10 s and the time its path takes at this speed
     same_m: Length = 0.6  # frontier pieces nearer than this to one dealt with before are the same
 

@@ -217,6 +217,23 @@ def test_enclosed_robot_stays():
     assert ready("nearest-frontier", belief).choose(belief_of(classes, (4.0, 4.0, 0.0))) is not None
 
 
+@pytest.mark.parametrize("name", ["nearest-frontier", "brisk-tour"])
+def test_a_goal_whose_way_opens_and_closes_again_and_again_is_let_be(name: str) -> None:
+    classes = np.full((170, 160), OCCUPIED, np.int8)
+    fill(classes, 0.5, 0.5, 7.5, 7.5, FREE)
+    fill(classes, 1.8, 1.8, 6.2, 6.2, OCCUPIED)  # a ring
+    fill(classes, 4.6, 7.5, 5.6, 8.5, UNKNOWN)
+    closed = classes.copy()
+    fill(closed, 6.2, 4.0, 7.5, 4.2, OCCUPIED)
+    seen = belief_of(classes, (5.2, 1.1, 0.0)), belief_of(closed, (5.7, 1.1, 0.0))
+    agent = ready(name, seen[0])
+    for k in range(900):  # at 0.15 m/s alone it would have 80 s for the way, three times
+        agent.act(None, seen[k // 11 % 2])
+        if agent.ended:
+            break
+    assert agent.status == "stuck"
+
+
 @pytest.mark.parametrize("name", ["nearest-frontier", "brisk-tour", "active", "ppo-frontier"])
 def test_a_first_scan_that_lost_many_beams_is_no_reason_to_stop(name: str) -> None:
     env = ExploreEnv(rooms="cave", noise=NoiseConfig(dropout=0.3))

@@ -108,8 +108,10 @@ class TwoNodes:
     def mecanum(self, *words: str) -> subprocess.Popen[str]:
         call = [sys.executable, "-m", "training.cli", *words, "--ray", self.address]
         return subprocess.Popen(
-            call, cwd=ROOT, env=self.env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
+            call, cwd=ROOT, env=self.env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            # What a shell starts with & has SIGINT ignored, and its children have, too.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
 
 
 @contextmanager
