@@ -263,7 +263,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def episode_metrics(self) -> dict[str, float | int | None]:
         """Return the metrics of the episode so far (see :class:`mecanum_env.episode.EpisodeRecord`)."""
-        return self.truth.record.metrics(self.truth.ground, self.backend.belief)
+        return self.truth.record.metrics(self.truth.ground, self.backend)
 
     # ---- parts of a step -----------------------------------------------------------------------------------
 

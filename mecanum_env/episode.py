@@ -11,6 +11,8 @@ import numpy as np
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from mecanum_env.physics.world import World
 from mecanum_env.rooms.floor_plan import FloorPlan
+from slam.accounts.landmarks import handed_out
+from slam.backend import Backend
 from slam.belief import Belief
 from slam.grids.occupancy import OCCUPIED
 from slam.metrics import measures as metrics
@@ -88,12 +90,13 @@ class EpisodeRecord:
         """Health of the belief after each row ``(n,)``."""
         return self._rows[:, _HEALTH]
 
-    def metrics(self, truth: GroundTruth, belief: Belief) -> dict[str, float | int | None]:
+    def metrics(self, truth: GroundTruth, backend: Backend) -> dict[str, float | int | None]:
         """Return ``episode_metrics``: plain numbers, deterministic, ``None`` where not reached or not defined."""
         rows = self._rows
         times, coverage = rows[:, _TIME], rows[:, _COVERAGE]
+        belief = backend.belief
         score = score_map(truth, belief)
-        corners = metrics.corner_deviation(belief.landmarks, truth.corners)
+        corners = metrics.corner_deviation(handed_out(backend).points, truth.corners)
         end = rows[-1]
         heading = metrics.heading_errors(end[None, _TRUE], end[None, _ESTIMATE])
         # The start is known by definition: NEES counts from the first step on.

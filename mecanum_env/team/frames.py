@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from mecanum_env.team.reports import Report
+from slam.accounts.account import Account
 from slam.backend import Backend
 from slam.geometry import compose, inverse
-from slam.teams.account import Account
 from slam.teams.alignment import align
 from slam.teams.sighting import combine, relative_pose
 from slam.types import Array, Sighting

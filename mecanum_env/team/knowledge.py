@@ -13,11 +13,11 @@ import numpy as np
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.frames import Frames
 from mecanum_env.team.reports import Report
+from slam.accounts.account import Account
 from slam.backend import Backend
 from slam.belief import Teammate
 from slam.geometry import compose, transform_points
 from slam.grids.occupancy import OccupancyGrid
-from slam.teams.account import Account
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Array, Sighting
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from slam.teams.account import Account
+from slam.accounts.account import Account
 from slam.teams.merged_grid import Chart
 from slam.types import Array
 

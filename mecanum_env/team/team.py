@@ -22,11 +22,11 @@ from mecanum_env.team.config import Robots, TeamConfig
 from mecanum_env.team.coverage import TeamCoverage
 from mecanum_env.team.member import Member
 from mecanum_env.team.starts import start_poses
+from slam.accounts.account import Account
 from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
 from slam.settings import argument, check_name, checked, from_mapping
-from slam.teams.account import Account
 from slam.teams.centralised import JointEkf
 from slam.types import Array
 

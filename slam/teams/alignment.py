@@ -14,11 +14,11 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse, wrap
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics.chi_square import chi2_quantile
 from slam.settings import Config, Gap, NotNegative, Share, Within
-from slam.teams.account import Account
 from slam.teams.constellation import ConstellationConfig, candidates, rigid_fit, same_landmarks
 from slam.teams.contradiction import contradiction
 from slam.teams.joint import Joint, Link, SameConfig, joint_of

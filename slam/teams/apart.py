@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse
 from slam.grids.occupancy import OccupancyGrid
-from slam.teams.account import Account
 from slam.teams.alignment import align
 from slam.teams.frames import compose_jacobians, points_into, pose_into, walls_into
 from slam.types import Array, Odometry, Scan

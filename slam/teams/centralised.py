@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from slam.accounts.account import Account
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.companions import Companions
@@ -26,7 +27,6 @@ from slam.grids.occupancy import OccupancyGrid
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.metrics.measures import nees_pose
 from slam.settings import require
-from slam.teams.account import Account
 from slam.teams.apart import EXACT_COV, Apart, Start
 from slam.teams.turns import correct_by_sighting, swap_robots
 from slam.types import LINE, Array, Observations, Odometry, Scan

@@ -15,9 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.accounts.account import Account
 from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.settings import Angle, Config, Count, Few, Length, Within, require
-from slam.teams.account import Account
 from slam.teams.frames import ends_into, points_into, walls_into
 from slam.types import Array
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse
-from slam.teams.account import Account
 from slam.teams.alignment import Alignment
 from slam.teams.frames import ends_into, points_into, pose_into, walls_into
 from slam.teams.joint import Frame, Joint, Link, SameConfig, joint_of

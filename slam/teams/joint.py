@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 
+from slam.accounts.account import Account
 from slam.geometry import wrap
 from slam.settings import Config, Within
-from slam.teams.account import Account
 from slam.teams.frames import points_into, walls_into
 from slam.types import Array
 

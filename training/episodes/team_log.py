@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from agents.base import Goal
 from mecanum_env.episode import score_map
 from mecanum_env.team.team import Team
+from slam.accounts.account import Account
+from slam.accounts.corners import settled
 from slam.geometry import compose, inverse
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics import measures
-from slam.teams.account import Account
 from slam.teams.alignment import align
-from slam.teams.corners import settled
 from slam.teams.fusion import MergedMap, fuse
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Array

@@ -15,10 +15,10 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
-from slam.belief import Belief
+from slam.accounts.landmarks import handed_out, write_landmarks
+from slam.backend import Backend
 from slam.files import plain_name
 from slam.formats import atomic_write, write_map_server, write_tum
-from slam.landmarks.database import write_landmark_map
 from slam.logs import ScanLog
 from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
@@ -97,15 +97,9 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
     times, true, _ = replay.trajectories()
     write_tum(folder / "trajectory_estimate.tum", replay.sample_times[:done], estimates)
     write_tum(folder / "trajectory_true.tum", times, np.nan_to_num(true, nan=0.0))  # a heading not known is 0
-    seen, angles = replay.backend.landmark_details()
-    write_landmark_map(
-        folder / "landmarks.db", belief.landmarks, cov=belief.landmark_cov,
-        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
-        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
-        backend=replay.config.slam, frame="reference",
-    )  # fmt: skip
+    write_landmarks(folder / "landmarks.db", replay.backend, name=replay.config.slam, frame="reference")
     surveyed = surveyed_places(replay, belief.landmark_ids)
-    atomic_write(folder / "landmarks.csv", _landmarks_csv(belief, seen, surveyed))
+    atomic_write(folder / "landmarks.csv", _landmarks_csv(replay.backend, surveyed))
     reckoned = log.dead_reckoning()[log.odometry_times <= replay.time_s]
     figure = draw_replay(
         reference=_broken_at_gaps(times, true, log.reference_gap_s), reckoned=reckoned, estimate=estimates,
@@ -128,16 +122,17 @@ def _run_values(replay: Replay) -> dict[str, Any]:
     return {key: v for key, v in replay.run.items() if v is not None} | {"versions": versions()}
 
 
-def _landmarks_csv(belief: Belief, seen: NDArray[np.int64], surveyed: Array) -> str:
+def _landmarks_csv(backend: Backend, surveyed: Array) -> str:
     """Return a line a landmark: estimate, covariance, sightings and, where it was surveyed, its true place."""
+    found, ids, (seen, _) = handed_out(backend), backend.belief.landmark_ids, backend.landmark_details()
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("id", "x_m", "y_m", "var_x", "var_y", "cov_xy", "times_seen", "true_x_m", "true_y_m"))
-    for i in np.argsort(belief.landmark_ids, kind="stable"):
-        (x, y), cov = belief.landmarks[i], belief.landmark_cov[i]
+    for i in np.argsort(ids, kind="stable"):
+        (x, y), cov = found.points[i], found.covs[i]
         numbers = [f"{v:.9g}" for v in (x, y, cov[0, 0], cov[1, 1], cov[0, 1])]
         true = [f"{v:.9g}" if math.isfinite(v) else "" for v in surveyed[i]]
-        table.writerow((int(belief.landmark_ids[i]), *numbers, int(seen[i]), *true))
+        table.writerow((int(ids[i]), *numbers, int(seen[i]), *true))
     return text.getvalue()
 
 

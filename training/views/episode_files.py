@@ -12,11 +12,10 @@ from typing import Any
 import cv2
 import tomli_w
 
-from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
+from slam.accounts.landmarks import write_landmarks
 from slam.files import plain_name
 from slam.formats import atomic_write, write_map_server, write_tum
-from slam.landmarks.database import write_landmark_map
 from slam.settings import to_mapping
 from training.episodes.explore import ENDINGS, EXTRAS, FILES, Course, Episode
 from training.episodes.recording import Recording
@@ -30,7 +29,6 @@ from training.views.rerun_file import check_rerun, write_rerun
 
 __all__ = [
     "Saver", "check_extras", "config_text", "episode_folder", "place_of", "who_of", "write_episode",
-    "write_landmarks",
 ]  # fmt: skip
 
 
@@ -106,7 +104,7 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     write_map_server(folder / "map", belief.grid)
     write_tum(folder / "trajectory_true.tum", times, true_poses)
     write_tum(folder / "trajectory_estimate.tum", times, estimates)
-    write_landmarks(folder / "landmarks.db", env)
+    write_landmarks(folder / "landmarks.db", env.backend, name=env.config.slam)
     view = episode_view(env.truth.ground, belief)
     robot, where = episode.config.robot, place_of(episode)
     who = who_of(episode)
@@ -135,18 +133,6 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
         write_rerun(recording, folder / EXTRAS["rerun"], robot=robot, lidar=episode.config.lidar, name=title)
     atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
     return metrics
-
-
-def write_landmarks(path: Path, env: ExploreEnv) -> None:
-    """Write the landmarks that a robot believes in."""
-    belief = env.backend.belief
-    seen, angles = env.backend.landmark_details()
-    write_landmark_map(
-        path, belief.landmarks, cov=belief.landmark_cov,
-        joint_cov=None if belief.joint_cov is None else belief.joint_cov[3:, 3:],
-        ids=belief.landmark_ids, kinds=belief.landmark_kinds, angles=angles, times_seen=seen,
-        backend=env.config.slam,
-    )  # fmt: skip
 
 
 def config_text(episode: Course) -> str:

@@ -11,13 +11,14 @@ import cv2
 import numpy as np
 
 from mecanum_env.team.picture import render_team
+from slam.accounts.landmarks import write_landmarks
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from training.episodes.explore import ENDINGS
 from training.episodes.recording import Recording
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
-from training.views.episode_files import config_text, episode_folder, place_of, who_of, write_landmarks
+from training.views.episode_files import config_text, episode_folder, place_of, who_of
 from training.views.team_page import team_page
 
 __all__ = ["write_team_episode"]
@@ -48,12 +49,12 @@ def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recordi
             backend=episode.config.slam,
         )  # fmt: skip
     elif team.joint is not None:
-        write_landmarks(folder / LANDMARKS, team.members[0])
+        write_landmarks(folder / LANDMARKS, team.members[0].backend, name=episode.config.slam)
     for member in team.members:
         k, record = member.number, member.truth.record
         write_tum(folder / f"trajectory_true_robot_{k}.tum", record.times, record.true_poses)
         write_tum(folder / f"trajectory_estimate_robot_{k}.tum", record.times, record.estimates)
-        write_landmarks(folder / f"landmarks_robot_{k}.db", member)
+        write_landmarks(folder / f"landmarks_robot_{k}.db", member.backend, name=episode.config.slam)
         write_map_server(folder / f"map_robot_{k}", member.grid)
     picture = cv2.cvtColor(render_team(team), cv2.COLOR_RGB2BGR)
     atomic_write(folder / "team.png", cv2.imencode(".png", picture)[1].tobytes())

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.linalg import block_diag
 
 import slam
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse, wrap
 from slam.metrics.measures import nees_band
-from slam.teams.account import Account
 from slam.teams.alignment import Alignment, align
 from slam.teams.frames import ends_into, points_into, pose_into, walls_into
 from slam.teams.fusion import MergedMap, fuse

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse, transform_points, wrap
-from slam.teams.account import Account
 from slam.teams.frames import ends_into, walls_into
 from slam.types import CONCAVE, CONVEX
 

@@ -20,13 +20,13 @@ import typer
 
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms.floor_plan import FloorPlan
+from slam.accounts.account import Account
+from slam.accounts.corners import CornerConfig, settled
 from slam.geometry import compose, inverse, transform_points, wrap
 from slam.grids.occupancy import FREE, OccupancyGrid
 from slam.metrics.measures import nees_pose
 from slam.settings import to_mapping
-from slam.teams.account import Account
 from slam.teams.alignment import Alignment, AlignmentConfig, align
-from slam.teams.corners import CornerConfig, settled
 from slam.teams.fusion import MergedMap, fuse
 from slam.types import Array
 from training.episodes.explore import make_agent

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from slam.teams.account import Account
-from slam.teams.corners import CornerConfig, settled
+from slam.accounts.account import Account
+from slam.accounts.corners import CornerConfig, settled
 from slam.types import CONCAVE, CONVEX, Array
 
 AS_TOLD = CornerConfig(end_share=1.0)  # ends no better than the filter says

@@ -18,9 +18,9 @@ from typing import Annotated
 
 import numpy as np
 
+from slam.accounts.account import Account
 from slam.metrics.chi_square import chi2_quantile
 from slam.settings import Angle, Config, Length, Share, Within
-from slam.teams.account import Account
 from slam.types import CONVEX, Array
 
 __all__ = ["CornerConfig", "settled"]
