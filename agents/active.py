@@ -29,6 +29,7 @@ from agents.view_points.anchoring import anchoring, marks_of, spread_m
 from agents.view_points.sightings import SensorModel, expected_sightings
 from slam.belief import Belief
 from slam.settings import Config, Count, Duration, Length, NotNegative, Positive, Rate, argument, from_mapping
+from slam.types import Array
 
 __all__ = ["ActiveConfig", "ActiveSlam", "DriftConfig", "LookConfig"]
 
@@ -81,8 +82,7 @@ class ActiveSlam(PpoFrontier):
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )
         self._looked_s: float | None = 0.0  # at the start; None once it has driven off
-        # Of the last steps: x, y [m] and the position's largest variance [m²].
-        self._lately: deque[tuple[float, float, float]] = deque(maxlen=self._drift.steps + 1)
+        self._lately: deque[tuple[Array, Array]] = deque(maxlen=self._drift.steps + 1)  # poses, covariances
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action: looking first, then to the goal, slowly where the place grows unsure."""
@@ -90,7 +90,7 @@ class ActiveSlam(PpoFrontier):
             if self._looks_on(belief):
                 return self._look(observation, belief)
             self._looked_s = None
-        self._measure(belief)
+        self._lately.append((np.array(belief.pose, dtype=np.float64), np.array(belief.pose_cov, dtype=np.float64)))
         action = super().act(observation, belief)
         return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action
 
@@ -133,23 +133,28 @@ class ActiveSlam(PpoFrontier):
 
     # ---- driving ---------------------------------------------------------------------------------------------
 
-    def _measure(self, belief: Belief) -> None:
-        """Take down where the robot is, and how unsure that is along the least known axis."""
-        pose, variance = (
-            np.asarray(belief.pose),
-            float(np.linalg.eigvalsh(np.asarray(belief.pose_cov)[:2, :2])[-1]),
-        )
-        self._lately.append((float(pose[0]), float(pose[1]), variance))
-
     def _control(self) -> ControlConfig:
         """Return how to drive: where the position grows unsure too fast, so slowly that it no longer does.
 
         Each step adds a variance in proportion to the square of its length, as long as nothing else tells.
         """
         usual, drift = super()._control(), self._drift
-        x, y, variances = np.array(self._lately).T
-        grown, squares = variances[-1] - variances[0], float((np.diff(x) ** 2 + np.diff(y) ** 2).sum())
-        if len(variances) <= drift.steps or grown <= 0.0 or squares <= 0.0:
+        if len(self._lately) <= drift.steps:
+            return usual
+        poses = np.array([pose for pose, _ in self._lately])
+        grown, squares = _grown(*self._lately[0], *self._lately[-1]), float((np.diff(poses[:, :2], axis=0) ** 2).sum())
+        if grown <= 0.0 or squares <= 0.0:
             return usual
         speed = max(drift.rate_m_rt_s * math.sqrt(squares / (grown * self._step_s)), drift.slowest_m_s)
         return replace(usual, speed_share=min(usual.speed_share, speed / self._robot.max_speed_m_s))
+
+
+def _grown(before: Array, cov_before: Array, now: Array, cov_now: Array) -> float:
+    """Return the variance [m²] that a way has added along the least known axis of the position.
+
+    What an error of the heading makes of the way is not of it: it is the same however slowly it is driven.
+    """
+    carried = np.eye(3)
+    carried[:2, 2] = before[1] - now[1], now[0] - before[0]
+    axis = np.linalg.eigh(cov_now[:2, :2])[1][:, -1]
+    return float(axis @ (cov_now - carried @ cov_before @ carried.T)[:2, :2] @ axis)
