@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import agents
-from agents.active import ActiveSlam
+from agents.active import ActiveSlam, _grown
 from agents.driving.control import ControlConfig
 from agents.driving.grip import GentleFollower, WheelWatch, eased
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -76,15 +76,17 @@ def test_where_nothing_could_be_a_landmark_it_does_not_wait_for_one():
     assert stood == [True] * 5 + [False] * 5
 
 
+HALL = half_known(40.0, 4.0, 39.0)
+
+
 def run_blind(drift: float, *, share: float, grows: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Drive along a hall where the wheels lose a share of each step; return way [m] and variance [m²] by step."""
     pose, variance = np.array([1.5, 2.0, 0.0]), 1e-6
-    classes = half_known(40.0, 4.0, 39.0)
-    agent = ready(belief_of(classes, (1.5, 2.0, 0.0)), drift={"rate_m_rt_s": drift}, **GO)
+    agent = ready(belief_of(HALL, (1.5, 2.0, 0.0)), drift={"rate_m_rt_s": drift}, **GO)
     ways, variances = [], []
     for _ in range(150):
         cov = np.diag([variance if grows else 1e-6, 1e-6, 1e-8])
-        action = agent.act(None, replace(belief_of(classes, tuple(pose)), pose_cov=cov))
+        action = agent.act(None, replace(belief_of(HALL, tuple(pose)), pose_cov=cov))
         after = drive(pose, action, ROBOT)
         ways.append(float(np.hypot(*(after - pose)[:2])))
         variance += (share * ways[-1]) ** 2
@@ -104,6 +106,33 @@ def test_where_it_keeps_its_place_or_the_wheels_hold_it_loses_no_time():
     for case in ({"share": 0.035, "grows": False}, {"share": 0.005}):
         usual, _ = run_blind(1.0, **case)
         np.testing.assert_array_equal(run_blind(0.0017, **case)[0], usual)
+
+
+def test_an_unsure_heading_makes_it_no_slower():
+    pose, cov = np.array([1.5, 2.0, 0.0]), np.diag([1e-4, 1e-4, 1e-4])
+    agent, usual = (ready(belief_of(HALL, (1.5, 2.0, 0.0)), drift={"rate_m_rt_s": r}, **GO) for r in (0.0017, 1.0))
+    for _ in range(80):
+        belief = replace(belief_of(HALL, tuple(pose)), pose_cov=cov)
+        action = agent.act(None, belief)
+        np.testing.assert_array_equal(action, usual.act(None, belief))
+        after = drive(pose, action, ROBOT)
+        carried = np.eye(3)
+        carried[:2, 2] = pose[1] - after[1], after[0] - pose[0]
+        pose, cov = after, carried @ cov @ carried.T
+    assert cov[1, 1] > 30 * 1e-4  # across the hall, by the heading alone
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_a_way_adds_is_told_from_what_the_heading_makes_of_it(seed):
+    rng = np.random.default_rng(seed)
+    root, added = rng.normal(size=(3, 3)), rng.uniform(0.0, 0.1)
+    before, now = rng.normal(size=3), rng.normal(size=3)
+    carried = np.eye(3)
+    carried[:2, 2] = before[1] - now[1], now[0] - before[0]  # of (x, y) by θ: a quarter turn of the way
+    cov = root @ root.T
+    after = carried @ cov @ carried.T + np.diag([added, added, 0.0])
+    assert _grown(before, cov, now, after) == pytest.approx(added, abs=1e-9 * np.abs(after).max())
 
 
 def test_it_never_creeps():

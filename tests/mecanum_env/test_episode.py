@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+import agents
+import slam
+from mecanum_env.env import ExploreEnv
+from slam.accounts.landmarks import handed_out, write_landmarks
+from slam.landmarks.database import read_landmark_map
+from slam.metrics.measures import corner_deviation
+
+
+def driven(backend: str, *, rooms: str = "rectangular", seed: int = 300, steps: int = 150) -> ExploreEnv:
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms, slam=backend).unwrapped
+    assert isinstance(env, ExploreEnv)
+    agent = agents.make("brisk-tour")
+    observation, _ = env.reset(seed=seed)
+    agent.reset(env.belief)
+    for _ in range(steps):
+        observation, _, terminated, truncated, _ = env.step(agent.act(observation, env.belief))
+        if terminated or truncated:
+            break
+    return env
+
+
+@pytest.mark.parametrize("backend", slam.names())
+def test_what_is_handed_out_is_what_is_written_and_measured(backend, tmp_path):
+    env = driven(backend, steps=60)
+    found, belief = handed_out(env.backend), env.belief
+    n = len(belief.landmarks)
+    assert found.points.shape == (n, 2) and found.covs.shape == (n, 2, 2)
+    assert np.hypot(*(found.points - belief.landmarks).T).max(initial=0.0) < 0.05  # no farther than to a wall
+    assert all(np.linalg.eigvalsh(cov)[0] > 0.0 for cov in found.covs)
+    if found.joint_cov is not None:
+        for k, cov in enumerate(found.covs):
+            np.testing.assert_array_equal(cov, found.joint_cov[2 * k : 2 * k + 2, 2 * k : 2 * k + 2])
+    metrics = env.episode_metrics()
+    deviation = corner_deviation(found.points, env.truth.ground.corners)
+    assert metrics["corner_mean_m"] == (deviation.mean if n else None)
+    write_landmarks(tmp_path / "landmarks.db", env.backend, name=backend)
+    written = read_landmark_map(tmp_path / "landmarks.db").landmarks
+    order = np.argsort(belief.landmark_ids)
+    np.testing.assert_allclose(np.column_stack([written["x"], written["y"]]), found.points[order], atol=1e-12)
+
+
+def test_corners_handed_out_lie_nearer_the_true_ones():
+    believed, handed, nees = [], [], []
+    for rooms in ("rectangular", "corridors", "maze"):
+        env = driven("invariant-ekf", rooms=rooms, steps=300)
+        true, found = env.truth.ground.corners, handed_out(env.backend)
+        believed.extend(corner_deviation(env.belief.landmarks, true).each)
+        handed.extend(corner_deviation(found.points, true).each)
+        off = found.points - true[np.linalg.norm(found.points[:, None] - true[None], axis=2).argmin(axis=1)]
+        nees.extend(np.einsum("ki,kij,kj->k", off, np.linalg.inv(found.covs), off)[np.hypot(*off.T) < 0.1])
+    assert np.mean(handed) < 0.8 * np.mean(believed)
+    assert (
+        0.5 < np.median(nees) / 1.39 < 3.0
+    )  # of χ² with two degrees of freedom; errors of a room have much in common
