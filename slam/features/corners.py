@@ -38,6 +38,8 @@ from slam.features.surfaces import (
 from slam.types import CONCAVE, CONVEX, LINE, Array
 
 _LOOSE_M = 0.02
+_CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
+_SPREAD = 5.0  # most χ² per degree of freedom of an end face's points, at a right angle to the surface
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -122,8 +124,8 @@ def edge(
 
     Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
     beams, uniformly. A short end face may show in between (a wall is as thick as that), all of it behind the
-    line; hidden or not, it is taken to recede at a right angle. (Where a beam stops short of the line, something
-    nearer hides the surface: the rim of a shadow, no landmark.)
+    line; hidden or not, it is taken to recede at a right angle, and where it is seen its points tell the end.
+    (Where a beam stops short of the line, something nearer hides the surface: the rim of a shadow, no landmark.)
     """
     if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
         return 0
@@ -134,7 +136,8 @@ def edge(
     # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
     end = _meets(line, rays[index])
     t = missed = 0.0
-    faces = 0
+    faces = on_face = 0
+    weight = mean = spread = 0.0  # of the face's points that are clear of the line, along it
     while True:
         index += step
         if index < 0 or index >= n:
@@ -154,8 +157,8 @@ def edge(
             t = _meets(line, rays[index])
         px, py = reach * rays[index, 0], reach * rays[index, 1]
         beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+        depth = line[NX] * px + line[NY] * py - line[R]
         if reach > missed + limits[EDGE_JUMP]:
-            depth = line[NX] * px + line[NY] * py - line[R]
             if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
                 break  # past the end face, or there is none to see
         elif beyond > limits[EDGE_FACE]:
@@ -163,16 +166,25 @@ def edge(
         faces += 1
         if faces > 40:
             return 0
+        if depth > _CLEAR * limits[SIGMA]:
+            slide = -line[NY] * rays[index, 0] + line[NX] * rays[index, 1]
+            w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
+            on_face, weight = on_face + 1, weight + w
+            off = beyond - mean
+            mean += w / weight * off
+            spread += w * off * (beyond - mean)
     spacing = abs(t - end)
     if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
-    s = 0.5 * (t + end)
+    if on_face >= 2 and spread < _SPREAD * (on_face - 1):
+        s = end + step * mean
+        along = 1.0 / weight + limits[FLOOR] ** 2
+    else:
+        # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still. And
+        # what was seen of an end face: its points pass for the surface's while they lie within a few σ of it.
+        s = end + step * mean if on_face == 1 else 0.5 * (t + end)
+        along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + 4.0 * limits[SIGMA] ** 2
     x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
-    # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still. And what
-    # was seen of an end face: its points pass for the surface's while they lie within a few σ of it, so the end is
-    # seen too far or, the line tilted by them, too near. That is much the same from look to look; as noise of each
-    # look it is counted for more than it is, and so adds up to no less (docs/studies/consistency.md).
-    along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + 4.0 * limits[SIGMA] ** 2
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
     direction = math.atan2(step * ay - ny, step * ax - nx)
