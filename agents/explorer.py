@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -106,7 +106,10 @@ class Explorer(Driver):
         if self._target is None or np.hypot(*(target - self._target)) > self.config.patience.same_m:
             if self._target is not None and candidates.current is None:
                 # Seen, and gone: should it come back, in the noise at an edge, that look has been had.
-                self._troubles.note(self._target).looks += 1
+                trouble = self._troubles.note(self._target)
+                trouble.looks += 1
+                away = math.hypot(*(self._target - belief.pose[:2]).tolist())
+                trouble.afar += away > self._watch_kept().range_m and trouble.afar < self.config.patience.attempts
             self._detours = 0
             self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
             self._arrived_for = 0.0
@@ -157,22 +160,28 @@ class Explorer(Driver):
         if self._ending == "unreachable" and not np.isfinite(found.costs).any():
             sure = self._cost_maps.of(belief, sigma_m=0.0)
             found = self._candidates_on(sure)
-        # Between two beams there may be a door, or the way to what is left.
-        if self._sparse and self._ending in ("covered", "unreachable") and not np.isfinite(found.costs).any():
-            finest = self._frontier_config.finest(found.cost_map.resolution)
-            found = self._candidates_on(found.cost_map, finest)
+        if self._ending in ("covered", "unreachable") and not np.isfinite(found.costs).any():
+            found = self._candidates_on(found.cost_map, at_last=True)
         return self._own_part(found, belief) if belief.teammates else found
 
-    def _candidates_on(self, cost_map: CostMap, finest: FrontierConfig | None = None) -> Candidates:
-        """Return what there is to go to; with ``finest`` however small it is, and though it was passed by."""
-        watch = self._watch_kept()
-        frontiers = find(cost_map, finest, None) if finest else find(cost_map, self._frontier_config, watch)
+    def _candidates_on(self, cost_map: CostMap, *, at_last: bool = False) -> Candidates:
+        """Return what there is to go to; ``at_last``, when nothing is left, what single beams may have hidden.
+
+        Where beams are sparse, a door may be between two of them, or the way to what is left: however small it
+        is, and though it was passed by. Dense ones, too, are single at last, far away. They cut a frontier in
+        crumbs; and one that was gone, as they met it, and has come back is looked at again.
+        """
+        watch, config = self._watch_kept(), self._frontier_config
+        if at_last and self._sparse:
+            frontiers = find(cost_map, config.finest(cost_map.resolution), None)
+        else:
+            frontiers = find(cost_map, replace(config, joined_cells=2) if at_last else config, watch)
         # Ways are searched for as far as they are asked for: on a large map most frontiers are far away.
         asked = self._costs_asked()
         within_m = math.inf if asked is None else self._within_m
         while True:
             travel = travel_costs(cost_map, within_m=within_m)
-            cells, costs = self._views(cost_map, travel, frontiers, watch)
+            cells, costs = self._views(cost_map, travel, frontiers, watch, at_last)
             known = costs[costs < travel.beyond_m]
             if asked is None or len(known) >= asked or not (np.isfinite(costs) & (costs >= travel.beyond_m)).any():
                 break
@@ -194,12 +203,12 @@ class Explorer(Driver):
         return None
 
     def _views(
-        self, cost_map: CostMap, travel: TravelCosts, frontiers: Frontiers, watch: Watch
+        self, cost_map: CostMap, travel: TravelCosts, frontiers: Frontiers, watch: Watch, at_last: bool
     ) -> tuple[NDArray[np.int64], Array]:
         """Return cells ``(m, 2)`` and costs ``(m,)`` of :class:`Candidates`; take note of why none may be left."""
         config = self.config
         troubles = self._troubles.near(frontiers.targets)
-        looks = np.array([t.looks if t else 0 for t in troubles], dtype=np.float64)
+        looks = np.array([t.looks - at_last * t.afar if t else 0 for t in troubles], dtype=np.float64)
         cells, costs = view_points(
             cost_map, travel, frontiers.targets, frontiers.normals, range_m=watch.range_m,
             beyond_m=config.frontiers.beyond_m,

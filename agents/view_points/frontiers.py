@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import Config, Gap, Length, NotNegative, Within
+from slam.settings import Config, Count, Gap, Length, NotNegative, Within
 from slam.types import Array
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
@@ -32,6 +32,7 @@ class FrontierConfig(Config):
     min_unknown_m2: NotNegative = 0.05  # smaller unknown pockets hold nothing to find
     min_unknown_width_m: Gap = 0.3  # thinner ones are the insides of walls
     min_clearance_m: Gap = 0.1  # of a frontier cell: gaps in the drawing of a wall are no openings
+    joined_cells: Count = 1  # frontier cells no farther apart than so many are of one cluster
     # A long cluster is looked at in pieces of about this size.
     spacing_m: Annotated[float, Within("[0.05, 1000]")] = 0.6
     # Farthest place to look from, squarely; never beyond 0.8 of the lidar's range.
@@ -105,7 +106,7 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     if watch is not None:
         seen = in_good_sight(cost_map, cells, normals, watch)
         cells, normals = cells[~seen], normals[~seen]
-    own, boxes = _clusters(cells, classes.shape)
+    own, boxes = _clusters(cells, classes.shape, config.joined_cells)
     extent = boxes.max(axis=1, initial=0) * resolution
     large = extent >= config.min_extent_m - 1e-9
     renumber = np.where(large, np.cumsum(large) - 1, -1)
@@ -138,16 +139,19 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     return near[span:-span, span:-span]
 
 
-def _clusters(cells: NDArray[np.int64], shape: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return each cell's 8-connected cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
+def _clusters(
+    cells: NDArray[np.int64], shape: tuple[int, ...], reach: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return each cell's cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
 
+    With a ``reach`` of 1 they are 8-connected.
     Clusters are numbered in the order in which blocks of 2 × 2 cells meet them, row by row: OpenCV's order. The
     few cells of a frontier are joined in a fraction of the time that OpenCV takes to look all over a large grid.
     """
     labels = np.empty(len(cells), dtype=np.int64)
     boxes = np.empty((len(cells), 2), dtype=np.int64)
     order = np.lexsort((cells[:, 1] // 2, cells[:, 0] // 2))
-    count = _join(cells, order, np.zeros(shape, dtype=np.int32), labels, boxes)
+    count = _join(cells, order, np.zeros(shape, dtype=np.int32), reach, labels, boxes)
     return labels, boxes[:count]
 
 
@@ -214,8 +218,8 @@ def _bordering(
 
 @njit(cache=True, nogil=True)
 def _join(
-    cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], labels: NDArray[np.int64],
-    boxes: NDArray[np.int64],
+    cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], reach: int,
+    labels: NDArray[np.int64], boxes: NDArray[np.int64],
 ) -> int:  # fmt: skip
     """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is 0 all over."""
     rows, cols = index.shape
@@ -237,8 +241,8 @@ def _join(
             row, col = cells[stack[height]]
             low_r, high_r = min(low_r, row), max(high_r, row)
             low_c, high_c = min(low_c, col), max(high_c, col)
-            for r in range(max(row - 1, 0), min(row + 2, rows)):
-                for c in range(max(col - 1, 0), min(col + 2, cols)):
+            for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
+                for c in range(max(col - reach, 0), min(col + reach + 1, cols)):
                     other = index[r, c] - 1
                     if other >= 0 and labels[other] < 0:
                         labels[other] = count

@@ -40,6 +40,7 @@ class Trouble:
     """A piece of frontier that was looked at in vain, or could not be driven to."""
 
     looks: int = 0
+    afar: int = 0  # of these, that were no more than its vanishing, seen from afar
     failures: int = 0
     avoid_until_s: float = 0.0
 
