@@ -84,6 +84,31 @@ def test_a_frontier_that_never_yields_ends_it(name):
     assert pose[0] > 2.5  # it did go there
 
 
+@pytest.mark.parametrize(("x", "comes_back"), [(3.0, True), (7.3, False)])
+def test_a_door_that_vanished_as_seen_from_afar_is_looked_at_when_nothing_else_is_left(x, comes_back):
+    """From near by, that look has been had."""
+
+    def hall(*doors: float) -> np.ndarray:
+        classes = room(11.0, 4.0)
+        fill(classes, 0.0, 0.0, 1.0, 4.0, UNKNOWN)
+        fill(classes, 8.0, 0.0, 11.0, 4.0, UNKNOWN)
+        for wall in (1.0, 8.0):
+            fill(classes, wall - 0.1, 0.0, wall + 0.1, 4.0)
+        for door in doors:
+            half = 0.4 if door > 5.0 else 0.7
+            fill(classes, door - 0.1, 2.0 - half, door + 0.1, 2.0 + half, FREE)
+        return classes
+
+    agent = agents.make("nearest-frontier", config={"frontiers": SHORT})
+    agent.reset(belief_of(hall(8.0), (x, 2.0, 0.0)))
+    assert agent.choose(belief_of(hall(8.0), (x, 2.0, 0.0))).pose[0] > 6.5
+    assert agent.choose(belief_of(hall(1.0), (x, 2.0, 0.0))).pose[0] < 2.5  # the other, once that is gone
+    for _ in range(3):
+        goal = agent.choose(belief_of(hall(8.0), (x, 2.0, 0.0)))
+        assert (goal is not None) == comes_back
+        assert agent.status == ("driving" if comes_back else "covered")
+
+
 @pytest.mark.parametrize(
     ("name", "config", "match"),
     [

@@ -137,6 +137,19 @@ def test_small_clusters_and_small_pockets_are_left_out():
     assert len(find(cost_map, FrontierConfig(min_extent_m=2.0, far_extent_m=2.0)).extents) == 0
 
 
+def test_crumbs_that_single_beams_leave_are_joined_where_that_is_asked_for():
+    classes = room(6.0, 4.0)
+    fill(classes, 3.0, 1.0, 6.0, 4.0, UNKNOWN)
+    fill(classes, 2.9, 1.0, 3.0, 4.0)  # closed, …
+    fill(classes, 3.0, 0.9, 6.0, 1.0)
+    for k in range(6):  # … but for a beam, seen in every fourth cell
+        fill(classes, 3.2 + 0.2 * k, 1.8 + 0.2 * k, 3.3 + 0.2 * k, 1.9 + 0.2 * k, FREE)
+    cost_map = cost_maps.build(belief_of(classes, (1.5, 2.0, 0.0)), PlannerConfig(), ROBOT)
+    assert len(find(cost_map, FrontierConfig()).extents) == 0
+    extents = find(cost_map, FrontierConfig(joined_cells=2)).extents
+    assert len(extents) == 1 and extents[0] == pytest.approx(1.1, abs=0.11)
+
+
 @settings(max_examples=40, deadline=None)
 @given(rasters, st.sampled_from([(0.0, 0.0), (-0.35, 0.05), (0.1, -0.15)]))
 def test_coarse_cells_are_conservative(classes, origin):

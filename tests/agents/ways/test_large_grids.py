@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from agents.view_points.frontiers import FrontierConfig, _borders_a_large_pocket, _clusters, find
 from agents.view_points.sight import Watch, first_in_good_sight, in_good_sight
@@ -157,11 +158,25 @@ def test_clusters_against_opencv(seed):
     rng = np.random.default_rng(seed)
     mask = rng.random(rng.integers(1, 60, 2)) < rng.random() ** 2
     cells = np.argwhere(mask)
-    labels, boxes = _clusters(cells, mask.shape)
+    labels, boxes = _clusters(cells, mask.shape, 1)
     count, expected, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     np.testing.assert_array_equal(labels, expected[mask] - 1)
     np.testing.assert_array_equal(boxes, stats[1:, [cv2.CC_STAT_HEIGHT, cv2.CC_STAT_WIDTH]])
     assert len(boxes) == count - 1
+
+
+@settings(max_examples=80, deadline=None)
+@given(seeds, st.integers(1, 4))
+def test_clusters_join_what_is_within_reach(seed, reach):
+    rng = np.random.default_rng(seed)
+    mask = rng.random(rng.integers(1, 40, 2)) < 0.3 * rng.random()
+    cells = np.argwhere(mask)
+    labels, boxes = _clusters(cells, mask.shape, reach)
+    apart = np.abs(cells[:, None] - cells[None]).max(axis=2, initial=0)
+    count, expected = connected_components(apart <= reach)
+    assert count == len(boxes) == len(set(zip(labels.tolist(), expected.tolist(), strict=True)))
+    for k, box in enumerate(boxes):
+        np.testing.assert_array_equal(box, np.ptp(cells[labels == k], axis=0) + 1)
 
 
 @settings(max_examples=60, deadline=None)
