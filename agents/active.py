@@ -142,10 +142,8 @@ class ActiveSlam(PpoFrontier):
         if len(self._lately) <= drift.steps:
             return usual
         poses = np.array([pose for pose, _ in self._lately])
-        grown, squares = (
-            _grown(*self._lately[0], *self._lately[-1]),
-            float((np.diff(poses[:, :2], axis=0) ** 2).sum()),
-        )
+        grown = _grown(*self._lately[0], *self._lately[-1])
+        squares = float((np.diff(poses[:, :2], axis=0) ** 2).sum())
         if grown <= 0.0 or squares <= 0.0:
             return usual
         speed = max(drift.rate_m_rt_s * math.sqrt(squares / (grown * self._step_s)), drift.slowest_m_s)
