@@ -197,7 +197,7 @@ def _ros() -> Answers:
 
 
 def _gpu() -> Answers:
-    remedy = "nothing to do: training runs on processor cores, and nothing else uses a GPU"
+    remedy = "nothing to do: only `mecanum train --device cuda` uses a GPU, and does without"
     if importlib.util.find_spec("torch") is None:
         yield {"works": False, "found": "no PyTorch", "remedy": remedy}
         return

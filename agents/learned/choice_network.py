@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored
 from agents.learned.layers import Layers
@@ -37,34 +38,44 @@ class ChoiceNetwork(Layers):
 
     def scores(self, choice: Choice) -> Floats:
         """Return the score of each candidate ``(m,)``; the policy takes the highest."""
-        patches = choice.patches.reshape(len(choice.patches), -1).astype(np.float32) / np.float32(255.0)
+        return self._scores(choice.candidates, choice.patches, choice.distances, choice.state)
+
+    def _scores(self, candidates: Floats, patches: NDArray[np.uint8], distances: Floats, state: Floats) -> Floats:
+        """Return the scores ``(…, m)`` of candidates ``(…, m, CANDIDATE)`` and patches ``(…, m, 4, s, s)``."""
+        looked = patches.reshape(*patches.shape[:-3], -1).astype(np.float32) / np.float32(255.0)
         x = (
-            self._linear("row", choice.candidates)
-            + self._linear("patch_2", np.maximum(self._linear("patch_1", patches), 0.0))
-            + self._linear("state", choice.state)
+            self._rows("row", candidates)
+            + self._rows("patch_2", np.maximum(self._rows("patch_1", looked), 0.0))
+            + self._rows("state", state[None])
         )
-        x = self._linear("token", np.maximum(x, 0.0))
+        x = self._rows("token", np.maximum(x, 0.0))
         for k in range(self._layers):
-            x = self._attend(f"layers.{k}.", x, choice.distances)
-        return np.asarray(self._linear("score", self._normal("norm", x))[:, 0])
+            x = self._attend(f"layers.{k}.", x, distances)
+        return np.asarray(self._rows("score", self._normal("norm", x))[..., 0])
 
     def _attend(self, layer: str, x: Floats, distances: Floats) -> Floats:
-        m, width = x.shape
-        qkv = self._linear(layer + "qkv", self._normal(layer + "norm_1", x))
-        q, key, v = qkv.reshape(m, 3, self._heads, -1).transpose(1, 2, 0, 3)
+        qkv = self._rows(layer + "qkv", self._normal(layer + "norm_1", x))
+        # (…, m, 3, heads, width / heads) → (3, …, heads, m, width / heads)
+        q, key, v = np.moveaxis(qkv.reshape(*qkv.shape[:-1], 3, self._heads, -1), (-3, -2), (0, -3))
         reach = np.logaddexp(np.float32(0.0), self._weights[layer + "reach"])
-        score = q @ key.transpose(0, 2, 1) / np.float32(math.sqrt(width // self._heads))
-        score = score - reach[:, None, None] * distances
+        score = q @ np.swapaxes(key, -1, -2) / np.float32(math.sqrt(q.shape[-1]))
+        score = score - reach[..., None, None] * distances
         score = np.exp(score - score.max(axis=-1, keepdims=True))
         score /= score.sum(axis=-1, keepdims=True)
-        x = x + self._linear(layer + "out", (score @ v).transpose(1, 0, 2).reshape(m, width))
-        up = np.maximum(self._linear(layer + "up", self._normal(layer + "norm_2", x)), 0.0)
-        return np.asarray(x + self._linear(layer + "down", up))
+        x = x + self._rows(layer + "out", np.swapaxes(score @ v, -3, -2).reshape(x.shape))
+        up = np.maximum(self._rows(layer + "up", self._normal(layer + "norm_2", x)), 0.0)
+        return np.asarray(x + self._rows(layer + "down", up))
+
+    def _rows(self, name: str, x: Floats) -> Floats:
+        """Return the linear layer of rows ``(…, m, in)``; weights may be of several networks, on axes in front."""
+        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
+        return np.asarray(x @ np.swapaxes(weight, -1, -2) + bias[..., None, :])
 
     def _normal(self, name: str, x: Floats) -> Floats:
         centred = x - x.mean(axis=-1, keepdims=True)
         scale = np.sqrt((centred**2).mean(axis=-1, keepdims=True) + np.float32(1e-5))
-        return np.asarray(centred / scale * self._weights[name + ".weight"] + self._weights[name + ".bias"])
+        weight, bias = self._weights[f"{name}.weight"], self._weights[f"{name}.bias"]
+        return np.asarray(centred / scale * weight[..., None, :] + bias[..., None, :])
 
     def _check(self) -> None:
         width, seen = len(self._weights["norm.bias"]), self._weights["patch_1.weight"].shape[-1]
@@ -101,11 +112,28 @@ class ChoiceEnsemble:
 
     def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
         self.members = [ChoiceNetwork(own, heads=heads) for own in apart(weights)]
+        self._all = _Together(self.members, heads=heads)
 
     def scores(self, choice: Choice) -> Floats:
         """Return the mean of the log-probabilities of each candidate ``(m,)``, of all networks and both views."""
+        return np.asarray(_log_softmax(self._all.scores(choice)).mean(axis=(0, 1)))
+
+
+class _Together(ChoiceNetwork):
+    """Networks of one shape, their weights stacked, that look at once, and at the same time in a mirror."""
+
+    def __init__(self, members: Sequence[ChoiceNetwork], *, heads: int) -> None:
+        self._heads, self._layers = heads, members[0]._layers
+        # (networks, 1: views, …)
+        self._weights = {
+            name: np.stack([own._weights[name] for own in members])[:, None] for name in members[0]._weights
+        }
+
+    def scores(self, choice: Choice) -> Floats:
+        """Return what each network ``(networks, 2, m)`` holds of the choice, as it is and in a mirror."""
         views = choice, mirrored(choice)
-        return np.asarray(np.mean([_log_softmax(m.scores(view)) for m in self.members for view in views], axis=0))
+        candidates, patches = np.stack([v.candidates for v in views]), np.stack([v.patches for v in views])
+        return self._scores(candidates, patches, choice.distances, choice.state)
 
 
 def joined(members: Sequence[Mapping[str, Floats]]) -> dict[str, Floats]:
@@ -125,5 +153,5 @@ def apart(weights: Mapping[str, Floats]) -> list[dict[str, Floats]]:
 
 
 def _log_softmax(scores: Floats) -> Floats:
-    above = scores - scores.max()
-    return np.asarray(above - np.log(np.exp(above).sum()))
+    above = scores - scores.max(axis=-1, keepdims=True)
+    return np.asarray(above - np.log(np.exp(above).sum(axis=-1, keepdims=True)))

@@ -41,6 +41,10 @@ def train(
         ),
     ] = None,
     ray: Ray = None,
+    device: Annotated[
+        str,
+        typer.Option(help="Where PPO's networks learn: cpu, cuda (cuda:1, …), or auto: a GPU if there is one."),
+    ] = "cpu",
     out: Annotated[Path, typer.Option(help="Folder of the run.")] = Path("out/train"),
     wandb: Annotated[
         str | None,
@@ -61,6 +65,7 @@ def train(
       mecanum train --config ppo-frontier --seed 2 --out out/frontier-2
       mecanum train --config my.toml --out out/mine --resume
       mecanum train --out out/frontier --wandb exploration
+      mecanum train --out out/frontier --device cuda
     """  # noqa: D301
     check_writable(out)
     settings = _read(config, seed)
@@ -76,9 +81,12 @@ def train(
         make_run = _runner(settings)
         from training.learning.follow import Follow
     who = workers_of(workers, ray) or os.cpu_count() or 1
+    if ray is not None and device != "cpu":
+        raise BadInput("--device is of this machine; leave out --ray, or --device")
     with bad_input():
+        where = _device(device)
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
-        run = make_run(settings, out, workers=who, log=_say, command=command, follow=Follow(wandb))
+        run = make_run(settings, out, workers=who, log=_say, command=command, follow=Follow(wandb), device=where)
     try:
         run.train()
     except KeyboardInterrupt as error:
@@ -96,6 +104,18 @@ def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., FolderRun]:
     from training.learning.ppo import Run
 
     return Run if settings.members == 1 else EnsembleRun
+
+
+def _device(name: str) -> str:
+    """Return a device of torch that is there; ``ValueError`` says which are."""
+    import torch
+
+    there = [f"cuda:{k}" for k in range(torch.cuda.device_count())]
+    if name == "auto":
+        return "cuda" if there else "cpu"
+    if name != "cpu" and name not in there and not (there and name == "cuda"):
+        raise ValueError(f"--device {name}: torch finds {', '.join(['cpu', *there])} here; see `mecanum doctor`")
+    return name
 
 
 def _read(config: str, seed: int | None) -> TrainConfig | DriveConfig:

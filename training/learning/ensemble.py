@@ -29,19 +29,22 @@ class EnsembleRun(FolderRun):
     """A run for each member, in folders ``member-1``, ``member-2`` and so on, and a trial of all at the end.
 
     A member that is done is not trained again. As many members as there are workers are trained at a time, each in
-    one process, which writes into the member's folder: the nodes of a cluster have to share it.
+    one process, or with processes for its environments where there are workers left; it writes into the member's
+    folder: the nodes of a cluster have to share it.
     """
 
     config: TrainConfig
 
     def _train(self, pool: Pool) -> None:
         folders = _folders(self.config, self.out)
+        each = max(1, self._workers // self.config.members) if isinstance(self._workers, int) else 1
         with pool.channel() as said:
             futures = []
             for number, folder in enumerate(folders):
                 config = replace(self.config, members=1, seed=seed_of(self.config.seed, number))
                 command = f"{self._progress['command']}: {folder.name}"
-                futures.append(pool.submit(_train_member, config, folder, command, said, self._follow))
+                about = config, folder, command, said, self._follow, self._device, each
+                futures.append(pool.submit(_train_member, *about))
             while not said.empty() or not all(future.done() for future in futures):
                 self._pass_on(said, futures)
         for future in futures:
@@ -66,8 +69,9 @@ class EnsembleRun(FolderRun):
 
 
 def _train_member(
-    config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]], follow: Follow
-) -> None:
+    config: TrainConfig, out: Path, command: str, said: queue.Queue[tuple[str, str]], follow: Follow, device: str,
+    workers: int,
+) -> None:  # fmt: skip
     def log(text: str) -> None:
         said.put((out.name, text))
 
@@ -77,7 +81,7 @@ def _train_member(
             "that every node shares"
         )
 
-    Run(config, out, workers=1, log=log, command=command, follow=follow).train()
+    Run(config, out, workers=workers, log=log, command=command, follow=follow, device=device).train()
 
 
 def best_weights(config: TrainConfig, out: Path) -> Weights:

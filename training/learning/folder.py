@@ -40,6 +40,7 @@ class FolderRun:
 
     The folder gets ``progress.json``, where ``command`` is noted for the policies that are exported;
     ``curve.jsonl`` with a line per evaluation; of stable-baselines3 ``checkpoint.zip``, of TensorBoard ``log``.
+    PPO's networks learn on a ``device`` of torch's; only on a processor are they the same again, bit for bit.
 
     Raises
     ------
@@ -52,9 +53,10 @@ class FolderRun:
 
     def __init__(
         self, config: Any, out: Path, *, workers: Workers, log: Callable[[str], None], command: str = "",
-        follow: Follow = NOBODY,
+        follow: Follow = NOBODY, device: str = "cpu",
     ) -> None:  # fmt: skip
         self.config, self.out, self._workers, self._log, self._follow = config, out, workers, log, follow
+        self._device = device
         settings = json.loads(json.dumps(to_mapping(config)))
         self._progress: dict[str, Any] = {
             "config": settings, "command": command, "round": 0, "chunk": 0, "steps": 0, "best": None,
@@ -116,7 +118,7 @@ class FolderRun:
         model.set_logger(logger)
         model.num_timesteps = progress["steps"]
         if progress["chunk"] > first:
-            model.set_parameters(str(checkpoint), device="cpu")
+            model.set_parameters(str(checkpoint), device=self._device)
         while (done := progress["chunk"] - first) < ppo.chunks:
             if done % every == 0:
                 try_out()

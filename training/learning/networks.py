@@ -89,7 +89,7 @@ class ChoiceNetwork(nn.Module):
         absent = ~present
         # Of the candidates that there are alone: most of the time goes into these two.
         patches = observation["patches"][present].flatten(1).float() / 255.0
-        seen = torch.zeros(*present.shape, self.width)
+        seen = torch.zeros(*present.shape, self.width, device=patches.device)
         seen[present] = self.patch_2(torch.relu(self.patch_1(patches)))
         x = self.row(observation["candidates"]) + seen + self.state(observation["state"])[:, None]
         x = self.token(torch.relu(x))

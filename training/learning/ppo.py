@@ -44,7 +44,7 @@ class Run(FolderRun):
     def _enact(self, stage: _Stage, pool: Pool) -> None:
         env = VecMonitor(self._environments(stage.makers))
         try:
-            model = make_model(self.config, env, stage.ppo)
+            model = make_model(self.config, env, stage.ppo, device=self._device)
             network = cast("ChoicePolicy", model.policy).network
             if stage.first > 0:
                 found = read_zip(self.out / "checkpoint.zip")
@@ -64,17 +64,17 @@ class Run(FolderRun):
             return SubprocVecEnv(apart, start_method="spawn")
 
     def _try_out(self, stage: _Stage, model: MaskablePPO, network: torch.nn.Module, pool: Pool) -> None:
-        weights = {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
+        weights = {name: value.detach().cpu().numpy().copy() for name, value in network.state_dict().items()}
         result = evaluate(weights, self.config.heads, stage.trials, pool)
         at = {"stage": stage.name, "steps": self._progress["steps"]}
         self._note_trial(at, result, result["time_to_95_s"], partial(save_model, model, self.out / "best.zip"))
 
 
-def make_model(config: TrainConfig, env: VecEnv, ppo: PpoConfig) -> MaskablePPO:
+def make_model(config: TrainConfig, env: VecEnv, ppo: PpoConfig, *, device: str = "cpu") -> MaskablePPO:
     """Return an untrained model for an environment with the configuration's choices."""
     network = {"width": config.width, "heads": config.heads, "layers": config.layers}
     model = MaskablePPO(
-        ChoicePolicy, env, **ppo.settings, rollout_buffer_class=SemiMarkovBuffer, device="cpu", seed=config.seed,
+        ChoicePolicy, env, **ppo.settings, rollout_buffer_class=SemiMarkovBuffer, device=device, seed=config.seed,
         policy_kwargs={"features_extractor_kwargs": network},
     )  # fmt: skip
     if config.rehearsal.steps > 0:

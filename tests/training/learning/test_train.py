@@ -11,6 +11,8 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
+import torch
+
 from agents.learned.choice import CANDIDATE, STATE
 from slam.settings import from_mapping
 from training.cli import main
@@ -40,7 +42,9 @@ REHEARSED = SMALL | {
 }  # fmt: skip
 
 
-def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL, workers: int = 2) -> list[str]:
+def run(
+    out: Path, *, kill_after: str | None = None, config: dict = SMALL, workers: int = 2, device: str = "cpu"
+) -> list[str]:
     said: list[str] = []
 
     def log(text: str) -> None:
@@ -48,7 +52,7 @@ def run(out: Path, *, kill_after: str | None = None, config: dict = SMALL, worke
         if kill_after is not None and text.startswith(kill_after):
             raise Killed
 
-    Run(from_mapping(TrainConfig, config), out, workers=workers, log=log).train()
+    Run(from_mapping(TrainConfig, config), out, workers=workers, log=log, device=device).train()
     return said
 
 
@@ -237,7 +241,8 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
         EnsembleRun(made, out, workers=2, log=log, command="as typed").train()
     with pytest.raises(ValueError, match="another configuration"):
         EnsembleRun(from_mapping(TrainConfig, config | {"seed": 2}), out, workers=2, log=print)
-    EnsembleRun(made, out, workers=2, log=said.append, command="as typed").train()
+    # With workers to spare each member has processes for its environments.
+    EnsembleRun(made, out, workers=4, log=said.append, command="as typed").train()
     assert sum(text.startswith("member-2: rehearsal, chunk 1") for text in said) == 1, "it was checkpointed"
     assert said[-1].startswith("evaluation: stage all members")
     assert main(["policy", str(out), str(mine)]) == 0
@@ -265,6 +270,25 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
     assert not (tmp_path / "x.zip").exists()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
+def test_what_is_learned_on_a_gpu_goes_on_on_a_processor(tmp_path):
+    with pytest.raises(Killed):
+        run(tmp_path, kill_after="rehearsal, chunk 1 ", config=REHEARSED, device="cuda")
+    learned = read_zip(tmp_path / "checkpoint.zip")
+    assert learned["score.weight"].any(), "it begins with none"
+    run(tmp_path, config=REHEARSED)
+    assert all(np.isfinite(values).all() for values in read_zip(tmp_path / "best.zip").values())
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
+def test_a_gpu_that_is_not_there_is_said_before_anything_is_written(tmp_path, capsys):
+    for name in ("cuda", "cuda:1", "tpu"):
+        assert main(["train", "--device", name, "--out", str(tmp_path / "run")]) == 2
+        error = capsys.readouterr().err
+        assert f"--device {name}: torch finds cpu here" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_damaged_policy_is_named(tmp_path):

@@ -89,10 +89,10 @@ class _Flat(nn.Module):
         return cast("Tensor", self.network(scan, landmarks.reshape(-1, LANDMARKS, 5), numbers))
 
 
-def make_model(config: DriveConfig, env: VecEnv) -> PPO:
+def make_model(config: DriveConfig, env: VecEnv, *, device: str = "cpu") -> PPO:
     """Return PPO with :class:`DrivePolicy`."""
     assert flatten_space(env.observation_space).shape == (LANDMARKS * 5 + NUMBERS + SECTORS,)
     return PPO(
-        DrivePolicy, env, **config.ppo.settings, device="cpu", seed=config.seed,
+        DrivePolicy, env, **config.ppo.settings, device=device, seed=config.seed,
         policy_kwargs={"log_std_init": -2.0, "net_arch": []},
     )  # fmt: skip

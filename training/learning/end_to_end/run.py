@@ -124,7 +124,7 @@ class DriveRun(FolderRun):
             )
         env = VecMonitor(envs)
         try:
-            model = make_model(config, env)
+            model = make_model(config, env, device=self._device)
             policy = cast("DrivePolicy", model.policy)
             policy.network.load_state_dict(self._control.state_dict())
 
