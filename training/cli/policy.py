@@ -14,9 +14,13 @@ __all__ = ["policy"]
 
 
 def policy(
-    source: Annotated[str, typer.Argument(help="Folder of a run, .safetensors, .zip or hf://USER/REPO.")],
-    target: Annotated[
-        str, typer.Argument(help=".safetensors (a .json file is written beside it), .zip or hf://USER/REPO.")
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCE... TARGET",
+            help="From a run's folder, .safetensors, .zip or hf://USER/REPO; to .safetensors (a .json file is "
+            "written beside it), .zip or hf://USER/REPO. Several .safetensors become one.",
+        ),
     ],
     like: Annotated[
         Path | None,
@@ -31,6 +35,8 @@ def policy(
 ) -> None:
     """Convert a policy: a run's best, the package's files, a zip of stable-baselines3 (ppo-frontier's only).
 
+    Of several policies of ppo-frontier it makes one whose networks choose together.
+
     The package's files, .safetensors and .json, hold no code; of a zip the weights alone are read. A Hugging Face
     hub, hf://USER/REPO[/NAME][@REVISION], is sent them or has them as they are; commit and SHA-256 are said.
 
@@ -38,11 +44,21 @@ def policy(
     Examples:
       mecanum policy out/train mine.safetensors
       mecanum policy mine.safetensors mine.zip
+      mecanum policy one.safetensors two.safetensors both.safetensors
       mecanum policy three.safetensors mine.zip --member 2
       mecanum policy mine.zip other.safetensors --like mine.json
       mecanum policy mine.safetensors hf://me/explorer
       mecanum policy hf://me/explorer@v2 theirs.safetensors
     """  # noqa: D301
+    if len(files) < 2:
+        raise BadInput(f"what shall {files[0]} become? Give a target, too")
+    *sources, target = files
+    if len(sources) > 1:
+        if like is not None or member is not None or private:
+            raise BadInput("--like, --member and --private are of one source; leave them out")
+        _join([Path(name) for name in sources], Path(target))
+        return
+    source = sources[0]
     if any(name.startswith("hf://") for name in (source, target)):
         if like is not None or member is not None:
             raise BadInput("--like and --member are of a .zip; a hub has the package's files")
@@ -75,6 +91,18 @@ def _convert(source: Path, target: Path, like: Path | None, member: int | None) 
         else:
             assert like is not None
             policies.export_policy(networks.read_zip(source), target, _read(like))
+
+
+def _join(sources: list[Path], target: Path) -> None:
+    for path in (*sources, target):
+        if path.suffix != ".safetensors":
+            raise BadInput(f"cannot join {path}; several .safetensors become one .safetensors")
+    check_writable(target.parent)
+    with needs_extra("train"):
+        from training.learning import policies
+    with bad_input():
+        policies.join_policies(sources, target)
+    print(f"wrote {target}")
 
 
 def _over_the_hub(source: str, target: str, private: bool) -> None:

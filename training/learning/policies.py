@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import ppo, ppo_frontier
 from agents.learned.choice import CANDIDATE, STATE
-from agents.learned.choice_network import apart
+from agents.learned.choice_network import apart, joined
 from agents.learned.chooser import ChooserConfig
 from agents.learned.drive_memory import PlanSettings
 from agents.learned.policy_files import write_policy
@@ -27,7 +27,7 @@ from training.learning.folder import save_model
 from training.learning.networks import ChoicePolicy
 from training.learning.ppo import make_model
 
-__all__ = ["export_policy", "export_run", "write_zip"]
+__all__ = ["export_policy", "export_run", "join_policies", "write_zip"]
 
 
 def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:
@@ -73,6 +73,35 @@ def export_run(run: Path, target: Path) -> None:
         _export_drive(run, target, progress, curve)
     else:
         export_policy(best_weights(config, run), target, _training(progress, curve))
+
+
+def join_policies(sources: Sequence[Path], target: Path) -> None:
+    """Write one policy of several of ``ppo-frontier``: all their networks choose together.
+
+    Its JSON file has the first one's configuration, all commands, and the curves one after the other.
+
+    Raises
+    ------
+    ValueError
+        Where one is no such policy, or they do not drive alike.
+    """
+    read = [ppo_frontier.load_choice_policy(path) for path in sources]
+    first = read[0]
+    for path, (_, driver, about) in zip(sources, read, strict=True):
+        if driver != first[1] or about["heads"] != first[2]["heads"]:
+            raise ValueError(f"{path} drives otherwise than {sources[0]}; join what was trained alike")
+        if "config" not in about:
+            raise ValueError(f"{path.with_suffix('.json')} does not say with which config it was trained")
+    described = [about for _, _, about in read]
+    members = [own for path in sources for own in apart(load_file(path))]
+    training = {
+        "command": "; ".join(dict.fromkeys(str(about.get("command", "")) for about in described)),
+        "config": described[0]["config"], "steps": sum(about.get("steps", 0) for about in described),
+        "hours": round(sum(about.get("hours", 0.0) for about in described), 3),
+        "training_seeds": described[0].get("training_seeds"),
+        "curve": [{"run": k} | line for k, about in enumerate(described, 1) for line in about.get("curve", [])],
+    }  # fmt: skip
+    export_policy(joined(members), target, training)
 
 
 def write_zip(source: Path, target: Path, member: int | None = None) -> None:

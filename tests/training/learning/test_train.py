@@ -222,7 +222,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
 
 
 def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
-    from agents.ppo_frontier import load_choice_policy
+    from agents.ppo_frontier import SHIPPED, load_choice_policy
 
     config = SMALL | {
         "members": 2, "world": {"rooms": ["rectangular"]},
@@ -256,6 +256,17 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
     for k, member in enumerate(network.members, start=1):
         same_weights(halved(read_zip(out / f"member-{k}" / "best.zip")), member._weights)
     assert not np.array_equal(network.members[0]._weights["row.weight"], network.members[1]._weights["row.weight"])
+    # Several policies become one.
+    more = tmp_path / "more.safetensors"
+    assert main(["policy", str(mine), str(SHIPPED), str(mine), str(more)]) == 2, "they drive otherwise"
+    assert "join what was trained alike" in capsys.readouterr().err and not more.exists()
+    assert main(["policy", str(mine), str(mine), str(more)]) == 0
+    together, _, said_of = load_choice_policy(more)
+    assert len(together.members) == 4 and said_of["steps"] == 64 and said_of["command"] == "as typed"
+    for k, member in enumerate(together.members):
+        same_weights(member._weights, network.members[k % 2]._weights)
+    assert main(["policy", str(mine), str(mine), str(tmp_path / "x.zip")]) == 2
+    assert main(["policy", str(mine)]) == 2
     # A zip holds one of them.
     zipped = tmp_path / "second.zip"
     assert main(["policy", str(mine), str(zipped), "--member", "2"]) == 0
