@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -78,21 +79,22 @@ def export_run(run: Path, target: Path) -> None:
 def join_policies(sources: Sequence[Path], target: Path) -> None:
     """Write one policy of several of ``ppo-frontier``: all their networks choose together.
 
-    Its JSON file has the first one's configuration, all commands, and the curves one after the other.
+    They may differ in their seeds alone. The JSON file has the first one's configuration, all commands, and the
+    curves one after the other.
 
     Raises
     ------
     ValueError
-        Where one is no such policy, or they do not drive alike.
+        Where one is no such policy, or another configuration's.
     """
-    read = [ppo_frontier.load_choice_policy(path) for path in sources]
-    first = read[0]
-    for path, (_, driver, about) in zip(sources, read, strict=True):
-        if driver != first[1] or about["heads"] != first[2]["heads"]:
-            raise ValueError(f"{path} drives otherwise than {sources[0]}; join what was trained alike")
-        if "config" not in about:
+    described, configs = [], []
+    for path in sources:
+        described.append(ppo_frontier.load_choice_policy(path)[2])
+        if "config" not in described[-1]:
             raise ValueError(f"{path.with_suffix('.json')} does not say with which config it was trained")
-    described = [about for _, _, about in read]
+        configs.append(replace(from_mapping(TrainConfig, described[-1]["config"]), seed=0))
+        if configs[-1] != configs[0]:
+            raise ValueError(f"{path} was trained otherwise than {sources[0]}: their configurations differ")
     members = [own for path in sources for own in apart(load_file(path))]
     training = {
         "command": "; ".join(dict.fromkeys(str(about.get("command", "")) for about in described)),

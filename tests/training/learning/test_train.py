@@ -258,8 +258,8 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
     assert not np.array_equal(network.members[0]._weights["row.weight"], network.members[1]._weights["row.weight"])
     # Several policies become one.
     more = tmp_path / "more.safetensors"
-    assert main(["policy", str(mine), str(SHIPPED), str(mine), str(more)]) == 2, "they drive otherwise"
-    assert "join what was trained alike" in capsys.readouterr().err and not more.exists()
+    assert main(["policy", str(mine), str(SHIPPED), str(mine), str(more)]) == 2, "of other configurations"
+    assert "was trained otherwise than" in capsys.readouterr().err and not more.exists()
     assert main(["policy", str(mine), str(mine), str(more)]) == 0
     together, _, said_of = load_choice_policy(more)
     assert len(together.members) == 4 and said_of["steps"] == 64 and said_of["command"] == "as typed"
