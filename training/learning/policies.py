@@ -96,13 +96,16 @@ def join_policies(sources: Sequence[Path], target: Path) -> None:
         if configs[-1] != configs[0]:
             raise ValueError(f"{path} was trained otherwise than {sources[0]}: their configurations differ")
     members = [own for path in sources for own in apart(load_file(path))]
-    training = {
-        "command": "; ".join(dict.fromkeys(str(about.get("command", "")) for about in described)),
-        "config": described[0]["config"], "steps": sum(about.get("steps", 0) for about in described),
-        "hours": round(sum(about.get("hours", 0.0) for about in described), 3),
-        "training_seeds": described[0].get("training_seeds"),
-        "curve": [{"run": k} | line for k, about in enumerate(described, 1) for line in about.get("curve", [])],
-    }  # fmt: skip
+    try:
+        training = {
+            "command": "; ".join(dict.fromkeys(str(about.get("command", "")) for about in described)),
+            "config": described[0]["config"], "steps": sum(int(about.get("steps", 0)) for about in described),
+            "hours": round(sum(float(about.get("hours", 0.0)) for about in described), 3),
+            "training_seeds": described[0].get("training_seeds"),
+            "curve": [{"run": k} | line for k, it in enumerate(described, 1) for line in it.get("curve", [])],
+        }  # fmt: skip
+    except TypeError as error:
+        raise ValueError(f"what a policy's JSON file says of its training is of another form: {error}") from error
     export_policy(joined(members), target, training)
 
 
