@@ -26,7 +26,8 @@ from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend,
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
-from slam.landmarks.spinning_wheels import FEWEST_BACK
+from slam.landmarks.rescue import match_missed
+from slam.landmarks.spinning_wheels import FEWEST_BACK, tells_place
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -95,21 +96,21 @@ class EkfSlam(GaussianBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
+        self._spinning.untold = not tells_place(z, match)
         if scan is not None and self._may_spin(scan, match, *self._recall):
             match = self._allow_for_spinning_wheels(z, match, scan)
-        given = z.copy() if self.config.lines else z  # what is matched with curved walls is straightened in place
-        self._accept(z, match, JOINT_LIMITS)
-        if self.nis_dof == 0 and self.nis > 0.0:  # each of them may be right, but not all together
-            z[:] = given
-            forget(z, match, self._book.marks)
+        if not self._accept(z, match, JOINT_LIMITS):  # each of them may be right, but not all together
             match = self._associate_jointly(z)
             loop = self._put_off(z, match)
             self._accept(z, match)
+        if self.nis_dof > 0 and self._recall[1] < self._recall[0]:
+            self._rescue(z, match)
         if loop:
             self._close_loop(z, match)
         if scan is not None:
             self._spinning.note(scan, self._x[:3], self._recall[0], match)
             if self.nis_dof >= 2 * FEWEST_BACK:
+                self._spinning.untold = not tells_place(z, match)
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
 
@@ -195,12 +196,26 @@ class EkfSlam(GaussianBackend):
         )  # fmt: skip
         if old == 0:
             return
-        nis, dof = self.nis, self.nis_dof
         closing = np.full(len(match), UNMATCHED)
         closing[rows] = more
-        self._accept(z, closing)
-        self.nis, self.nis_dof = self.nis + nis, self.nis_dof + dof
-        match[closing >= 0] = closing[closing >= 0]
+        self._accept_also(z, match, closing)
+
+    def _rescue(self, z: Array, match: NDArray[np.int64]) -> None:
+        """Match and correct by what left its gate, now that the others have put the pose right."""
+        more, gates = np.empty(len(z), np.int64), self._gates
+        offset, book = self.config.lidar_offset_m, self._book
+        if match_missed(self._x, self._p, offset, z, book.marks, book.now, gates, match, more) > 0:
+            self._accept_also(z, match, more, JOINT_LIMITS)
+
+    def _accept_also(
+        self, z: Array, match: NDArray[np.int64], more: NDArray[np.int64], limits: Array = NO_LIMITS
+    ) -> None:
+        """Correct by further matches, and count them to those that there are."""
+        nis, dof = self.nis, self.nis_dof
+        if self._accept(z, more, limits):
+            match[more >= 0] = more[more >= 0]
+            nis, dof = nis + self.nis, dof + self.nis_dof
+        self.nis, self.nis_dof = nis, dof
 
     def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
         """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
@@ -214,9 +229,11 @@ class EkfSlam(GaussianBackend):
         wide = self._p[:3, :3].copy()
         match, spun = self._associate_jointly(z), False
         if spinning.enough(match, usual):
-            fit = self._fit(z, match, scan)
+            fit, there = self._fit(z, match, scan), self._x[:2].copy()
             self._x[:n], self._p[:n, :n] = x, p
-            spun = spinning.explain(fit, self._fit(z, usual, scan))
+            usual_fit = self._fit(z, usual, scan)
+            shift = math.hypot(*(there - self._x[:2]))
+            spun = spinning.explain(fit, usual_fit, unseen=shift < self.grid.resolution)
         if spun or lately:
             p[:3, :3] = wide
         self._x[:n], self._p[:n, :n] = x, p
@@ -229,14 +246,24 @@ class EkfSlam(GaussianBackend):
         self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
 
-    def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
-        """Correct by a match that stands, curved walls made straight; show the innovations to who has asked."""
-        offset = self.config.lidar_offset_m
+    def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
+        """Correct by a match, curved walls made straight; tell whether it stands, as its joint NIS may be refused.
+
+        The innovations are shown to who has asked.
+        """
+        offset, marks = self.config.lidar_offset_m, self._book.marks
+        given = z
         if self.config.lines:
-            straighten(self._x, offset, z, match, self._book.marks, self._curved)
+            given = z.copy()
+            straighten(self._x, offset, z, match, marks, self._curved)
         if self.witness is not None:
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
         self._correct(z, match, limits)
+        stands = self.nis_dof > 0 or self.nis == 0.0
+        if not stands:
+            z[:] = given
+            forget(z, match, marks)
+        return stands
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
         """Make one stacked update of all matched observations, unless their NIS is above the limit of so many."""

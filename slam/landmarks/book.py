@@ -18,13 +18,15 @@ from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.settings import Config, Count, Gap, NotNegative
 from slam.types import LINE, Array, Scan
 
-__all__ = ["KIND", "MARKS", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall"]
+__all__ = [
+    "KIND", "LAST_SEEN", "MARKS", "RECENT", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall",
+]  # fmt: skip
 
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 
 MARKS = 11  # columns of ``marks``, one row a landmark; the last three are those of slam.landmarks.curved_walls
-_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, _LAST_SEEN, _FROM, _TO = range(8)
-_RECENT = 3  # updates
+_KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, LAST_SEEN, _FROM, _TO = range(8)
+RECENT = 3  # updates, of which a landmark was in one: it is missed where it is not seen again
 _SAME_TURN = 0.6  # [rad] between two sightings of one landmark
 _WALL_REACH_M = 3.0  # between the middles of two pieces of a wall that may become one landmark
 # Columns of the tentative ones.
@@ -155,7 +157,7 @@ class LandmarkBook:
         self._now += 1
         seen = match[match >= 0]
         self._marks[seen, _SEEN] += 1.0
-        self._marks[seen, _LAST_SEEN] = self._now
+        self._marks[seen, LAST_SEEN] = self._now
 
     def review(
         self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan | None = None, *,
@@ -194,7 +196,7 @@ def _seen_at(
     seen_ids, seen = np.empty(n, np.int64), np.empty((n, 3))
     count = 0
     for row in range(n):
-        if marks[row, _LAST_SEEN] == now:
+        if marks[row, LAST_SEEN] == now:
             seen_ids[count], seen[count, 0], seen[count, 1] = ids[row], points[row, 0], points[row, 1]
             seen[count, 2] = marks[row, _KIND] == LINE
             count += 1
@@ -229,10 +231,10 @@ def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int,
     """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
     recent = still = 0
     for i in range(marks.shape[0]):
-        if marks[i, _LAST_SEEN] > now - _RECENT:
+        if marks[i, LAST_SEEN] > now - RECENT:
             recent += 1
     for k in range(match.shape[0]):
-        if match[k] >= 0 and marks[match[k], _LAST_SEEN] > now - _RECENT:
+        if match[k] >= 0 and marks[match[k], LAST_SEEN] > now - RECENT:
             still += 1
     return recent, still
 
@@ -252,7 +254,7 @@ def _sightings(
     for k in range(z.shape[0]):
         if match[k] >= 0:
             marks[match[k], _SEEN] += 1.0
-            marks[match[k], _LAST_SEEN] = now
+            marks[match[k], LAST_SEEN] = now
             if z[k, KIND] == LINE:
                 _lengthen(x, offset, z[k], match[k], marks[match[k]])
     for k in range(z.shape[0]):
@@ -333,7 +335,7 @@ def _look_through(
     full = beams >= circle
     doubtful = False
     for i in range(marks.shape[0]):
-        if marks[i, _LAST_SEEN] == now or marks[i, _KIND] == LINE:
+        if marks[i, LAST_SEEN] == now or marks[i, _KIND] == LINE:
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy

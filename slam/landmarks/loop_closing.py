@@ -17,12 +17,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.landmarks.association import IGNORED, add_expected, gated_distance, predicted
+from slam.landmarks.book import LAST_SEEN
 from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
 from slam.types import LINE, Array
 
 __all__ = ["agreeing", "put_off"]
 
-_LAST_SEEN = 5  # column of marks
 _OLD = 50.0  # updates without a sighting: what is followed from scan to scan needs no company
 _HOLD = 3  # other landmarks seen, that old ones can wait for company
 _ALONE = 2.0  # times ``sigma`` to which one must be expected to be taken without company
@@ -68,7 +68,7 @@ def put_off(
         i = match[k]
         if i < 0:
             continue
-        if now - marks[i, _LAST_SEEN] > _OLD:
+        if now - marks[i, LAST_SEEN] > _OLD:
             sigmas2 = _expected_variance(x, p, i, offset, z[k], h) / sigma**2
             doubtful[k] = sigmas2 > 1.0
             if doubtful[k] and sigmas2 <= _ALONE**2:
@@ -105,7 +105,7 @@ def agreeing(
         i = match[k]
         if i < 0:
             continue
-        if now - marks[i, _LAST_SEEN] <= _OLD or _expected_variance(x, p, i, offset, z[k], h[pairs]) <= sigma**2:
+        if now - marks[i, LAST_SEEN] <= _OLD or _expected_variance(x, p, i, offset, z[k], h[pairs]) <= sigma**2:
             match[k] = IGNORED
             continue
         landmark[pairs] = i

@@ -15,14 +15,15 @@ from collections.abc import Callable
 import numpy as np
 
 from slam.grids.occupancy import OccupancyGrid
-from slam.types import Array, Indices, Scan
+from slam.types import LINE, Array, Indices, Scan
 
-__all__ = ["FEWEST_BACK", "SpinningWheels"]
+__all__ = ["FEWEST_BACK", "SpinningWheels", "tells_place"]
 
 FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
 
-_FEWEST_RECENT = 3  # landmarks that the last scans showed, below which none is missed
+_ASKEW = 0.2  # sine of the angle between two walls from which on they say where along them the robot is
+_UNTOLD_M = 0.3  # of the wheels' way at most is remembered along a corridor of which no end is in sight
 # Log-odds [nat] by which a scan fits worse; by which it must fit better, and where less than half of the landmarks
 # are still matched. Of 692 explanations that robots driven at random needed 610 come up to that, of 314 not needed
 # none (rooms with straight walls, training seeds 200-205): all were right. At the doors of 20 drives on floors,
@@ -39,10 +40,13 @@ class SpinningWheels:
     ----------
     moved_m, turned_rad : float
         What the wheels claim since the landmarks were last in sight.
+    untold : bool
+        Whether the matched landmarks leave open how far along them the robot is: walls of one direction, or none.
     """
 
     def __init__(self) -> None:
         self.moved_m = self.turned_rad = 0.0
+        self.untold = False
         self._left = 0
         self._most_missed = False
         self._last: tuple[Scan, Array] | None = None
@@ -53,8 +57,14 @@ class SpinningWheels:
         self.turned_rad += turned_rad
 
     def forget_motion(self) -> None:
-        """Note that the landmarks say where the robot is."""
-        self.moved_m = self.turned_rad = 0.0
+        """Note that the landmarks say where the robot is, but for what is ``untold``."""
+        self.moved_m = min(self.moved_m, _UNTOLD_M) if self.untold else 0.0
+        self.turned_rad = 0.0
+
+    @property
+    def _least(self) -> int:
+        """How many landmarks must be missed to ask; a corridor's end alone tells how far along it the robot is."""
+        return 1 if self.untold else FEWEST_BACK
 
     @property
     def variances(self) -> tuple[float, float, float]:
@@ -86,7 +96,7 @@ class SpinningWheels:
         self._most_missed = 2 * still < recent
         if self._left:
             return True
-        if recent < _FEWEST_RECENT or recent - still < FEWEST_BACK or np.count_nonzero(match < 0) < FEWEST_BACK:
+        if recent - still < self._least or np.count_nonzero(match < 0) < self._least:
             return False
         if self._last is None:
             return True
@@ -95,13 +105,17 @@ class SpinningWheels:
 
     def enough(self, found: Indices, usual: Indices) -> bool:
         """Tell whether a match that was made as though they spun may explain more than the usual one."""
-        least = int(np.count_nonzero(usual >= 0)) + (0 if self._left else FEWEST_BACK)
+        least = int(np.count_nonzero(usual >= 0)) + (0 if self._left else self._least)
         return int(np.count_nonzero(found >= 0)) >= max(FEWEST_BACK, least)
 
-    def explain(self, fit: float, usual: float) -> bool:
-        """Tell whether a scan says that they spun, by how well [nat] it fits from there and as usual."""
+    def explain(self, fit: float, usual: float, *, unseen: bool = False) -> bool:
+        """Tell whether a scan says that they spun, by how well [nat] it fits from there and as usual.
+
+        Where the two poses are less than a cell apart (``unseen``) the fit tells nothing; then the end of a
+        corridor, too near to where it was to be another wall, is believed.
+        """
         surely = fit > usual + min(abs(usual), _MOST_MISSED_NAT if self._most_missed else _SURE_NAT)
-        if surely:
+        if surely or (unseen and self.untold and fit >= usual):
             self._left = _LATELY
             return True
         return self.lately and fit > usual
@@ -109,5 +123,21 @@ class SpinningWheels:
     def note(self, scan: Scan, body: Array, recent: int, match: Indices) -> None:
         """Take note of a scan, the body's pose ``(3,)`` and the match; one that misses landmarks is no measure."""
         self._left = max(self._left - 1, 0)
-        if np.count_nonzero(match >= 0) > recent - FEWEST_BACK:
+        if np.count_nonzero(match >= 0) > recent - self._least:
             self._last = scan, body.copy()
+
+
+def tells_place(z: Array, match: Indices) -> bool:
+    """Tell whether matched observations say where the robot is: not those of parallel walls alone.
+
+    Parameters
+    ----------
+    z, match
+        As in :func:`slam.landmarks.association.nearest_neighbour`.
+    """
+    seen = z[match >= 0]
+    walls = seen[:, 5] == LINE
+    if len(seen) == 0 or not walls.all():
+        return len(seen) > 0
+    turns = seen[:, 6]
+    return bool(np.abs(np.sin(turns - turns[0])).max() > _ASKEW)

@@ -8,9 +8,10 @@ import pytest
 
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import OccupancyGrid
-from slam.landmarks.spinning_wheels import SpinningWheels
+from slam.landmarks.spinning_wheels import SpinningWheels, tells_place
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import Scan
+from tests.slam.landmarks.test_loop_closing import wall_row
 
 STEPS_EACH = 15  # 1.5 s of one twist: long enough to reach a wall and to be pressed to it
 
@@ -42,7 +43,12 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
     assert suspected(off, 1, 4)
     assert not suspected(off, 4, 4)  # one landmark may well go out of sight
     assert not suspected(off, 1, 1)  # and what is not seen explains nothing
-    assert not suspected(off, 0, 4, recent=2)
+    assert not suspected(off, 1, 4, recent=2)
+    assert suspected(off, 0, 4, recent=2)  # both that were in sight
+    wheels.untold = True
+    assert suspected(off, 4, 1)  # the end of a corridor, of which the walls beside the robot are left
+    assert not suspected(here, 4, 1)
+    wheels.untold = False
     wheels.note(scan, off, 5, matched(1, 4))  # nothing to compare with: the fit there is bad
     assert suspected(off, 3, 2)
     assert not wheels.explain(530.0, 500.0)
@@ -51,11 +57,26 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
     assert suspected(here, 5, 0)  # they did, lately
 
 
+def test_walls_of_one_direction_do_not_tell_the_place() -> None:
+    beside = [wall_row(0.7, side * np.pi / 2, -3.0, 3.0) for side in (1, -1)]
+    end, corner = wall_row(2.5, 0.05, -0.7, 0.7), np.zeros(10)
+    for rows, match, tells in [
+        (beside, [0, 1], False), ([*beside, end], [0, 1, 2], True), ([*beside, end], [0, 1, -1], False),
+        ([*beside, corner], [0, 1, 2], True), (beside, [-1, -2], False),
+    ]:  # fmt: skip
+        assert tells_place(np.array(rows), np.array(match)) is tells
+
+
 def test_the_scan_decides_and_is_believed_for_a_while() -> None:
     wheels, scan = SpinningWheels(), mapped_wall()[1]
     wheels.claim(0.3, 0.1)
     wheels.claim(0.1, 0.1)
     assert wheels.variances == pytest.approx((0.16, 0.16, 0.04))
+    wheels.untold = True
+    wheels.forget_motion()
+    assert wheels.variances == pytest.approx((0.09, 0.09, 0.0))  # how far along the corridor is to be told
+    assert wheels.enough(matched(3, 0), matched(2, 1))
+    wheels.untold = False
     wheels.forget_motion()
     assert wheels.variances == (0.0, 0.0, 0.0)
     assert wheels.enough(matched(3, 0), matched(1, 2))
