@@ -10,7 +10,7 @@ import pytest
 
 from mecanum_env.team.config import TeamConfig
 from slam.geometry import compose
-from slam.grids.occupancy import FREE
+from slam.grids.occupancy import FREE, UNKNOWN
 from slam.metrics.measures import corner_deviation
 from tests.training.team_episode import STEPS, Explored, explore_together
 from training.episodes import explore as single
@@ -123,8 +123,14 @@ def test_the_recordings_are_the_robots(explored: Explored) -> None:
     for recording, member in zip(explored.recordings, explored.episode.team.members, strict=True):
         assert np.array_equal(recording.true_poses, member.truth.record.true_poses)
         assert len(recording.collisions) == len(recording.times) == STEPS + 1
-        known = sum(int((change[:, 2] != -1).sum()) for change in recording.map_changes.values)
-        assert known >= member.backend.grid.known_cells
+        grid = member.backend.grid
+        told = {(row, col): now for change in recording.map_changes.values for row, col, now in change.tolist()}
+        cells = np.argwhere(grid.classes() != UNKNOWN)
+        last = {tuple(cell): int(grid.classes()[tuple(cell)]) for cell in cells.tolist()}
+        row0, col0 = grid.lattice_origin
+        assert {cell: now for cell, now in told.items() if now != UNKNOWN} == {
+            (row0 + row, col0 + col): now for (row, col), now in last.items()
+        }
 
 
 def test_the_team_of_a_file_gives_way_to_the_options(tmp_path: Path) -> None:
