@@ -10,9 +10,11 @@ then they are not believed, and of two explanations the better one is taken.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
+from numba import njit
 
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import LINE, Array, Indices, Scan
@@ -127,6 +129,7 @@ class SpinningWheels:
             self._last = scan, body.copy()
 
 
+@njit(cache=True, nogil=True, error_model="numpy")
 def tells_place(z: Array, match: Indices) -> bool:
     """Tell whether matched observations say where the robot is: not those of parallel walls alone.
 
@@ -135,9 +138,11 @@ def tells_place(z: Array, match: Indices) -> bool:
     z, match
         As in :func:`slam.landmarks.association.nearest_neighbour`.
     """
-    seen = z[match >= 0]
-    walls = seen[:, 5] == LINE
-    if len(seen) == 0 or not walls.all():
-        return len(seen) > 0
-    turns = seen[:, 6]
-    return bool(np.abs(np.sin(turns - turns[0])).max() > _ASKEW)
+    first = -1
+    for k in range(z.shape[0]):
+        if match[k] < 0:
+            continue
+        if z[k, 5] != LINE or (first >= 0 and abs(math.sin(z[k, 6] - z[first, 6])) > _ASKEW):
+            return True
+        first = k if first < 0 else first
+    return False
