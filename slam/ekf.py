@@ -96,21 +96,23 @@ class EkfSlam(GaussianBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
-        self._spinning.untold = not tells_place(z, match)
-        if scan is not None and self._may_spin(scan, match, *self._recall):
-            match = self._allow_for_spinning_wheels(z, match, scan)
+        missed = self._recall[1] < self._recall[0]
+        if scan is not None and (missed or self._spinning.lately):
+            self._spinning.untold = not tells_place(z, match)
+            if self._may_spin(scan, match, *self._recall):
+                match = self._allow_for_spinning_wheels(z, match, scan)
         if not self._accept(z, match, JOINT_LIMITS):  # each of them may be right, but not all together
             match = self._associate_jointly(z)
             loop = self._put_off(z, match)
             self._accept(z, match)
-        if self.nis_dof > 0 and self._recall[1] < self._recall[0]:
+        if missed and self.nis_dof > 0:
             self._rescue(z, match)
         if loop:
             self._close_loop(z, match)
         if scan is not None:
             self._spinning.note(scan, self._x[:3], self._recall[0], match)
             if self.nis_dof >= 2 * FEWEST_BACK:
-                self._spinning.untold = not tells_place(z, match)
+                self._spinning.untold = self.config.lines and not tells_place(z, match)
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.landmarks.association import UNMATCHED, nearest_neighbour
+from slam.landmarks.association import UNMATCHED, alike, gated_distance, nearest_neighbour
 from slam.landmarks.book import LAST_SEEN, RECENT
 from slam.types import Array
 
@@ -42,6 +42,9 @@ def match_missed(
     int
         How many there are.
     """
+    if not _worth_it(x, p, offset, z, marks, now, gates, match):
+        more[:] = UNMATCHED
+        return 0
     distance, found = np.empty(z.shape[0]), 0
     nearest_neighbour(x, p, offset, z, marks, gates[0], gates[1], gates[2], True, more, distance)
     for k in range(z.shape[0]):
@@ -54,3 +57,23 @@ def match_missed(
         more[k] = i
         found += i >= 0
     return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _worth_it(
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, match: NDArray[np.int64]
+) -> bool:
+    """Tell whether any observation without a match may be a landmark that is missed: one scan in eighty."""
+    h, again = np.empty((2, 5)), np.zeros(marks.shape[0], np.bool_)
+    for k in range(z.shape[0]):
+        if match[k] >= 0:
+            again[match[k]] = True
+    for i in range(marks.shape[0]):
+        if again[i] or marks[i, LAST_SEEN] <= now - RECENT:
+            continue
+        for k in range(z.shape[0]):
+            if match[k] >= 0 or not alike(z[k], marks[i], x[2], gates[2]):
+                continue
+            if gated_distance(x, p, i, offset, z[k], h) < gates[0]:
+                return True
+    return False
