@@ -96,9 +96,9 @@ class EkfSlam(GaussianBackend):
         self._settle_beliefs()
         match = self._associate(z)
         loop = self._put_off(z, match)
-        missed = self._recall[1] < self._recall[0]
+        missed = scan is not None and self._recall[1] < self._recall[0]
         if scan is not None and (missed or self._spinning.lately):
-            self._spinning.untold = not tells_place(z, match)
+            self._spinning.untold = self._leaves_open(z, match)
             if self._may_spin(scan, match, *self._recall):
                 match = self._allow_for_spinning_wheels(z, match, scan)
         if not self._accept(z, match, JOINT_LIMITS):  # each of them may be right, but not all together
@@ -112,7 +112,7 @@ class EkfSlam(GaussianBackend):
         if scan is not None:
             self._spinning.note(scan, self._x[:3], self._recall[0], match)
             if self.nis_dof >= 2 * FEWEST_BACK:
-                self._spinning.untold = self.config.lines and not tells_place(z, match)
+                self._spinning.untold = self._leaves_open(z, match)
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
 
@@ -181,6 +181,10 @@ class EkfSlam(GaussianBackend):
             self._max_turn, match,
         )  # fmt: skip
         return match
+
+    def _leaves_open(self, z: Array, match: NDArray[np.int64]) -> bool:
+        """Tell whether wheels that may slip are all that says how far along some walls the robot is."""
+        return self.config.lines and self._noise.slip_share > 0.0 and not tells_place(z, match)
 
     def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
         """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are."""
