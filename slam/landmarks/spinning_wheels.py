@@ -5,8 +5,8 @@ landmarks for the right ones. So where landmarks are missed all at once, and the
 the wheels have the robot than the last one did, observations are associated anew with a pose that may be off by
 all that the wheels claim. Gates so wide take any corner for a landmark: one pose must explain them all, and the
 scan must fit the map surely better from there. Along walls of one direction, which leave open how far along them
-the robot is, one missed landmark is enough to ask: the end of a corridor. Wheels that spun once are likely to do so
-in the next scans, too: then they are not believed, and of two explanations the better one is taken.
+the robot is, one missed landmark is enough to ask: the end of a corridor. Wheels that spun once are likely to do
+so in the next scans, too: then they are not believed, and of two explanations the better one is taken.
 """
 
 from __future__ import annotations
