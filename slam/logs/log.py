@@ -33,7 +33,7 @@ class Log:
     reference_poses: Array  # (r, 3) [m, m, rad] of the body frame; headings nan where not recorded
     reference_gap_s: float  # the reference is interpolated between times no farther apart than this
     start_pose: Array  # (3,) in the reference's frame, given to every backend
-    settings: Mapping[str, Any] = field(default_factory=dict)  # backend configuration for this log
+    settings: Mapping[str, Any] = field(default_factory=dict)  # of backends; of one alone under its name
     note: str = ""  # what the reference is, and what of the comparison is given rather than estimated
 
     @property

@@ -17,6 +17,7 @@ comparison with filters that take it so; so does a log with bearings that this c
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,8 @@ SETTINGS = {
     "lidar_offset_m": 0.0,
     "association": "nearest",
     "known_gate": 18.4,  # 99.99 %: a few bar codes were misread
+    "loop_sigma_m": math.inf,  # meant for walls, many in a scan; tubes are seen one by one, and never find company
+    "invariant-ekf": {"loop_sigma_m": 0.6},  # it knows how unsure it is; groups of tubes stand metres apart
     "odometry": _ODOMETRY | {"lasting": _LASTING},
     "landmarks": {"tentative_gate_m": 0.3, "new_distance_m": 0.3, "confirm_after": 3, "forget_after": 20},
 }

@@ -193,7 +193,8 @@ def _make_config(log: AnyLog, values: Mapping[str, Any], backend: str | None) ->
     config = from_mapping(ReplayConfig, values, base=ReplayConfig(observation=log.observation_noise))
     name = backend or config.slam
     kind = config_type(name)
-    known = {key: value for key, value in log.settings.items() if key in kind.__dataclass_fields__}
+    told = {**log.settings, **log.settings.get(name, {})}
+    known = {key: value for key, value in told.items() if key in kind.__dataclass_fields__}
     settings = from_mapping(kind, config.slam_config, base=from_mapping(kind, known))
     return ReplayConfig(observation=config.observation, slam=name, slam_config=to_mapping(settings))
 

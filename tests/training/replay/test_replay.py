@@ -111,6 +111,14 @@ def test_options_and_config_lie_over_the_logs_own_values(logs: Path, tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
+def test_a_log_has_values_for_one_backend_alone(logs: Path, tmp_path: Path) -> None:
+    told = {
+        name: task.prepare(logs / "utias", out=tmp_path / "out", slam=name).backend.config.loop_sigma_m  # type: ignore[attr-defined]
+        for name in ("ekf", "invariant-ekf")
+    }
+    assert told == {"ekf": math.inf, "invariant-ekf": 0.6}
+
+
 def test_a_log_without_ids_or_headings(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = replayed([str(logs / "park"), "--out", str(tmp_path)], capsys)
     assert found["association"] == "unknown" and found["landmarks"] == 5
