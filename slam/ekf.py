@@ -27,7 +27,7 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.spinning_wheels import FEWEST_BACK, tells_place
+from slam.landmarks.spinning_wheels import FEWEST_BACK, tells_place, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -234,7 +234,7 @@ class EkfSlam(GaussianBackend):
         self._p[[0, 1, 2], [0, 1, 2]] += spinning.variances
         wide = self._p[:3, :3].copy()
         match, spun = self._associate_jointly(z), False
-        if spinning.enough(match, usual):
+        if spinning.enough(match, usual) and (not spinning.untold or walls_cross(z, match)):
             fit, there = self._fit(z, match, scan), self._x[:2].copy()
             self._x[:n], self._p[:n, :n] = x, p
             usual_fit = self._fit(z, usual, scan)
@@ -242,6 +242,7 @@ class EkfSlam(GaussianBackend):
             spun = spinning.explain(fit, usual_fit, unseen=shift < self.grid.resolution)
         if spun or lately:
             p[:3, :3] = wide
+            spinning.allowed_for()
         self._x[:n], self._p[:n, :n] = x, p
         return match if spun else usual
 

@@ -124,7 +124,8 @@ def edge(
 
     Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
     beams, uniformly. A short end face may show in between (a wall is as thick as that), all of it behind the
-    line; hidden or not, it is taken to recede at a right angle, and where it is seen its points tell the end.
+    line; hidden or not, it is taken to recede at a right angle, and where it is seen its points tell the end. That
+    is from beyond the end alone: what shows behind the line from elsewhere is another surface, a door's frame.
     (Where a beam stops short of the line, something nearer hides the surface: the rim of a shadow, no landmark.)
     """
     if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
@@ -166,8 +167,8 @@ def edge(
         faces += 1
         if faces > 40:
             return 0
-        if depth > _CLEAR * limits[SIGMA]:
-            slide = -line[NY] * rays[index, 0] + line[NX] * rays[index, 1]
+        slide = -line[NY] * rays[index, 0] + line[NX] * rays[index, 1]
+        if depth > _CLEAR * limits[SIGMA] and step * slide < 0.0:
             w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
             on_face, weight = on_face + 1, weight + w
             off = beyond - mean

@@ -5,8 +5,10 @@ landmarks for the right ones. So where landmarks are missed all at once, and the
 the wheels have the robot than the last one did, observations are associated anew with a pose that may be off by
 all that the wheels claim. Gates so wide take any corner for a landmark: one pose must explain them all, and the
 scan must fit the map surely better from there. Along walls of one direction, which leave open how far along them
-the robot is, one missed landmark is enough to ask: the end of a corridor. Wheels that spun once are likely to do
-so in the next scans, too: then they are not believed, and of two explanations the better one is taken.
+the robot is, one missed landmark is enough to ask, and a wall across them alone is an answer: the end of a
+corridor. (In buildings jambs and ledges stand centimetres apart, and any of them fits where nothing else says how
+far along the robot is.) Wheels that spun once are likely to do so in the next scans, too: then they are not
+believed, and of two explanations the better one is taken.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from numba import njit
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import LINE, Array, Indices, Scan
 
-__all__ = ["FEWEST_BACK", "SpinningWheels", "tells_place"]
+__all__ = ["FEWEST_BACK", "SpinningWheels", "tells_place", "walls_cross"]
 
 FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
@@ -63,6 +65,10 @@ class SpinningWheels:
         """Note that the landmarks say where the robot is, but for what is ``untold``."""
         self.moved_m = min(self.moved_m, _UNTOLD_M) if self.untold else 0.0
         self.turned_rad = 0.0
+
+    def allowed_for(self) -> None:
+        """Note that the pose's covariance owns to what they claim: once, or it would grow scan after scan."""
+        self.moved_m = self.turned_rad = 0.0
 
     @property
     def _least(self) -> int:
@@ -131,6 +137,19 @@ class SpinningWheels:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def walls_cross(z: Array, match: Indices) -> bool:
+    """Tell whether there are walls of two directions among matched observations, as for :func:`tells_place`."""
+    first = -1
+    for k in range(z.shape[0]):
+        if match[k] < 0 or z[k, 5] != LINE:
+            continue
+        if first >= 0 and abs(math.sin(z[k, 6] - z[first, 6])) > _ASKEW:
+            return True
+        first = k if first < 0 else first
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def tells_place(z: Array, match: Indices) -> bool:
     """Tell whether matched observations say where the robot is: not those of parallel walls alone.
 
@@ -139,11 +158,7 @@ def tells_place(z: Array, match: Indices) -> bool:
     z, match
         As in :func:`slam.landmarks.association.nearest_neighbour`.
     """
-    first = -1
     for k in range(z.shape[0]):
-        if match[k] < 0:
-            continue
-        if z[k, 5] != LINE or (first >= 0 and abs(math.sin(z[k, 6] - z[first, 6])) > _ASKEW):
+        if match[k] >= 0 and z[k, 5] != LINE:
             return True
-        first = k if first < 0 else first
-    return False
+    return walls_cross(z, match)

@@ -137,6 +137,24 @@ def test_an_end_face_that_is_seen_tells_the_end() -> None:
     assert np.quantile(nees, 0.99) < 12.0  # of χ² with two degrees of freedom 9.2
 
 
+def test_a_surface_that_lies_a_little_farther_back_is_no_end_face() -> None:
+    """The frame of a door, seen from where no end face can be: the wall before it ends between two beams."""
+    frame = np.array([[1.0, 3.0], [3.0, 3.0], [3.0, 3.1], [3.15, 3.1], [3.15, 3.3], [1.0, 3.3]])
+    rng = np.random.default_rng(0)
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=0.01))
+    along = []
+    for _ in range(200):
+        pose = np.array([rng.uniform(1.2, 2.6), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
+        scan = polygon_scan(pose, [ROOM, frame], rng)
+        corners, true = corners_in(extractor, scan), polar(pose, frame[1:2])[0]
+        for z, kind in zip(corners.range_bearing, corners.kind, strict=True):
+            error = np.array([true[0] - z[0], wrap(true[1] - z[1])])
+            if kind == CONVEX and np.abs(error).max() < 0.15:
+                along.append(z[0] * error[1])
+    assert len(along) > 100
+    assert np.max(along) < 0.03  # half of what the beams are apart; the frame's own points are 0.1 m too far out
+
+
 def ends_of_a_wall(
     sigma: float, *, thick: float, from_x: tuple[float, float], ends: tuple[int, ...] = (0, 1)
 ) -> tuple[list, list]:

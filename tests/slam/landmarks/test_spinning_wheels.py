@@ -11,7 +11,7 @@ import pytest
 import agents
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import OccupancyGrid
-from slam.landmarks.spinning_wheels import SpinningWheels, tells_place
+from slam.landmarks.spinning_wheels import SpinningWheels, tells_place, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import Scan
 from tests.slam.landmarks.test_loop_closing import wall_row
@@ -63,11 +63,13 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
 def test_walls_of_one_direction_do_not_tell_the_place() -> None:
     beside = [wall_row(0.7, side * np.pi / 2, -3.0, 3.0) for side in (1, -1)]
     end, corner = wall_row(2.5, 0.05, -0.7, 0.7), np.zeros(10)
-    for rows, match, tells in [
-        (beside, [0, 1], False), ([*beside, end], [0, 1, 2], True), ([*beside, end], [0, 1, -1], False),
-        ([*beside, corner], [0, 1, 2], True), (beside, [-1, -2], False),
+    for rows, match, tells, cross in [
+        (beside, [0, 1], False, False), ([*beside, end], [0, 1, 2], True, True),
+        ([*beside, end], [0, 1, -1], False, False), ([*beside, corner], [0, 1, 2], True, False),
+        ([end, corner], [0, 1], True, False), (beside, [-1, -2], False, False),
     ]:  # fmt: skip
         assert tells_place(np.array(rows), np.array(match)) is tells
+        assert walls_cross(np.array(rows), np.array(match)) is cross
 
 
 def test_the_scan_decides_and_is_believed_for_a_while() -> None:
@@ -79,6 +81,9 @@ def test_the_scan_decides_and_is_believed_for_a_while() -> None:
     wheels.forget_motion()
     assert wheels.variances == pytest.approx((0.09, 0.09, 0.0))  # how far along the corridor is to be told
     assert wheels.enough(matched(3, 0), matched(2, 1))
+    wheels.allowed_for()
+    assert wheels.variances == (0.0, 0.0, 0.0)  # once
+    wheels.claim(0.3, 0.1)
     wheels.untold = False
     wheels.forget_motion()
     assert wheels.variances == (0.0, 0.0, 0.0)
