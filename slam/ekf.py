@@ -27,7 +27,7 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.spinning_wheels import FEWEST_BACK, tells_place, walls_cross
+from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -55,6 +55,8 @@ class EkfSlam(GaussianBackend):
         del seed  # nothing here is drawn
         self._settle_beliefs()
         self._noise = self.config.odometry
+        # Wheels that may slip can be all that says how far along some walls the robot is.
+        self._may_slip_along = self.config.lines and self._noise.slip_share > 0.0
         self._n, self._x = 3, np.zeros(3 + 2 * 32)
         self._p = aligned_zeros(len(self._x), len(self._x))  # upper triangle
         self._x[:3], self._p[:3, :3] = pose, np.triu(pose_cov)
@@ -98,7 +100,7 @@ class EkfSlam(GaussianBackend):
         loop = self._put_off(z, match)
         missed = scan is not None and self._recall[1] < self._recall[0]
         if scan is not None and (missed or self._spinning.lately):
-            self._spinning.untold = self._leaves_open(z, match)
+            self._spinning.untold = self._may_slip_along and not seen_again(z, match)[1]
             if self._may_spin(scan, match, *self._recall):
                 match = self._allow_for_spinning_wheels(z, match, scan)
         if not self._accept(z, match, JOINT_LIMITS):  # each of them may be right, but not all together
@@ -110,9 +112,10 @@ class EkfSlam(GaussianBackend):
         if loop:
             self._close_loop(z, match)
         if scan is not None:
-            self._spinning.note(scan, self._x[:3], self._recall[0], match)
+            matched, told = seen_again(z, match)
+            self._spinning.note(scan, self._x[:3], self._recall[0], matched)
             if self.nis_dof >= 2 * FEWEST_BACK:
-                self._spinning.untold = self._leaves_open(z, match)
+                self._spinning.untold = self._may_slip_along and not told
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
 
@@ -181,10 +184,6 @@ class EkfSlam(GaussianBackend):
             self._max_turn, match,
         )  # fmt: skip
         return match
-
-    def _leaves_open(self, z: Array, match: NDArray[np.int64]) -> bool:
-        """Tell whether wheels that may slip are all that says how far along some walls the robot is."""
-        return self.config.lines and self._noise.slip_share > 0.0 and not tells_place(z, match)
 
     def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
         """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are."""

@@ -117,7 +117,7 @@ class FastSlam(LandmarkBackend):
         if np.count_nonzero(match[leader] >= 0) >= FEWEST_BACK:
             self._spinning.forget_motion()
         best = self._correct(z, match)
-        self._spinning.note(scan, self._poses[best], recent, match[leader])
+        self._spinning.note(scan, self._poses[best], recent, int(np.count_nonzero(match[leader] >= 0)))
         self._manage(z, match[best], best, scan)
         self._resample(len(z))
         self._believe()

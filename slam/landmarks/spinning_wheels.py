@@ -22,7 +22,7 @@ from numba import njit
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import LINE, Array, Indices, Scan
 
-__all__ = ["FEWEST_BACK", "SpinningWheels", "tells_place", "walls_cross"]
+__all__ = ["FEWEST_BACK", "SpinningWheels", "seen_again", "walls_cross"]
 
 FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
@@ -129,16 +129,16 @@ class SpinningWheels:
             return True
         return self.lately and fit > usual
 
-    def note(self, scan: Scan, body: Array, recent: int, match: Indices) -> None:
-        """Take note of a scan, the body's pose ``(3,)`` and the match; one that misses landmarks is no measure."""
+    def note(self, scan: Scan, body: Array, recent: int, matched: int) -> None:
+        """Take note of a scan and the body's pose ``(3,)``; one that misses landmarks is no measure."""
         self._left = max(self._left - 1, 0)
-        if np.count_nonzero(match >= 0) > recent - self._least:
+        if matched > recent - self._least:
             self._last = scan, body.copy()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walls_cross(z: Array, match: Indices) -> bool:
-    """Tell whether there are walls of two directions among matched observations, as for :func:`tells_place`."""
+    """Tell whether there are walls of two directions among matched observations, as for :func:`seen_again`."""
     first = -1
     for k in range(z.shape[0]):
         if match[k] < 0 or z[k, 5] != LINE:
@@ -150,15 +150,19 @@ def walls_cross(z: Array, match: Indices) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def tells_place(z: Array, match: Indices) -> bool:
-    """Tell whether matched observations say where the robot is: not those of parallel walls alone.
+def seen_again(z: Array, match: Indices) -> tuple[int, bool]:
+    """Return how many observations are matched, and whether they say where the robot is.
+
+    Parallel walls alone do not: they leave open how far along them.
 
     Parameters
     ----------
     z, match
         As in :func:`slam.landmarks.association.nearest_neighbour`.
     """
+    count, points = 0, False
     for k in range(z.shape[0]):
-        if match[k] >= 0 and z[k, 5] != LINE:
-            return True
-    return walls_cross(z, match)
+        if match[k] >= 0:
+            count += 1
+            points = points or z[k, 5] != LINE
+    return count, points or walls_cross(z, match)

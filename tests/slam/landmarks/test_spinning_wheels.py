@@ -11,7 +11,7 @@ import pytest
 import agents
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import OccupancyGrid
-from slam.landmarks.spinning_wheels import SpinningWheels, tells_place, walls_cross
+from slam.landmarks.spinning_wheels import SpinningWheels, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import Scan
 from tests.slam.landmarks.test_loop_closing import wall_row
@@ -41,7 +41,7 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
         return wheels.suspected(grid, lambda body: believed if body is None else body, scan, recent, still, match)
 
     assert suspected(here, 1, 4)  # nothing to compare with yet
-    wheels.note(scan, here, 5, matched(5, 0))
+    wheels.note(scan, here, 5, 5)
     assert not suspected(here, 1, 4)  # as good a fit as the last
     assert suspected(off, 1, 4)
     assert not suspected(off, 4, 4)  # one landmark may well go out of sight
@@ -52,7 +52,7 @@ def test_they_are_suspected_where_landmarks_and_the_fit_go_at_once() -> None:
     assert suspected(off, 4, 1)  # the end of a corridor, of which the walls beside the robot are left
     assert not suspected(here, 4, 1)
     wheels.untold = False
-    wheels.note(scan, off, 5, matched(1, 4))  # nothing to compare with: the fit there is bad
+    wheels.note(scan, off, 5, 1)  # nothing to compare with: the fit there is bad
     assert suspected(off, 3, 2)
     assert not wheels.explain(530.0, 500.0)
     assert suspected(off, 2, 3)
@@ -68,7 +68,7 @@ def test_walls_of_one_direction_do_not_tell_the_place() -> None:
         ([*beside, end], [0, 1, -1], False, False), ([*beside, corner], [0, 1, 2], True, False),
         ([end, corner], [0, 1], True, False), (beside, [-1, -2], False, False),
     ]:  # fmt: skip
-        assert tells_place(np.array(rows), np.array(match)) is tells
+        assert seen_again(np.array(rows), np.array(match)) == (sum(i >= 0 for i in match), tells)
         assert walls_cross(np.array(rows), np.array(match)) is cross
 
 
@@ -96,7 +96,7 @@ def test_the_scan_decides_and_is_believed_for_a_while() -> None:
     assert wheels.enough(matched(2, 0), matched(2, 0))
     assert wheels.explain(501.0, 500.0)
     for _ in range(10):
-        wheels.note(scan, np.zeros(3), 3, matched(3, 0))
+        wheels.note(scan, np.zeros(3), 3, 3)
     assert not wheels.lately
     assert not wheels.explain(501.0, 500.0)
 
