@@ -33,6 +33,9 @@ class BackendConfig(Config):
     # L: how far ahead of the body's centre the sensor sits (theory.md A)
     lidar_offset_m: Annotated[float, Within("[-10, 10]")] = 0.2
     body_radius_m: Annotated[float, Within("[0.01, 10]")] = 0.25  # of the disc that is marked as visited
+    # Of the body, its middle at the pose: whether it touches something. 0: not known, and not asked.
+    body_length_m: Annotated[float, Within("[0, 10]")] = 0.0
+    body_width_m: Annotated[float, Within("[0, 10]")] = 0.0
     grid_resolution_m: Annotated[float, Within("[0.01, 1]")] = 0.05
     odometry: OdometryNoise = field(default_factory=OdometryNoise)
     features: FeatureConfig = field(default_factory=FeatureConfig)

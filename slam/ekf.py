@@ -19,6 +19,8 @@ from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
+from slam.geometry import wrap_scalar
+from slam.health.relocalisation import Place, Relocaliser
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
@@ -27,7 +29,7 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
+from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, touches, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -239,11 +241,31 @@ class EkfSlam(GaussianBackend):
             usual_fit = self._fit(z, usual, scan)
             shift = math.hypot(*(there - self._x[:2]))
             spun = spinning.explain(fit, usual_fit, unseen=shift < self.grid.resolution)
-        if spun or lately:
-            p[:3, :3] = wide
-            spinning.allowed_for()
         self._x[:n], self._p[:n, :n] = x, p
+        if not spun and (place := self._held_back(z, usual, scan)) is not None:
+            self._place(place.pose, place.cov + found_cov())
+            spinning.allowed_for()
+            return self._associate(z)
+        if spun or lately:
+            self._p[:3, :3] = wide
+            spinning.allowed_for()
         return match if spun else usual
+
+    def _held_back(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> Place | None:
+        """Return where a robot that touches something stayed while its wheels went on, by the scan alone."""
+        c, n, spinning = self.config, self._n, self._spinning
+        if not touches(scan, c.lidar_offset_m, c.body_length_m, c.body_width_m, c.features.range_sigma_m):
+            return None
+        body = self._x[:3].copy()
+        place = Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, body)
+        dx, dy, turn = (place.pose - body).tolist()
+        if not place.good or not spinning.claims(math.hypot(dx, dy), abs(wrap_scalar(turn))):
+            return None
+        x, p = self._x[:n].copy(), self._p[:n, :n].copy()
+        usual_fit = self._fit(z, usual, scan)
+        self._x[:n], self._p[:n, :n] = x, p
+        fit = self.grid.agreement(self.sensor_pose(place.pose), scan)
+        return place if spinning.surely(fit, usual_fit) else None
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
         """Correct by a match; return how well the scan fits the map from there. It is only a trial."""

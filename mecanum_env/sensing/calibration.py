@@ -60,6 +60,8 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "lidar_offset_m": config.lidar.offset_m,
         "body_radius_m": 0.5 * (config.robot.inscribed_radius_m + config.robot.circumscribed_radius_m),
+        "body_length_m": config.robot.length_m,
+        "body_width_m": config.robot.width_m,
         "grid_resolution_m": config.grid_resolution_m,
         "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
         "features": {"range_sigma_m": max(config.noise.range_sigma_m, _LEAST_RANGE_SIGMA_M)},

@@ -7,8 +7,9 @@ all that the wheels claim. Gates so wide take any corner for a landmark: one pos
 scan must fit the map surely better from there. Along walls of one direction, which leave open how far along them
 the robot is, one missed landmark is enough to ask, and a wall across them alone is an answer: the end of a
 corridor. (In buildings jambs and ledges stand centimetres apart, and any of them fits where nothing else says how
-far along the robot is.) Wheels that spun once are likely to do so in the next scans, too: then they are not
-believed, and of two explanations the better one is taken.
+far along the robot is.) Where landmarks do not answer, as in caves, and the body touches something, the scan alone
+is held against the map; where it touches nothing, a view that changes is a door. Wheels that spun once are likely
+to do so in the next scans, too: then they are not believed, and of two explanations the better one is taken.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from numba import njit
 from slam.grids.occupancy import OccupancyGrid
 from slam.types import LINE, Array, Indices, Scan
 
-__all__ = ["FEWEST_BACK", "SpinningWheels", "seen_again", "walls_cross"]
+__all__ = ["FEWEST_BACK", "SpinningWheels", "seen_again", "touches", "walls_cross"]
 
 FEWEST_BACK = 2
 """Landmarks by which a robot is back from wheels that spun; one alone says nothing about the heading."""
@@ -36,6 +37,8 @@ _UNTOLD_M = 0.3  # of the wheels' way at most is remembered along a corridor of 
 # is wrong, half of those by more than 80 nat.
 _WORSE_NAT, _SURE_NAT, _MOST_MISSED_NAT = 30.0, 80.0, 20.0
 _LATELY = 6  # scans for which wheels that spun are not believed
+_TOUCH_SIGMAS = 4.0  # of a range, from which on what a beam meets is not touched
+_BEYOND_M, _BEYOND_RAD = 0.05, 0.05  # by which a pose may be farther off than the wheels claim to have moved
 
 
 class SpinningWheels:
@@ -80,6 +83,10 @@ class SpinningWheels:
         """What the pose may be off by: x, y [m²], θ [rad²]."""
         return self.moved_m**2, self.moved_m**2, self.turned_rad**2
 
+    def claims(self, way_m: float, turn_rad: float) -> bool:
+        """Tell whether a pose so far off is one where the robot stayed while the wheels went on."""
+        return way_m <= self.moved_m + _BEYOND_M and turn_rad <= self.turned_rad + _BEYOND_RAD
+
     @property
     def lately(self) -> bool:
         """Whether they turned in vain in one of the last scans."""
@@ -123,17 +130,41 @@ class SpinningWheels:
         Where the two poses are less than a cell apart (``unseen``) the fit tells nothing; then the end of a
         corridor, too near to where it was to be another wall, is believed.
         """
-        surely = fit > usual + min(abs(usual), _MOST_MISSED_NAT if self._most_missed else _SURE_NAT)
-        if surely or (unseen and self.untold and fit >= usual):
+        if unseen and self.untold and fit >= usual:
             self._left = _LATELY
             return True
-        return self.lately and fit > usual
+        return self.surely(fit, usual) or (self.lately and fit > usual)
+
+    def surely(self, fit: float, usual: float) -> bool:
+        """Tell whether a scan fits so much better [nat] that they spun."""
+        if fit > usual + min(abs(usual), _MOST_MISSED_NAT if self._most_missed else _SURE_NAT):
+            self._left = _LATELY
+            return True
+        return False
 
     def note(self, scan: Scan, body: Array, recent: int, matched: int) -> None:
         """Take note of a scan and the body's pose ``(3,)``; one that misses landmarks is no measure."""
         self._left = max(self._left - 1, 0)
         if matched > recent - self._least:
             self._last = scan, body.copy()
+
+
+def touches(scan: Scan, offset_m: float, length_m: float, width_m: float, sigma_m: float) -> bool:
+    """Tell whether a scan shows something at a body of this length and width [m], as far as it can be seen.
+
+    Parameters
+    ----------
+    scan, offset_m
+        From a sensor so far ahead of the body's middle.
+    sigma_m
+        Standard deviation of a range.
+    """
+    near = np.flatnonzero(scan.ranges < math.hypot(length_m, width_m) + abs(offset_m))
+    bearings = scan.angle_min + scan.angle_increment * near
+    ahead = np.abs(offset_m + scan.ranges[near] * np.cos(bearings)) - 0.5 * length_m
+    aside = np.abs(scan.ranges[near] * np.sin(bearings)) - 0.5 * width_m
+    clear = np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
+    return bool(np.any(clear < _TOUCH_SIGMAS * sigma_m))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
