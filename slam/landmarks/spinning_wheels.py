@@ -159,6 +159,8 @@ def touches(scan: Scan, offset_m: float, length_m: float, width_m: float, sigma_
     sigma_m
         Standard deviation of a range.
     """
+    if length_m <= 0.0 or width_m <= 0.0:  # nobody has said how large it is
+        return False
     near = np.flatnonzero(scan.ranges < math.hypot(length_m, width_m) + abs(offset_m))
     bearings = scan.angle_min + scan.angle_increment * near
     ahead = np.abs(offset_m + scan.ranges[near] * np.cos(bearings)) - 0.5 * length_m

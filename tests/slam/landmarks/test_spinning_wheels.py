@@ -7,11 +7,13 @@ import math
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import agents
 from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import OccupancyGrid
-from slam.landmarks.spinning_wheels import SpinningWheels, seen_again, walls_cross
+from slam.landmarks.spinning_wheels import SpinningWheels, seen_again, touches, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import Scan
 from tests.slam.landmarks.test_loop_closing import wall_row
@@ -72,6 +74,33 @@ def test_walls_of_one_direction_do_not_tell_the_place() -> None:
         assert walls_cross(np.array(rows), np.array(match)) is cross
 
 
+@given(st.floats(-math.pi, math.pi), st.floats(0.0, 0.3), st.floats(-0.2, 0.2))
+def test_what_stands_at_the_body_is_touched(bearing: float, clear: float, offset: float) -> None:
+    """One beam of a body of 0.6 × 0.4 m meets something ``clear`` beyond the outline, straight out from it."""
+    ahead, aside = math.cos(bearing), math.sin(bearing)
+    edge = min(0.3 / max(abs(ahead), 1e-9), 0.2 / max(abs(aside), 1e-9))
+    x, y = edge * ahead, edge * aside
+    if abs(abs(x) - 0.3) < 1e-9:
+        x += math.copysign(clear, x)
+    else:
+        y += math.copysign(clear, y)
+    at = math.atan2(y, x - offset)
+    ranges = np.array([math.inf, math.hypot(x - offset, y), math.nan])
+    scan = Scan(ranges, at - 0.1, 0.1, 8.0)
+    if abs(clear - 0.04) > 1e-6:
+        assert touches(scan, offset, 0.6, 0.4, 0.01) is (clear < 0.04)
+    assert not touches(scan, offset, 0.0, 0.0, 0.01)  # of a body that nobody has told of
+
+
+def test_a_robot_stays_behind_by_what_its_wheels_claim_at_most() -> None:
+    wheels = SpinningWheels()
+    wheels.claim(0.2, 0.3)
+    assert wheels.claims(0.2, 0.3)
+    assert wheels.claims(0.24, 0.34)  # a map of cells does not tell it better
+    assert not wheels.claims(0.3, 0.3)
+    assert not wheels.claims(0.2, 0.4)
+
+
 def test_the_scan_decides_and_is_believed_for_a_while() -> None:
     wheels, scan = SpinningWheels(), mapped_wall()[1]
     wheels.claim(0.3, 0.1)
@@ -101,7 +130,7 @@ def test_the_scan_decides_and_is_believed_for_a_while() -> None:
     assert not wheels.explain(501.0, 500.0)
 
 
-@pytest.mark.parametrize("room", ["apartment", "corridors", "maze"])
+@pytest.mark.parametrize("room", ["apartment", "corridors", "maze", "cave"])
 @pytest.mark.parametrize("backend", ["ekf-lines", "invariant-ekf"])
 def test_a_robot_that_is_driven_into_walls_knows_where_it_is(room: str, backend: str) -> None:
     """Twists at random press it to walls for a good part of the time, and its wheels go on turning."""
@@ -141,3 +170,20 @@ def test_the_end_of_a_corridor_is_not_lost(seed: int) -> None:
         off.append(math.hypot(*(inner.belief.pose - inner.truth.pose)[:2]))
     assert off[-1] < 0.02
     assert np.mean(np.array(off) > 0.05) < 0.02
+
+
+def test_a_robot_pressed_to_the_wall_of_a_cave_is_placed_by_the_scan() -> None:
+    """Four landmarks in sight, and none that answers: without the scan it is lost for good after 25 s."""
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms="cave", max_episode_steps=400)
+    inner = env.unwrapped
+    assert isinstance(inner, ExploreEnv)
+    agent = agents.make("random")
+    observation, info = env.reset(seed=8)
+    agent.reset(inner.belief, seed=8)
+    nees, truncated = [], False
+    while not truncated:
+        observation, _, _, truncated, info = env.step(agent.act(observation, inner.belief))
+        nees.append(info["nees"])
+    assert info["collisions"] > 3
+    assert np.mean(nees) < 3 * 3.0
+    assert info["position_error_m"] < 0.05
