@@ -29,7 +29,7 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, touches, walls_cross
+from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -254,7 +254,7 @@ class EkfSlam(GaussianBackend):
     def _held_back(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> Place | None:
         """Return where a robot that touches something stayed while its wheels went on, by the scan alone."""
         c, n, spinning = self.config, self._n, self._spinning
-        if not touches(scan, c.lidar_offset_m, c.body_length_m, c.body_width_m, c.features.range_sigma_m):
+        if not spinning.touching:
             return None
         body = self._x[:3].copy()
         place = Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, body)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.backend import Backend
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
-from slam.landmarks.spinning_wheels import SpinningWheels
+from slam.landmarks.spinning_wheels import SpinningWheels, touches
 from slam.motion import OdometryNoise, Twist
 from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
@@ -39,7 +39,12 @@ class LandmarkBackend(Backend):
 
     def _may_spin(self, scan: Scan, match: Indices, recent: int, still: int) -> bool:
         """Tell whether the wheels may have turned in vain; see :meth:`SpinningWheels.suspected`."""
-        return self._spinning.suspected(self.grid, self.sensor_pose, scan, recent, still, match)
+        spinning, c = self._spinning, self.config
+        if not spinning.suspected(self.grid, self.sensor_pose, scan, recent, still, match):
+            return False
+        sigma_m = c.features.range_sigma_m
+        spinning.touching = touches(scan, c.lidar_offset_m, c.body_length_m, c.body_width_m, sigma_m)
+        return True
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 

@@ -31,11 +31,11 @@ FEWEST_BACK = 2
 _ASKEW = 0.2  # sine of the angle between two walls from which on they say where along them the robot is
 _UNTOLD_M = 0.3  # of the wheels' way at most is remembered along a corridor of which no end is in sight
 # Log-odds [nat] by which a scan fits worse; by which it must fit better, and where less than half of the landmarks
-# are still matched. Of 692 explanations that robots driven at random needed 610 come up to that, of 314 not needed
+# are still matched and the robot touches something. Of 692 explanations that robots driven at random needed 610 come up to that, of 314 not needed
 # none (rooms with straight walls, training seeds 200-205): all were right. At the doors of 20 drives on floors,
 # where it is the view that changed, 5 of 645 do, and 23 would if two thirds were few enough. In caves every tenth
 # is wrong, half of those by more than 80 nat.
-_WORSE_NAT, _SURE_NAT, _MOST_MISSED_NAT = 30.0, 80.0, 20.0
+_WORSE_NAT, _SURE_NAT, _PRESSED_NAT = 30.0, 80.0, 20.0
 _LATELY = 6  # scans for which wheels that spun are not believed
 _TOUCH_SIGMAS = 4.0  # of a range, from which on what a beam meets is not touched
 _BEYOND_M, _BEYOND_RAD = 0.05, 0.05  # by which a pose may be farther off than the wheels claim to have moved
@@ -50,11 +50,13 @@ class SpinningWheels:
         What the wheels claim since the landmarks were last in sight.
     untold : bool
         Whether the matched landmarks leave open how far along them the robot is: walls of one direction, or none.
+    touching : bool
+        Whether the robot touches something, as the last scan that had to be asked about shows.
     """
 
     def __init__(self) -> None:
         self.moved_m = self.turned_rad = 0.0
-        self.untold = False
+        self.untold = self.touching = False
         self._left = 0
         self._most_missed = False
         self._last: tuple[Scan, Array] | None = None
@@ -137,7 +139,8 @@ class SpinningWheels:
 
     def surely(self, fit: float, usual: float) -> bool:
         """Tell whether a scan fits so much better [nat] that they spun."""
-        if fit > usual + min(abs(usual), _MOST_MISSED_NAT if self._most_missed else _SURE_NAT):
+        less = self._most_missed and self.touching  # where the robot is held back, less will do
+        if fit > usual + min(abs(usual), _PRESSED_NAT if less else _SURE_NAT):
             self._left = _LATELY
             return True
         return False
