@@ -33,8 +33,8 @@ _UNTOLD_M = 0.3  # of the wheels' way at most is remembered along a corridor of 
 # Log-odds [nat] by which a scan fits worse; by which it must fit better, and where less than half of the landmarks
 # are still matched and the robot touches something. Of 692 explanations that robots driven at random needed 610
 # come up to that, of 314 not needed none (rooms with straight walls, training seeds 200-205): all were right. At
-# the doors of 20 drives on floors, where it is the view that changed, 5 of 645 would without the touching, and 23 if
-# two thirds were few enough. In caves every tenth is wrong, half of those by more than 80 nat.
+# the doors of 20 drives on floors, where it is the view that changed, 5 of 645 would without the touching, and 23
+# if two thirds were few enough. In caves every tenth is wrong, half of those by more than 80 nat.
 _WORSE_NAT, _SURE_NAT, _PRESSED_NAT = 30.0, 80.0, 20.0
 _LATELY = 6  # scans for which wheels that spun are not believed
 _TOUCH_SIGMAS = 4.0  # of a range, from which on what a beam meets is not touched
