@@ -138,7 +138,7 @@ class SpinningWheels:
         return self.surely(fit, usual) or (self.lately and fit > usual)
 
     def surely(self, fit: float, usual: float) -> bool:
-        """Tell whether a scan fits so much better [nat] that they spun; if so, they are not believed for a while."""
+        """Tell whether a scan fits so much better [nat] that they spun; then they are not believed for a while."""
         less = self._most_missed and self.touching  # where the robot is held back, less will do
         if fit > usual + min(abs(usual), _PRESSED_NAT if less else _SURE_NAT):
             self._left = _LATELY
