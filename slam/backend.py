@@ -137,7 +137,7 @@ class Backend(abc.ABC):
             if recovery.kept is None:
                 recovery.kept = self._copy()
             self._update(scan)
-            if recovery.kept is not None and recovery.monitor.fine < recovery.config.give_up:
+            if recovery.kept is not None and recovery.gone(self.grid, self.pose, scan):
                 self._put_back(recovery.kept)
                 recovery.give_up()
 

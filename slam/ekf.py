@@ -29,6 +29,7 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
+from slam.landmarks.seen_from import seen_from
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
@@ -86,6 +87,8 @@ class EkfSlam(GaussianBackend):
     def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         self._take(self._features(scan), scan)
+        if self._doubtful and self._recovers:
+            self._match_map(scan)
         self._draw(scan)
         if self.key_scans.due():
             self._redraw_if_moved()
@@ -243,7 +246,8 @@ class EkfSlam(GaussianBackend):
             spun = spinning.explain(fit, usual_fit, unseen=shift < self.grid.resolution)
         self._x[:n], self._p[:n, :n] = x, p
         if not spun and (place := self._held_back(z, usual, scan)) is not None:
-            self._place(place.pose, place.cov + found_cov())
+            self._p[:3, :3] = wide
+            self._correct_by_map(place, NO_LIMITS)
             spinning.allowed_for()
             return self._associate(z)
         if spun or lately:
@@ -273,6 +277,23 @@ class EkfSlam(GaussianBackend):
         self._correct(z, match)
         self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
+
+    def _match_map(self, scan: Scan) -> None:
+        """Correct by where beside the believed pose a scan fits the drawn map, if from there it contradicts it."""
+        c, recovery, body = self.config, self.recovery, self._x[:3].copy()
+        if not recovery.opposed(self.grid, body, scan):
+            return
+        place = Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, body)
+        if recovery.opposed(self.grid, place.pose, scan):
+            return
+        self._correct_by_map(place, JOINT_LIMITS)
+
+    def _correct_by_map(self, place: Place, limits: Array) -> None:
+        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
+        kept, cov = (self.nis, self.nis_dof), place.cov + found_cov()
+        z, match = seen_from(self._x, self._book.marks, self.config.lidar_offset_m, place.pose, cov)
+        self._correct(z, match, limits)
+        self.nis, self.nis_dof = kept
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
         """Correct by a match, curved walls made straight; tell whether it stands, as its joint NIS may be refused.

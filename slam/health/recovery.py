@@ -6,7 +6,9 @@ the monitor gives the belief up, the copy is put back, so that neither wrong mat
 nothing is written any more until a place is found that explains several scans in a row, or until many scans in a
 row no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
 there is none, or where no scan can say anything. Buildings repeat themselves, so from there no other place is
-looked for on the whole map. Scans that agree with the map cost one look at them and nothing else.
+looked for on the whole map, and one that is found there must explain the scan far better than the believed one. A
+scan that fits for the most part right beside the belief does not give it up, either: where the robot comes back to
+a map that has drifted, it is a little off. Scans that agree with the map cost one look at them and nothing else.
 """
 
 from __future__ import annotations
@@ -83,6 +85,26 @@ class Recovery:
             return agreement(grid, sensor, scan, len(scan.ranges))
         return seen
 
+    def opposed(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
+        """Tell whether a scan speaks against a pose of the body ``(3,)``."""
+        x, y, theta = body.tolist()
+        return self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
+
+    def gone(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
+        """Tell whether the belief is to be given up: it contradicts the scans, and not by a little."""
+        if self.monitor.fine >= self.config.give_up:
+            return False
+        return not self._beside(Relocaliser(self._relocalisation, grid, self._offset_m), body, scan)
+
+    def _beside(self, relocaliser: Relocaliser, body: Array, scan: Scan) -> bool:
+        """Tell whether a scan fits the map for the most part right beside a pose of the body ``(3,)``.
+
+        Then the pose is a little off, or the map is; a robot that is elsewhere sees something else.
+        """
+        config, place = self._relocalisation, relocaliser.check(scan, body)
+        away = math.hypot(place.pose[0] - body[0], place.pose[1] - body[1])
+        return away <= config.beside_m and place.quality >= config.mostly
+
     def give_up(self) -> None:
         """Note that the belief is lost."""
         self.lost = True
@@ -99,18 +121,17 @@ class Recovery:
         returned, and the belief is no longer lost.
         """
         self.scans_lost += 1
+        if self._relocaliser is None:
+            self._relocaliser = Relocaliser(self._relocalisation, grid, self._offset_m)
+        relocaliser, trail = self._relocaliser, self._trail
         if np.count_nonzero(scan.ranges <= scan.range_max) >= self._relocalisation.fewest_beams:
-            x, y, theta = believed.tolist()
-            opposed = self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
+            opposed = self.opposed(grid, believed, scan) and not self._beside(relocaliser, believed, scan)
             self._unopposed, self._silent = 0 if opposed else self._unopposed + 1, 0
         else:
             self._silent += 1
         if self._unopposed >= self._relocalisation.unopposed or self._silent >= self._relocalisation.silent:
             self._end()
             return None
-        if self._relocaliser is None:
-            self._relocaliser = Relocaliser(self._relocalisation, grid, self._offset_m)
-        relocaliser, trail = self._relocaliser, self._trail
         if trail is not None:
             pose = compose(trail.place.pose, compose(inverse(trail.believed), believed))
             place: Place | None = relocaliser.check(scan, pose)
@@ -154,7 +175,10 @@ class Recovery:
             return None
         if math.isinf(radius):
             self._searched_from = believed.copy()
-        return relocaliser.find(scan, believed, radius)
+        place = relocaliser.find(scan, believed, radius)
+        if place is None or math.isfinite(radius):
+            return place
+        return place if place.quality >= relocaliser.check(scan, believed).quality + config.far_margin else None
 
     @staticmethod
     def _moved(now: Array, before: Array) -> bool:

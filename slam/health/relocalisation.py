@@ -48,6 +48,11 @@ class RelocalisationConfig(Config):
     most_through: Share = 0.1  # … and of all, that may come through a wall: some pass close by a corner
     least_sharp: Share = 0.65  # of those on walls, that end in the very cell
     margin: Share = 0.12  # by which the best place must be better than the next, in shares of the beams
+    # The same for one on the whole map, against the one right beside where the wheels have the robot: a map that
+    # has drifted explains a scan worse than it should, and buildings repeat themselves.
+    far_margin: Share = 0.35
+    beside_m: Gap = 0.25  # how far off that is beside, …
+    mostly: Share = 0.5  # … and the quality from which on it says that the robot is no longer lost
     radii_m: Annotated[tuple[float, ...], Within("(0, inf]")] = (
         1.5,
         4.0,

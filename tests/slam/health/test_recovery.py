@@ -90,6 +90,35 @@ def test_a_drawing_from_unsure_poses_says_nothing_against_a_sure_one(
         assert not backend._doubtful  # it is drawn anew meanwhile
 
 
+@pytest.mark.parametrize("name", ["ekf", "invariant-ekf"])
+def test_where_no_landmark_is_in_sight_the_drawn_map_puts_the_pose_right(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is off by what its covariance allows for, and the scans contradict the map from there."""
+    env = driven(name, 60)
+    backend = env.backend
+    assert isinstance(backend, EkfSlam)
+    monkeypatch.setattr(backend, "_features", lambda scan: np.zeros((0, 12)))
+    backend._x[:3] = compose(backend._x[:3], np.array([0.03, 0.02, 0.09]))
+    backend._p[[0, 1, 2], [0, 1, 2]] += np.square([0.03, 0.03, 0.08])
+    for _ in range(20):
+        env.step(np.zeros(3, np.float32))
+    assert backend.recovery.times_lost == 0 and backend.recovery.monitor.fine > 0.9
+    off = backend.pose - env.truth.pose
+    assert np.hypot(*off[:2]) < 0.04 and abs(off[2]) < 0.02
+    assert backend.pose_nees(env.truth.pose) < 14.0
+
+
+def test_a_scan_that_fits_right_beside_the_belief_does_not_give_it_up() -> None:
+    env = driven("invariant-ekf", 60)
+    recovery, grid, pose = env.backend.recovery, env.backend.grid, env.backend.pose
+    recovery.monitor.restart(0.01)
+    assert not recovery.gone(grid, compose(pose, np.array([0.1, 0.0, 0.03])), env.scan)
+    assert recovery.gone(grid, compose(pose, np.array([1.0, 0.3, 0.4])), env.scan)
+    recovery.monitor.restart(0.5)
+    assert not recovery.gone(grid, compose(pose, np.array([1.0, 0.3, 0.4])), env.scan)
+
+
 @pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "dp-slam"])
 def test_where_nothing_is_wrong_nothing_changes(name: str) -> None:
     watched, alone = driven(name, 40), driven(name, 40, settings={"health": {"recover": False}})

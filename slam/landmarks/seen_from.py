@@ -1,0 +1,43 @@
+"""What a scan that was matched against the drawn map says of landmarks, whether it shows them or not.
+
+The map is drawn from the estimates. So the place where a scan fits it best is no pose in the world, but one among
+the landmarks around: it says where from there each of them is (Nieto, Bailey and Nebot, "Recursive scan-matching
+SLAM", Robotics and Autonomous Systems 55, 2007, keep the drawing itself as the landmark). What is off with the
+place is off with all of them at once. Each sighting gets the place's covariance as many times as there are
+sightings: together they say no more than the match did, however they are correlated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from slam.landmarks.association import predicted
+from slam.landmarks.book import KIND, LAST_SEEN
+from slam.types import Array, Indices
+
+__all__ = ["seen_from"]
+
+_SIGHTINGS = 3  # two points or walls say where the robot is; one more, should two walls be parallel
+
+
+def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) -> tuple[Array, Indices]:
+    """Return observation rows ``(k, 12)`` of the landmarks seen last, and which they are ``(k,)``.
+
+    Parameters
+    ----------
+    x, marks
+        The state ``(3 + 2n,)``, and the landmarks' marks ``(n, 11)``: :class:`slam.landmarks.book.LandmarkBook`.
+    offset
+        The sensor's, ahead of the robot's centre [m].
+    pose, cov
+        Where a scan fits the map that is drawn of these landmarks ``(3,)``, and its covariance there ``(3, 3)``.
+    """
+    match = np.argsort(-marks[:, LAST_SEEN], kind="stable")[:_SIGHTINGS]
+    z, h, there = np.zeros((len(match), 12)), np.zeros((2, 5)), x.copy()
+    there[:3] = pose
+    for k, row in enumerate(match.tolist()):
+        z[k, KIND] = marks[row, 0]
+        z[k, :2] = predicted(there, row, z[k, KIND], offset, h)
+        r = len(match) * h[:, :3] @ cov @ h[:, :3].T
+        z[k, 2:5] = r[0, 0], r[0, 1], r[1, 1]
+    return z, match
