@@ -89,7 +89,8 @@ def _outline(
     for i in range(n):
         r = ranges[i]
         along_x, along_y = c * rays[0, i] - s * rays[1, i], s * rays[0, i] + c * rays[1, i]
-        reach = (range_max if r > range_max else r) / resolution
+        # Below zero would be outside of the mask, whatever sensor says so: the beam is lost.
+        reach = (range_max if r > range_max else (r if r >= 0.0 else math.nan)) / resolution
         beams[0, i], beams[1, i] = along_x * reach, along_y * reach
         # What stopped the beam lies behind the point it returned from: a quarter of a cell deeper.
         deeper = reach + 0.25 if r <= range_max else math.nan

@@ -154,6 +154,19 @@ class OccupancyGrid:
         """Return ``(rows, cols)`` of UNKNOWN, FREE and OCCUPIED."""
         return CLASS_OF[self.log_odds.view(np.uint8)]
 
+    def points_of(self, kind: int, centre: tuple[float, float], radius_m: float) -> Array:
+        """Return the centres ``(n, 2)`` [m] of the cells of a class within a radius of a point, row by row."""
+        (x, y), rows, cols = centre, slice(None), slice(None)
+        if math.isfinite(radius_m):
+            rows, cols = (
+                slice(max(math.floor((at - radius_m) / self.resolution) - first, 0),
+                      max(math.ceil((at + radius_m) / self.resolution) - first + 1, 0))
+                for at, first in ((y, self._row0), (x, self._col0))
+            )  # fmt: skip
+        found = np.argwhere(CLASS_OF[self.log_odds[rows, cols].view(np.uint8)] == kind)
+        points = self.to_points(found + np.array([rows.start or 0, cols.start or 0]))
+        return points[np.hypot(points[:, 0] - x, points[:, 1] - y) <= radius_m]
+
     def probability(self) -> NDArray[np.float32]:
         """Return the occupancy probability ``(rows, cols)``, 0.5 where nothing was observed."""
         return np.asarray(1.0 / (1.0 + np.exp(-UNIT_NAT * self.log_odds.astype(np.float32))), np.float32)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated
 
 import cv2
@@ -112,17 +113,17 @@ class Relocaliser:
 
     def __init__(self, config: RelocalisationConfig, grid: OccupancyGrid, offset_m: float) -> None:
         self.config, self._grid, self._offset_m = config, grid, offset_m
-        classes = grid.classes()
-        self._walls = grid.to_points(np.argwhere(classes == OCCUPIED))
-        # Lattice points in free space, with some room for the body.
-        step = max(round(config.spacing_m / grid.resolution), 1)
-        room = cv2.erode((classes == FREE).astype(np.uint8), np.ones((3, 3), np.uint8))
-        free = np.argwhere(room[::step, ::step]) * step
-        self._free = grid.to_points(free)
         self._sharp_matching = dataclasses.replace(config.matching, smooth_m=config.sharp_smooth_m)
         self._field: LikelihoodField | None = None
         self._sharp_field: LikelihoodField
         self._field_of: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+
+    @cached_property
+    def _free(self) -> Array:
+        """Lattice points ``(n, 2)`` in free space, with some room for the body."""
+        grid, step = self._grid, max(round(self.config.spacing_m / self._grid.resolution), 1)
+        room = cv2.erode((grid.classes() == FREE).astype(np.uint8), np.ones((3, 3), np.uint8))
+        return grid.to_points(np.argwhere(room[::step, ::step]) * step)
 
     @property
     def places(self) -> int:
@@ -136,7 +137,7 @@ class Relocaliser:
         near = self._free
         if math.isfinite(radius_m):
             near = near[np.hypot(near[:, 0] - around[0], near[:, 1] - around[1]) <= radius_m]
-        if len(points) < config.fewest_beams or not len(near) or not len(self._walls):
+        if len(points) < config.fewest_beams or not len(near):
             return None
         likelihood = self._field_around(around, radius_m)
         places = [
@@ -158,9 +159,7 @@ class Relocaliser:
         x, y, reach = float(pose[0]), float(pose[1]), radius_m + self.config.matching.reach_m
         known_x, known_y, known = self._field_of
         if self._field is None or not (math.hypot(x - known_x, y - known_y) + reach <= known + 0.5):
-            walls = self._walls
-            if math.isfinite(reach):
-                walls = walls[np.hypot(walls[:, 0] - x, walls[:, 1] - y) <= reach + 1.0]
+            walls = self._grid.points_of(OCCUPIED, (x, y), reach + 1.0)
             self._field = LikelihoodField(self.config.matching, walls)
             self._sharp_field = LikelihoodField(self._sharp_matching, walls)
             self._field_of = (x, y, reach + 0.5)

@@ -256,6 +256,19 @@ def test_cells_and_points_are_inverse(points: list[tuple[float, float]]) -> None
     np.testing.assert_array_equal(grid.to_cells(grid.to_points(cells)), cells)
 
 
+@given(
+    st.tuples(st.floats(-9, 9), st.floats(-9, 9)), st.one_of(st.floats(0, 12), st.just(math.inf)),
+    st.sampled_from([FREE, OCCUPIED]),
+)  # fmt: skip
+def test_cells_of_a_class_around_a_point_are_those_of_the_whole_grid(
+    centre: tuple[float, float], radius: float, kind: int
+) -> None:
+    grid = mapped(np.array([3.0, 2.0, 0.5]))
+    points = grid.to_points(np.argwhere(grid.classes() == kind))
+    expected = points[np.hypot(*(points - centre).T) <= radius]
+    assert np.array_equal(grid.points_of(kind, centre, radius), expected)
+
+
 def test_evidence_saturates_and_can_be_overturned() -> None:
     grid = OccupancyGrid()
     pose = np.zeros(3)
@@ -270,6 +283,18 @@ def test_evidence_saturates_and_can_be_overturned() -> None:
     cell = tuple(grid.to_cells(np.array([[2.02, 0.0]]))[0])
     assert grid.classes()[cell] == FREE
     assert grid.known_area_m2 == pytest.approx(math.pi * 16, rel=0.05)
+
+
+@pytest.mark.parametrize("wrong", [-1e-9, -48.0, -math.inf])
+def test_a_range_below_zero_is_a_lost_beam(wrong: float) -> None:
+    drawn = []
+    for value in (math.nan, wrong):
+        ranges = np.full(BEAMS, 2.0)
+        ranges[40:90] = ranges[200] = value
+        grid = OccupancyGrid()
+        grid.integrate(np.array([0.4, -0.3, 0.5]), Scan(ranges, ANGLE_MIN, INCREMENT, 8.0))
+        drawn.append(grid.log_odds)
+    assert np.array_equal(*drawn)
 
 
 def test_no_return_is_free_to_the_maximum_and_a_gap_of_lost_beams_is_unknown() -> None:
