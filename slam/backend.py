@@ -68,6 +68,7 @@ class Backend(abc.ABC):
         self.recovery = Recovery(config.health, config.relocalisation, config.lidar_offset_m)
         self._doubtful = False  # whether the scan at hand spoke against the predicted pose
         self._recovers = self.relocalises and config.health.recover
+        self._lidar = (0, 0.0)  # beams and range_max of the last scan
 
     def reset(
         self, pose: Array | tuple[float, float, float] = (0.0, 0.0, 0.0), *,
@@ -101,7 +102,13 @@ class Backend(abc.ABC):
         """Move on by what the wheels measured."""
 
     def update(self, scan: Scan) -> None:
-        """Correct by a scan, and draw it into the grid; while the belief is lost, look for where it was taken."""
+        """Correct by a scan, and draw it into the grid; while the belief is lost, look for where it was taken.
+
+        Raises ``ValueError`` where it is no scan; nothing has changed then.
+        """
+        if (len(scan.ranges), scan.range_max) != self._lidar:  # or only now has become one
+            scan.check()
+            self._lidar = len(scan.ranges), scan.range_max
         recovery = self.recovery
         if recovery.lost:
             place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())

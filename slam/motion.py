@@ -77,8 +77,13 @@ class OdometryNoise(Config):
         """Return the twist of a step, its variances as :meth:`variances`, and the body's twist after it.
 
         Where the odometry does not tell what slipped, :meth:`slip` does, from the twist ``body`` before the step.
+        Raises ``ValueError`` where it is not finite: a belief that has once taken that in has lost everything.
         """
         twist, slip = odometry.numbers, odometry.slip
+        if not math.isfinite(twist[0] + twist[1] + twist[2] + odometry.dt):
+            raise ValueError(
+                f"vx, vy, ω and dt of an odometry are finite numbers, got {twist} and {odometry.dt}; leave it out"
+            )
         if slip is None:
             slip, body = self.slip(body, twist, odometry.dt) if odometry.dt > 0.0 else (NO_SLIP, body)
         return twist, *self.variances(*twist, slip=slip), body

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -59,6 +60,21 @@ class Scan(NamedTuple):
     angle_increment: float  # [rad]
     range_max: float  # [m]
     range_min: float = 0.0  # [m]
+
+    def check(self) -> None:
+        """Raise ``ValueError``, saying what is wrong, where this is no scan; its ranges may be what they like."""
+        ranges = self.ranges
+        if not isinstance(ranges, np.ndarray):
+            raise ValueError(f"a scan's ranges are a NumPy array (beams,), got {type(ranges).__name__}")
+        if ranges.ndim != 1 or not len(ranges) or ranges.dtype.kind not in "fiu":
+            raise ValueError(
+                f"a scan's ranges are numbers (beams,), one at least; got {ranges.dtype} {ranges.shape}"
+            )
+        if not (math.isfinite(self.angle_min + self.angle_increment) and 0.0 < self.range_max < math.inf):
+            raise ValueError(
+                "a scan's angles are finite, and its range_max is what its lidar sees [m]; got angle_min "
+                f"{self.angle_min}, angle_increment {self.angle_increment}, range_max {self.range_max}"
+            )
 
 
 class Sighting(NamedTuple):
