@@ -68,7 +68,7 @@ class Scan(NamedTuple):
             raise ValueError(f"a scan's ranges are a NumPy array (beams,), got {type(ranges).__name__}")
         if ranges.ndim != 1 or not len(ranges) or ranges.dtype.kind not in "fiu":
             raise ValueError(
-                f"a scan's ranges are numbers (beams,), one at least; got {ranges.dtype} {ranges.shape}"
+                f"ranges of a scan are numbers (beams,), one at least, got {ranges.dtype} {ranges.shape}"
             )
         if not (math.isfinite(self.angle_min + self.angle_increment) and 0.0 < self.range_max < math.inf):
             raise ValueError(

@@ -31,7 +31,7 @@ def test_no_backend_minds_what_a_broken_lidar_says(name: str) -> None:
 @pytest.mark.parametrize(
     ("wrong", "what"),
     [
-        ({"ranges": np.zeros(0)}, r"one at least; got float64 \(0,\)"),
+        ({"ranges": np.zeros(0)}, r"one at least, got float64 \(0,\)"),
         ({"ranges": np.ones((2, 180))}, r"got float64 \(2, 180\)"),
         ({"ranges": [2.0] * 360}, "got list"),
         ({"range_max": math.inf}, "range_max inf"),
