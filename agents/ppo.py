@@ -37,8 +37,9 @@ class PpoConfig(Config):
     policy: str = ""  # path of a .safetensors file, the .json file beside it; the package's own by default
     # With nothing new in sight, and on the way to nothing that is rather a goal than none, until the place is held
     # for explored …
-    patience_s: Duration = 30.0
-    hopeful_s: Duration = 300.0  # … and with nothing new in sight, whatever it is on the way to
+    patience_s: Duration = 20.0
+    hopeful_s: Duration = 60.0  # … and with nothing new in sight, whatever it is on the way to,
+    hopeful_s_per_m: Positive = 2.0  # and so much longer for each metre of the longest way since something was new
     new_m2: Positive = 0.3  # what counts for new
 
 
@@ -67,7 +68,7 @@ class Ppo(Agent):
         self._memory = self._network.memory(step_s=self._step_s)
         self._sent = np.zeros(3, np.float32)
         self._time = self._news_at = self._hoped_at = 0.0
-        self._known_m2 = 0.0
+        self._known_m2 = self._longest_m = 0.0
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Start an episode with nothing remembered; nothing is drawn at random."""
@@ -87,6 +88,7 @@ class Ppo(Agent):
         seen = self._complete(observation, belief)
         way = self._memory.way(belief)
         self._goal = _goal(way, belief)
+        self._longest_m = max(self._longest_m, way.length)
         if way.likely:
             self._hoped_at = self._time
         self._sent = self._network.twist(self._network.inputs(seen, way))
@@ -99,10 +101,11 @@ class Ppo(Agent):
         if step % max(round(1.0 / self._step_s), 1) == 0:
             known = float(np.count_nonzero(belief.grid.classes() == FREE)) * belief.grid.resolution**2
             if known >= self._known_m2 + self.config.new_m2:
-                self._known_m2, self._news_at = known, self._time
+                self._known_m2, self._news_at, self._longest_m = known, self._time, 0.0
             without_news = self._time - self._news_at
             without_hope = min(without_news, self._time - self._hoped_at)
-            given_up = without_hope > self.config.patience_s or without_news > self.config.hopeful_s
+            hopeful_s = self.config.hopeful_s + self.config.hopeful_s_per_m * self._longest_m
+            given_up = without_hope > self.config.patience_s or without_news > hopeful_s
             self._status = "covered" if given_up else "driving"
         return self.ended
 
