@@ -18,18 +18,18 @@ from slam.gaussian.beliefs import GaussianBackend
 from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
-from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, told_by, work_space
 from slam.geometry import wrap_scalar
 from slam.health.relocalisation import Place, Relocaliser
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
-from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
+from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, LAST_SEEN, TO, count_recent, match_and_recall
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.seen_from import seen_from
+from slam.landmarks.seen_from import LEAST_NAT, Loose, seen_from
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
@@ -68,6 +68,7 @@ class EkfSlam(GaussianBackend):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
+        self._loose = Loose()
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
 
@@ -87,8 +88,8 @@ class EkfSlam(GaussianBackend):
     def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""
         self._take(self._features(scan), scan)
-        if self._doubtful and self._recovers:
-            self._match_map(scan)
+        if self._recovers:
+            self._hold_by_map(scan)
         self._draw(scan)
         if self.key_scans.due():
             self._redraw_if_moved()
@@ -257,12 +258,11 @@ class EkfSlam(GaussianBackend):
 
     def _held_back(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> Place | None:
         """Return where a robot that touches something stayed while its wheels went on, by the scan alone."""
-        c, n, spinning = self.config, self._n, self._spinning
+        n, spinning = self._n, self._spinning
         if not spinning.touching:
             return None
-        body = self._x[:3].copy()
-        place = Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, body)
-        dx, dy, turn = (place.pose - body).tolist()
+        place = self._place_beside(scan)
+        dx, dy, turn = (place.pose - self._x[:3]).tolist()
         if not place.good or not spinning.claims(math.hypot(dx, dy), abs(wrap_scalar(turn))):
             return None
         x, p = self._x[:n].copy(), self._p[:n, :n].copy()
@@ -278,21 +278,36 @@ class EkfSlam(GaussianBackend):
         self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
 
-    def _match_map(self, scan: Scan) -> None:
-        """Correct by where beside the believed pose a scan fits the drawn map, if from there it contradicts it."""
-        c, recovery, body = self.config, self.recovery, self._x[:3].copy()
-        if not recovery.opposed(self.grid, body, scan):
-            return
-        place = Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, body)
-        if recovery.opposed(self.grid, place.pose, scan):
-            return
-        self._correct_by_map(place, JOINT_LIMITS)
+    def _hold_by_map(self, scan: Scan) -> None:
+        """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
+        recovery, book = self.recovery, self._book
+        if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
+            if recovery.opposed(self.grid, self._x[:3], scan):
+                place = self._place_beside(scan)
+                if not recovery.opposed(self.grid, place.pose, scan):
+                    self._correct_by_map(place, JOINT_LIMITS)
+        elif self._spinning.touching or not self.config.lines:
+            self._loose.held()
+        elif self._loose.due(self.nis_dof // 2, scan, book.marks[:, LAST_SEEN], book.now):
+            place = self._place_beside(scan)
+            if place.good:
+                self._correct_by_map(place, JOINT_LIMITS, LEAST_NAT)
 
-    def _correct_by_map(self, place: Place, limits: Array) -> None:
-        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
+    def _place_beside(self, scan: Scan) -> Place:
+        """Return where beside the believed pose a scan fits the drawn map best."""
+        c = self.config
+        return Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, self._x[:3].copy())
+
+    def _correct_by_map(self, place: Place, limits: Array, least_nat: float = 0.0) -> None:
+        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen.
+
+        Nothing is done where it would tell less of them than ``least_nat``.
+        """
         kept, cov = (self.nis, self.nis_dof), place.cov + found_cov()
-        z, match = seen_from(self._x, self._book.marks, self.config.lidar_offset_m, place.pose, cov)
-        self._correct(z, match, limits)
+        offset, work = self.config.lidar_offset_m, (self._h, self._w, self._s)
+        z, match = seen_from(self._x, self._book.marks, offset, place.pose, cov)
+        if not least_nat or told_by(self._x, self._p, self._n, z, match, offset, *work) >= least_nat:
+            self._correct(z, match, limits)
         self.nis, self.nis_dof = kept
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:

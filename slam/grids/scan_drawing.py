@@ -82,13 +82,13 @@ def mark_surfaces(
 ) -> None:
     """Mark the cells that beams ended in, and those between two hits on one straight surface.
 
-    Farther off than ``dense`` [cells] there may be none between them; and where they are more than ``gap`` [cells]
-    apart nothing is said of what is between.
+    Farther off than ``dense`` [cells] there may be none between them; and where there, or across beams that were
+    lost, they are more than ``gap`` [cells] apart nothing is said of what is between.
     """
     n = beams.shape[1]
     joined = surface.shape[0] == n
     last_x = last_y = 0.0
-    last_surface = -1
+    last_surface = last = -1
     for i in range(n):
         px, py = beams[2, i], beams[3, i]
         if math.isnan(px):
@@ -99,7 +99,7 @@ def mark_surfaces(
             dx, dy = px - last_x, py - last_y
             steps = int(max(abs(dx), abs(dy)) * 1.5)
             near = beams[0, i] ** 2 + beams[1, i] ** 2 <= dense * dense
-            if not near and dx * dx + dy * dy > gap * gap:
+            if (not near or i > last + 1) and dx * dx + dy * dy > gap * gap:
                 steps = 0
             for k in range(1, steps + 1):
                 f = k / (steps + 1)
@@ -108,7 +108,7 @@ def mark_surfaces(
                     mask[row, col] = IN_SURFACE
                 elif mask[row, col] != IN_SURFACE:
                     mask[row, col] = IN_BRIDGE
-        last_x, last_y, last_surface = px, py, here
+        last_x, last_y, last_surface, last = px, py, here, i
 
 
 @njit(cache=True, nogil=True, inline="always")
