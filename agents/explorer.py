@@ -175,7 +175,7 @@ class Explorer(Driver):
         if at_last and self._sparse:
             frontiers = find(cost_map, config.finest(cost_map.resolution), None)
         else:
-            frontiers = find(cost_map, replace(config, joined_cells=2) if at_last else config, watch)
+            frontiers = find(cost_map, replace(config, joined_cells=3) if at_last else config, watch)
         # Ways are searched for as far as they are asked for: on a large map most frontiers are far away.
         asked = self._costs_asked()
         within_m = math.inf if asked is None else self._within_m

@@ -246,6 +246,24 @@ def test_a_first_scan_that_lost_many_beams_is_no_reason_to_stop(name: str) -> No
     assert agent.goal is not None
 
 
+def test_a_robot_that_sees_a_dead_end_ahead_looks_behind() -> None:
+    """What borders on the unknown behind it falls in three where its own body was drawn; each is too small."""
+    env = ExploreEnv(
+        config={"grid_resolution_m": 0.04}, rooms="corridors",
+        robot={"length_m": 0.4191, "width_m": 0.3319, "wheelbase_m": 0.355, "track_m": 0.2374},
+        lidar={"beams": 270, "field_of_view_deg": 240.0, "range_max_m": 12.3581, "offset_m": 0.1297},
+        noise={"range_sigma_m": 0.0268, "dropout": 0.1},
+    )  # fmt: skip
+    observation, _ = env.reset(seed=329)
+    agent = agents.make(
+        "nearest-frontier", robot=env.config.robot, lidar=env.config.lidar, step_s=env.config.step_s
+    )
+    agent.reset(env.belief, 329)
+    for _ in range(60):
+        observation, *_ = env.step(agent.act(observation, env.belief))
+        assert not agent.ended
+
+
 @pytest.mark.parametrize(("depth_m", "chosen"), [(4.0, True), (0.3, False)])
 def test_a_narrow_opening_far_away_is_gone_to_at_last(depth_m, chosen):
     """0.7 m wide, less the walls' nearness, and 9 m away: too far for a niche, but there may be a room behind."""
