@@ -25,7 +25,7 @@ LEAST_NAT = 0.03
 
 _SIGHTINGS = 3  # two points or walls say where the robot is; one more, should two walls be parallel
 _SCANS = 10  # in a row with fewer landmarks than that: the next is matched; what lasts of a drawing is used once
-_FRESH = 50  # scans ago: what is drawn around was drawn of landmarks seen since, not by the wheels alone
+_FRESH = 20  # scans ago: what is drawn around was drawn of landmarks seen since, not by the wheels alone
 _RETURNS = 0.8  # share of the beams; in halls few return, and a match says how far along a wall where it cannot
 
 

@@ -50,6 +50,10 @@ STUDIES = {
         "training.studies.teams.filters",
         "robots that map one building: one filter for all, or one each",
     ),
+    "worlds": (
+        "training.studies.worlds",
+        "robots, lidars and noises drawn by lot: what holds where nothing was tuned",
+    ),
 }
 """Name → the module whose function ``study`` it is, and a line for the list."""
 
