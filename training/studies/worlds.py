@@ -149,7 +149,7 @@ def study(
         if what := wrong(row):
             file = out / f"{seed}_{backend}.toml"
             atomic_write(file, to_toml(draw(seed, backend)[0]))
-            failed.append(f"{file}: {row['agent']}, --seed {seed}: {', '.join(what)}")
+            failed.append(f"{file.name}: {row['agent']}, --seed {seed}: {', '.join(what)}")
     backends = dict.fromkeys(backend for _, backend in jobs)
     tables = {name: table([row for (_, b), row in rows.items() if b == name]) for name in backends}
     write_json(out / "summary.json", {**settings, "tables": tables, "wrong": failed})

@@ -12,8 +12,9 @@ from training.cli import main
 from training.studies import worlds
 
 FINE: worlds.Row = {
-    "rooms": "cave", "agent": "brisk-tour", "coverage": 0.99, "time_to_95_s": 30.0, "time_s": 60.0, "end": "covered",
-    "collisions": 0, "ate_rmse_m": 0.01, "anees": 1.0, "map_iou": 0.9, "lost_s": 0.0, "relocalisations": 0,
+    "rooms": "cave", "agent": "brisk-tour", "coverage": 0.99, "time_to_95_s": 30.0, "time_s": 60.0,
+    "end": "covered", "collisions": 0, "ate_rmse_m": 0.01, "anees": 1.0, "map_iou": 0.9,
+    "lost_s": 0.0, "relocalisations": 0,
 }  # fmt: skip
 
 
