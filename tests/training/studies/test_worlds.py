@@ -53,3 +53,8 @@ def test_worlds_are_explored_and_those_that_went_wrong_kept(
     assert main(command) == 0
     again = capsys.readouterr()
     assert again.out == first.out and "worlds: 0/2" not in again.err, "nothing is run twice"
+
+
+def test_who_knows_where_it_is_is_not_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["study", "worlds", "--slam", "truth", "--out", str(tmp_path / "out")]) == 2
+    assert "there is nothing to ask" in capsys.readouterr().err and not (tmp_path / "out").exists()
