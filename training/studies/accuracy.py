@@ -45,6 +45,8 @@ def run_job(job: Job) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         episode = prepare(out=Path(folder), agent=agent, rooms=rooms, slam=backend, seed=seed, noise=noise)
         run(episode, lambda **_: None)
+    if episode.interrupted:  # what there is of it is no result
+        raise KeyboardInterrupt
     every = round(1.0 / episode.config.step_s)
     nees = [round(float(v), 4) for v in episode.env.truth.record.nees[every::every]]
     return episode.metrics() | {"nees_each_s": nees, "noise": noise}

@@ -93,6 +93,8 @@ def run_job(job: Job) -> Row:
             max_steps=round(_LIMIT_S / world.step_s),
         )  # fmt: skip
         run(episode, lambda **_: None)
+    if episode.interrupted:  # what there is of it is no result
+        raise KeyboardInterrupt
     metrics = episode.metrics()
     return {"rooms": world.rooms, "agent": agent} | {key: metrics[key] for key in _KEPT}
 

@@ -9,7 +9,7 @@ import pytest
 
 from mecanum_env.config import from_toml
 from training.cli import main
-from training.studies import worlds
+from training.studies import accuracy, worlds
 
 FINE: worlds.Row = {
     "rooms": "cave", "agent": "brisk-tour", "coverage": 0.99, "time_to_95_s": 30.0, "time_s": 60.0,
@@ -58,3 +58,12 @@ def test_worlds_are_explored_and_those_that_went_wrong_kept(
 def test_who_knows_where_it_is_is_not_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["study", "worlds", "--slam", "truth", "--out", str(tmp_path / "out")]) == 2
     assert "there is nothing to ask" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("study", "job"), [(worlds, (0, "ekf")), (accuracy, ("rectangular", "ekf", 0, "nearest-frontier", "nominal"))]
+)
+def test_an_episode_that_was_broken_off_is_no_result(study, job, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "run", lambda episode, _: setattr(episode, "interrupted", True))
+    with pytest.raises(KeyboardInterrupt):
+        study.run_job(job)
