@@ -15,7 +15,9 @@ import agents
 import mecanum_env
 from agents.learned.drive_network import DriveNetwork
 from agents.learned.drive_plan import EDGES, descend, distances, gradient, node_prices
-from agents.ppo import SHIPPED
+from agents.ppo import SHIPPED, Ppo
+from slam.belief import Belief
+from tests.agents import grids
 
 assert mecanum_env
 
@@ -95,6 +97,27 @@ def test_the_agent_drives_and_keeps_to_the_network():
             break
     assert info["coverage"] > 0.6 and info["collisions"] == 0
     assert agent.goal is not None and np.hypot(*(agent.goal.path[0] - env.unwrapped.belief.pose[:2])) < 0.2
+
+
+def ends_after(config: dict[str, float], *beliefs: Belief) -> float:
+    """Time [s] until a robot that never moves ends; each belief but the last holds for 15 s."""
+    agent = Ppo(config)
+    agent.reset(beliefs[0])
+    for step in range(1500):
+        agent.act(None, beliefs[min(step // 150, len(beliefs) - 1)])
+        if agent.ended:
+            return 0.1 * step
+    raise AssertionError("never")
+
+
+def test_a_place_without_news_is_explored_and_a_hopeful_one_later():
+    known = grids.belief_of(grids.room(4.0, 3.0), (2.0, 1.5, 0.0))
+    more = grids.belief_of(grids.room(4.0, 3.5), (2.0, 1.5, 0.0))
+    assert ends_after({}, known) == pytest.approx(20.0)
+    assert ends_after({}, known, more) == pytest.approx(35.0, abs=1.0)
+    half = grids.belief_of(grids.half_known(), (1.0, 2.0, 0.0))
+    assert 21.0 < ends_after({}, half) < 60.0 + 2.0 * 8.0
+    assert ends_after({"hopeful_s": 24.0, "hopeful_s_per_m": 0.01}, half) == pytest.approx(25.0, abs=1.0)
 
 
 def test_the_policy_says_where_it_comes_from():
