@@ -124,12 +124,11 @@ class Belief:
             landmarks, landmark_cov, whole_cov = self._read
             if name == "landmark_cov":
                 values = {name: landmark_cov()}
-            elif name in ("joint_cov", "whole_cov"):
-                whole, points = whole_cov(), 3 + 2 * len(self.landmarks)
-                values = {
-                    "joint_cov": whole[:points, :points].copy() if len(whole) > points else whole,
-                    "whole_cov": whole,
-                }
+            elif name == "joint_cov":
+                whole, points = self.whole_cov, 3 + 2 * len(self.landmarks)
+                values = {name: whole[:points, :points].copy() if len(whole) > points else whole}
+            elif name == "whole_cov":
+                values = {name: whole_cov()}
             else:
                 values = landmarks()
             for key, value in values.items():

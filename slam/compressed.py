@@ -182,7 +182,7 @@ class CompressedEkfSlam(EkfSlam):
         if needed > len(self._map_x):
             self._enlarge_map(1 + 2 * (3 * needed // 4))  # odd: three of the robot, two a landmark
         if self.recovery.kept is not None and self.recovery.kept["_map_p"] is self._map_p:
-            self._map_p = _copied(self._map_p)
+            self._map_p = _enlarged(self._map_p, len(self._map_p))
         change = self._change()
         self._write(self._map_p, change)
         self._map_x[b], self._map_own[:, b] = change.x[b], change.own[:, b]
@@ -245,11 +245,11 @@ class CompressedEkfSlam(EkfSlam):
 
     def _enlarge_map(self, size: int) -> None:
         old = len(self._map_x)
-        x, p, own, ids, marks = self._map_x, self._map_p, self._map_own, self._map_ids, self._map_marks
-        self._map_x, self._map_p = np.zeros(size), aligned_zeros(size, size)
+        x, own, ids, marks = self._map_x, self._map_own, self._map_ids, self._map_marks
+        self._map_x, self._map_p = np.zeros(size), _enlarged(self._map_p, size)
         self._map_own = np.zeros((len(own), size))
         self._map_ids, self._map_marks = np.zeros(size // 2, np.int64), np.zeros((size // 2, MARKS))
-        self._map_x[:old], self._map_p[:old, :old], self._map_own[:, :old] = x, p[:old, :old], own
+        self._map_x[:old], self._map_own[:, :old] = x, own
         self._map_ids[: len(ids)], self._map_marks[: len(ids)] = ids, marks
 
     # ---- the belief ----------------------------------------------------------------------------------------
@@ -258,9 +258,7 @@ class CompressedEkfSlam(EkfSlam):
         if not len(self._far):
             return super()._covariance(landmarks)
         rows = state_rows(np.concatenate([self._near, self._far])[landmarks], robot=True)
-        size = max(int(rows.max()) + 1, len(self._map_p))
-        p = aligned_zeros(size, size)
-        p[: len(self._map_p), : len(self._map_p)] = self._map_p[:, : len(self._map_p)]
+        p = _enlarged(self._map_p, max(int(rows.max()) + 1, len(self._map_p)))
         self._write(p, self._change())
         out = np.empty((len(rows), len(rows)))
         read_block(p, rows, out)
@@ -312,10 +310,18 @@ def _distance(x: Array, marks: Array, px: float, py: float) -> Array:
     return np.asarray(out)
 
 
-def _copied(p: Array) -> Array:
-    out = aligned_zeros(*p.shape)
-    out[:] = p
+def _enlarged(p: Array, size: int) -> Array:
+    """Return a larger matrix with p's upper triangle; the lower, which nobody reads, takes no memory."""
+    out = aligned_zeros(size, size)
+    _copy_upper(p, out)
     return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _copy_upper(p: Array, out: Array) -> None:
+    for i in range(p.shape[0]):
+        for j in range(i, p.shape[0]):
+            out[i, j] = p[i, j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -13,10 +13,13 @@ tells: it is what is left where all else is known.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+from scipy.linalg.blas import dger
+from scipy.sparse import coo_array, csr_array
 
 from slam.accounts.account import Account
 from slam.metrics.chi_square import chi2_quantile
@@ -58,7 +61,9 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
     stays one. A corner where two surfaces meet has less than σ², and keeps it.
     """
     cov = account.cov.copy()
-    information = np.linalg.inv(cov + _NOTHING * np.eye(len(cov)))
+    np.fill_diagonal(cov, np.diag(cov) + _NOTHING)
+    information = np.linalg.inv(cov)
+    np.fill_diagonal(cov, np.diag(account.cov))
     for u in np.flatnonzero(account.kinds == CONVEX):
         at = slice(3 + 2 * u, 5 + 2 * u)
         variances, axes = np.linalg.eigh(np.linalg.inv(information[at, at]))
@@ -67,7 +72,8 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
             axis = axes[:, 1]
             cov[at, at] -= less * np.outer(axis, axis)
             column = information[:, at] @ axis
-            information += np.outer(column, column) * (less / (1.0 - less * (axis @ column[at])))
+            # In place, as the matrix of a building is hundreds of megabytes; the transpose is how BLAS counts.
+            dger(less / (1.0 - less * (axis @ column[at])), column, column, a=information.T, overwrite_a=True)
     return cov
 
 
@@ -81,28 +87,42 @@ def _on_walls(account: Account, config: CornerConfig) -> Account:
     bisectors = np.column_stack([np.cos(account.directions), np.sin(account.directions)])
     likely = (np.abs(off) < config.off_m) & (bisectors @ normals.T < -_FACING)  # not so where it is not known
     likely &= np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1)) < config.beyond_m
-    points, jacobian, gate = account.points.copy(), np.eye(len(account.cov)), chi2_quantile(config.gate, 1)
+    points, gate = account.points.copy(), chi2_quantile(config.gate, 1)
+    blocks = {(k, k): np.eye(2) for k in range(n + len(r))}  # of J, 2 × 2, but for the pose's
     for u in range(n):
-        walls = [j for j in np.flatnonzero(likely[u]) if off[u, j] ** 2 < gate * _variance(account, u, int(j))]
+        walls = [j for j in np.flatnonzero(likely[u]).tolist() if off[u, j] ** 2 < gate * _variance(account, u, j)]
         if not walls:
             continue
         walls.sort(key=lambda j: abs(off[u, j]))
-        first, at = walls[0], slice(3 + 2 * u, 5 + 2 * u)
+        first = walls[0]
         across = [j for j in walls if abs(normals[j] @ tangents[first]) > math.sin(config.crossing_rad)]
         if across:  # N x = r
             made_by = [first, across[0]]
             gains = np.linalg.inv(normals[made_by])
-            points[u], jacobian[at, at] = gains @ r[made_by], 0.0
+            points[u], blocks[u, u] = gains @ r[made_by], np.zeros((2, 2))
         else:  # x − n (nᵀx − r)
             made_by, gains = [first], normals[[first]].T
             points[u] -= normals[first] * off[u, first]
-            jacobian[at, at] -= np.outer(normals[first], normals[first])
-            jacobian[at, 3 + 2 * (n + first)] = -tangents[first] * off[u, first]
+            blocks[u, u] = np.eye(2) - np.outer(normals[first], normals[first])
         for j, gain in zip(made_by, gains.T, strict=True):  # a turn of the wall moves it at the corner, too
-            jacobian[at, 3 + 2 * (n + j)] -= gain * (tangents[j] @ points[u])
-            jacobian[at, 4 + 2 * (n + j)] = gain
-    cov = jacobian @ account.cov @ jacobian.T
+            blocks[u, n + j] = np.column_stack([-gain * (tangents[j] @ points[u]), gain])
+        if not across:
+            blocks[u, n + first][:, 0] -= tangents[first] * off[u, first]
+    jacobian = _with_pose(blocks, len(account.cov))
+    cov = jacobian @ (jacobian @ account.cov).T
     return replace(account, points=points, cov=0.5 * (cov + cov.T))
+
+
+def _with_pose(blocks: Mapping[tuple[int, int], Array], size: int) -> csr_array:
+    """Return J of all states ``(size, size)``, of its blocks of points and walls, and 1 for the pose."""
+    row, column = 3 + 2 * np.array(list(blocks)).T
+    rows = (row[:, None] + [0, 0, 1, 1]).ravel()
+    columns = (column[:, None] + [0, 1, 0, 1]).ravel()
+    values = np.array(list(blocks.values())).ravel()
+    pose = np.arange(3)
+    return coo_array(
+        (np.r_[np.ones(3), values], (np.r_[pose, rows], np.r_[pose, columns])), shape=(size, size)
+    ).tocsr()
 
 
 def _variance(account: Account, u: int, j: int) -> float:

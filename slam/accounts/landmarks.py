@@ -31,7 +31,7 @@ def handed_out(backend: Backend) -> HandedOut:
     As it believes them where it keeps no joint covariance of pose and map.
     """
     belief = backend.belief
-    if belief.joint_cov is None:
+    if not belief.has_whole_cov and belief.joint_cov is None:
         return HandedOut(points=belief.landmarks, covs=belief.landmark_cov, joint_cov=None)
     account = settled(Account.of(0, 0.0, backend))
     n = len(account.points)
