@@ -28,7 +28,7 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "make_agent", "prepare", "run",
+    "done", "make_agent", "prepare", "run",
 ]  # fmt: skip
 
 FILES = (
@@ -196,6 +196,11 @@ def asked_for(
     return world, run | {"max_steps": limit}, plan
 
 
+def done(agent: Agent) -> bool:
+    """Whether an agent has nothing to drive to; one whose belief is lost waits until it is found again."""
+    return agent.goal is None and agent.status != "lost"
+
+
 def make_agent(name: str, env: ExploreEnv) -> Agent:
     """Return an agent for an environment's robot, the bounds that know the map among them."""
     if name in KNOWN_MAPS:
@@ -238,7 +243,7 @@ def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ())
             for witness in witnesses:
                 witness.take(env, goal)
             progress(coverage=info["coverage"], time_s=info["time_s"], steps=steps, max_steps=max_steps)
-            idle = idle + 1 if goal is None else 0
+            idle = idle + 1 if done(agent) else 0
             if interrupted.is_set():
                 episode.end, episode.interrupted = "interrupted", True
             elif terminated and not (info["is_success"] and agent.outlives_coverage):

@@ -16,7 +16,7 @@ from agents.base import Agent, Goal
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.team import Team
 from slam.settings import from_mapping
-from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Course, Progress, asked_for, make_agent
+from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Course, Progress, asked_for, done, make_agent
 from training.episodes.team_log import TeamLog, team_metrics
 from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input
@@ -196,7 +196,7 @@ def run(episode: TeamEpisode, progress: Progress, witnesses: Iterable[TeamWitnes
             for witness in watching:
                 witness.take(team, goals)
             progress(coverage=team.coverage_share, time_s=team.time_s, steps=steps, max_steps=max_steps)
-            idle = idle + 1 if all(goals[k] is None for k in outcomes) else 0
+            idle = idle + 1 if all(done(agents[k]) for k in outcomes) else 0
             if interrupted.is_set():
                 episode.end, episode.interrupted = "interrupted", True
             elif not team.active and not any(outcome.truncated for outcome in outcomes.values()):
