@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
+from scipy.linalg import inv
 from scipy.linalg.blas import dger
 from scipy.sparse import coo_array, csr_array
 
@@ -60,10 +61,10 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
     Own is what it has where all else is known: less by no more than that, one corner after the other, a covariance
     stays one. A corner where two surfaces meet has less than σ², and keeps it.
     """
-    cov = account.cov.copy()
-    np.fill_diagonal(cov, np.diag(cov) + _NOTHING)
-    information = np.linalg.inv(cov)
-    np.fill_diagonal(cov, np.diag(account.cov))
+    cov, information = account.cov.copy(), account.cov.copy()
+    np.fill_diagonal(information, np.diag(cov) + _NOTHING)
+    # In place, as in a building a matrix has hundreds of megabytes; transposed, as BLAS counts.
+    information = inv(information.T, overwrite_a=True, check_finite=False).T
     for u in np.flatnonzero(account.kinds == CONVEX):
         at = slice(3 + 2 * u, 5 + 2 * u)
         variances, axes = np.linalg.eigh(np.linalg.inv(information[at, at]))
@@ -72,7 +73,6 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
             axis = axes[:, 1]
             cov[at, at] -= less * np.outer(axis, axis)
             column = information[:, at] @ axis
-            # In place, as the matrix of a building is hundreds of megabytes; the transpose is how BLAS counts.
             dger(less / (1.0 - less * (axis @ column[at])), column, column, a=information.T, overwrite_a=True)
     return cov
 
@@ -110,7 +110,9 @@ def _on_walls(account: Account, config: CornerConfig) -> Account:
             blocks[u, n + first][:, 0] -= tangents[first] * off[u, first]
     jacobian = _with_pose(blocks, len(account.cov))
     cov = jacobian @ (jacobian @ account.cov).T
-    return replace(account, points=points, cov=0.5 * (cov + cov.T))
+    cov += cov.T
+    cov *= 0.5
+    return replace(account, points=points, cov=cov)
 
 
 def _with_pose(blocks: Mapping[tuple[int, int], Array], size: int) -> csr_array:
