@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
 
 __all__ = [
-    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out",
-    "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts",
-    "UnknownStarts", "Workers", "workers_of",
+    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "JointBelief", "Json", "MaxSteps",
+    "Noise", "Out", "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam",
+    "Starts", "UnknownStarts", "Workers", "workers_of",
 ]  # fmt: skip
 
 _LAST_SEED = 2**31 - 1

@@ -19,6 +19,7 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
 from training.figures.tables import text_table
+from training.runs.processes import memory_mb
 from training.studies.costs import peers
 
 __all__ = ["REPEATS", "measure", "run"]
@@ -156,7 +157,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
     env = _make_env(rooms, slam, beams)
     episodes = _record(env, min(max(steps // REPEATS, 100), 20_000), seed)
     _replay(env, episodes, None)  # every buffer reaches the size that these rooms ask for
-    rss_before = _rss_mb()
+    rss_before = memory_mb()
     times: list[float] = []
     landmarks: list[int] = []
     replays: list[list[float]] = []
@@ -165,7 +166,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
         replays.append(more_times)
         times += more_times
         landmarks += more_landmarks
-    rss_after = _rss_mb()
+    rss_after = memory_mb()
     watch = _Stopwatch()
     timed, _ = _replay(env, episodes, watch)
     inner = _unwrapped(env)
@@ -241,15 +242,3 @@ def _against(peer: dict[str, Any]) -> str:
         f"{peer['steps_per_second']:,.0f} steps per second, ratio {peer['ratio']:.2f} (medians of {rounds} rounds "
         f"of {peer['steps']:,} steps; theirs has no dynamics and no SLAM)"
     )
-
-
-def _rss_mb() -> float:
-    """Return this process's resident memory [MB]; 0 where the platform does not tell."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            pages = int(file.read().split()[1])
-    except OSError:
-        return 0.0
-    import resource
-
-    return pages * resource.getpagesize() / 1e6
