@@ -108,10 +108,6 @@ def _table(summaries: list[Row]) -> str:
     return markdown_table(head, rows)
 
 
-def _shown(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value
-
-
 def study(
     rooms: Annotated[
         str, typer.Option(help="Generators of rooms, separated by commas.")
@@ -138,6 +134,6 @@ def study(
     rows = [every[job] for job in sorted(set(jobs))]
     summaries = summarise(rows, seeds)
     write_json(out / "summary.json", {"versions": versions(), "summaries": summaries})
-    shown = [{key: _shown(value) for key, value in row.items() if key not in _NOT_IN_CSV} for row in rows]
-    atomic_write(out / "episodes.csv", csv_table(shown))
+    shown = [{key: value for key, value in row.items() if key not in _NOT_IN_CSV} for row in rows]
+    atomic_write(out / "episodes.csv", csv_table(shown, digits=6))
     print(_table(summaries))
