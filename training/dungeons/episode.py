@@ -178,14 +178,9 @@ class _Run:
         low = int(rows[0]), int(cols[0])
         part = self.known[low[0] : int(rows[-1]) + 1, low[1] : int(cols[-1]) + 1]
         origin = low[1] * CELL_M, low[0] * CELL_M
-        return Belief(
-            pose=np.array([*self._point(self._cell), self._heading]),
-            pose_cov=np.zeros((3, 3)),
-            landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64),
-            grid=OccupancyGrid.from_classes(part, CELL_M, origin),
-        )
+        pose = np.array([*self._point(self._cell), self._heading])
+        grid = OccupancyGrid.from_classes(part, CELL_M, origin)
+        return Belief.without_landmarks(pose, np.zeros((3, 3)), grid)
 
     def _point(self, cell: tuple[int, int]) -> Array:
         """Return the centre (x, y) [m] of a cell."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from training.episodes import explore
 from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.options import Seed
 from training.views.film import Camera, check_video, film
 
 __all__ = ["moving_picture", "study"]
@@ -60,7 +61,7 @@ class _Enough(Exception):
 def study(
     agent: Annotated[str, typer.Option(help="Who explores.")] = "brisk-tour",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 4,
+    seed: Seed = 4,
     speed: Annotated[int, typer.Option(min=1, max=100, help="Times as fast as true.")] = 4,
     width: Annotated[int, typer.Option(min=16, max=4096, help="Of the picture [pixels].")] = 800,
     until: Annotated[float, typer.Option(min=0, max=1, help="Coverage at which it ends.")] = 0.97,
