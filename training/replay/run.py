@@ -23,15 +23,7 @@ from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
 from training.runs.signals import interrupt_flag
 
-__all__ = [
-    "FILES",
-    "MAP_FILES",
-    "Replay",
-    "ReplayConfig",
-    "prepare",
-    "run",
-    "sample_times",
-]
+__all__ = ["FILES", "MAP_FILES", "Replay", "ReplayConfig", "prepare", "run", "sample_times"]
 
 FILES = (
     "trajectory_estimate.tum", "trajectory_true.tum", "landmarks.db", "landmarks.csv", "trajectory.png",
