@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.metrics.measures import ate_aligned
 from slam.types import Array
-from training.episodes.explore import Course, Episode, prepare, run
+from training.episodes.explore import Course, Episode, run_whole
 from training.runs.errors import one_line
 from training.runs.running import plain
 
@@ -91,16 +91,12 @@ class EpisodeFailure:
     message: str
 
 
-def run_single(job: EpisodeJob) -> EpisodeRow | None:
-    """Run an episode of one robot; return its row, or None where it was interrupted."""
-    episode = prepare(**job.options)
-    run(episode, lambda **_: None)
-    return None if episode.interrupted else _row(episode)
+def run_single(job: EpisodeJob) -> EpisodeRow:
+    """Run an episode of one robot; return its row."""
+    return _row(run_whole(**job.options))
 
 
-def run_job(
-    job: EpisodeJob, run_one: Callable[[Any], EpisodeRow | None] = run_single
-) -> EpisodeRow | EpisodeFailure:
+def run_job(job: EpisodeJob, run_one: Callable[[Any], EpisodeRow] = run_single) -> EpisodeRow | EpisodeFailure:
     """Run one episode; an error in it is returned, so that the other episodes go on.
 
     Raises
@@ -109,12 +105,9 @@ def run_job(
         On Ctrl-C: half an episode is no row.
     """
     try:
-        row = run_one(job)
+        return run_one(job)
     except Exception as error:
         return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
-    if row is None:
-        raise KeyboardInterrupt
-    return row
 
 
 def resampled(values: Array, along: Array) -> Curve:

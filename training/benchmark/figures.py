@@ -24,18 +24,9 @@ from training.figures.statistics import (
 )
 
 __all__ = [
-    "COMPARED",
-    "METRICS",
-    "REGRETS",
-    "Figure",
-    "Group",
-    "Metric",
-    "comparisons",
-    "figures",
-    "group_rows",
-    "merged",
-    "with_regrets",
-]
+    "COMPARED", "METRICS", "REGRETS", "Figure", "Group", "Metric", "comparisons", "figures", "group_rows",
+    "merged", "with_regrets",
+]  # fmt: skip
 
 Row = dict[str, Any]  # an episode's metrics
 

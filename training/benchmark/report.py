@@ -10,7 +10,6 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from slam.files import plain_name
 from slam.formats import atomic_write
 from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
@@ -18,7 +17,7 @@ from training.benchmark.output import Entry, Report, centres
 from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent, scaling_charts
 from training.benchmark.team_figures import scaling_table
 from training.episodes.explore import ENDINGS
-from training.figures.page import html_page, text_html
+from training.figures.page import html_page, name_html, text_html
 from training.figures.statistics import Comparison
 from training.truth.known_map import KNOWN_MAPS
 
@@ -46,10 +45,10 @@ def page(report: Report, *, config_text: str) -> str:
     """Return the page."""
     suites = report.suites()
     colours = {name: k for k, name in enumerate(dict.fromkeys(entry.name for entry in report.entries))}
-    links = "".join(f'<a href="#{_anchor(name)}">{_name(name)}</a>' for name in suites)
+    links = "".join(f'<a href="#{_anchor(name)}">{name_html(name)}</a>' for name in suites)
     body = [
         "<h1>Exploration benchmark</h1>",
-        f'<p class="soft">{_name(_described(report), 2000)}</p>',
+        f'<p class="soft">{name_html(_described(report), 2000)}</p>',
         f"<nav>{links}<a href='#made'>configuration</a></nav>",
         _READING,
         _BOUND if any(entry.group.agent in KNOWN_MAPS for entry in report.entries) else "",
@@ -72,8 +71,8 @@ def _suite(name: str, entries: Sequence[Entry], report: Report, colours: dict[st
     episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
     backends = ", ".join(dict.fromkeys(entry.group.slam for entry in entries))
     parts = [
-        f'<h2 id="{_anchor(name)}">{_name(name)}</h2>',
-        f'<p class="soft">{episodes} episodes an agent, {_name(backends)}</p>',
+        f'<h2 id="{_anchor(name)}">{name_html(name)}</h2>',
+        f'<p class="soft">{episodes} episodes an agent, {name_html(backends)}</p>',
         _figures(entries, tables.HEADLINE, colours),
         _against(
             {entry.name: entry.against for entry in entries if entry.against},
@@ -120,7 +119,7 @@ def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None
     if not found:
         return ""
     return (
-        f"<h3>{_name(f'Against {baseline}, {where}')}</h3>"
+        f"<h3>{name_html(f'Against {baseline}, {where}')}</h3>"
         '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
         "change; below, in what share of the episodes it did better, ties counted half.</p>"
         + tables.html(tables.against_table(found, baseline))
@@ -135,7 +134,7 @@ def _charts(entries: Sequence[Entry], colours: dict[str, int]) -> str:
         high = extent(groups, along)
         bands = [band(entry.group, name=entry.name, along=along, high=high) for entry in entries]
         charts.append(coverage_chart(bands, along=along, colours=[colours[entry.name] for entry in entries]))
-    legend = "".join(f"<span>{_key(colours[e.name])}{_name(e.name)}</span>" for e in entries)
+    legend = "".join(f"<span>{_key(colours[e.name])}{name_html(e.name)}</span>" for e in entries)
     return (
         "<h3>Coverage against time and way</h3>"
         f'<p class="soft">Median, and the middle half of the episodes.</p><nav>{legend}</nav>'
@@ -147,7 +146,7 @@ def _teams(report: Report, suite: str) -> str:
     scalings = report.scalings(suite)
     if not scalings:
         return ""
-    legend = "".join(f"<span>{_key(k)}{_name(s.name)}</span>" for k, s in enumerate(scalings))
+    legend = "".join(f"<span>{_key(k)}{name_html(s.name)}</span>" for k, s in enumerate(scalings))
     return (
         "<h3>Several robots</h3>"
         '<p class="soft">Time until the team has mapped 95 %, with its interval; dashed, what there would be if '
@@ -197,7 +196,9 @@ def worst_first(keys: Sequence[Key], rows: Sequence[EpisodeRow]) -> list[tuple[K
 def _cases(entry: Entry) -> str:
     worst = worst_first(entry.group.keys, entry.group.rows)[:_CASES]
     shown_cases = "".join(_case(key, row, several=len(set(entry.group.strata)) > 1) for key, row in worst)
-    return f'<details open><summary>{_name(entry.name)}</summary><div class="cases">{shown_cases}</div></details>'
+    return (
+        f'<details open><summary>{name_html(entry.name)}</summary><div class="cases">{shown_cases}</div></details>'
+    )
 
 
 def _case(key: Key, row: EpisodeRow, *, several: bool) -> str:
@@ -205,7 +206,7 @@ def _case(key: Key, row: EpisodeRow, *, several: bool) -> str:
     where = f"{key[1]}, seed {key[2]}" if several else f"seed {key[2]}"
     at = "95 % never" if m["time_to_95_s"] is None else f"95 % at {m['time_to_95_s']:.0f} s"
     lines = [
-        f"<b>{_name(where)}</b>",
+        f"<b>{name_html(where)}</b>",
         f"{100 * m['coverage']:.1f} %, {at}",
         f"ATE {_cm(m['ate_rmse_m'])}, end {_cm(m['final_position_error_m'])}",
         f"{escape(str(m['end']))} at {m['time_s']:.0f} s"
@@ -213,7 +214,7 @@ def _case(key: Key, row: EpisodeRow, *, several: bool) -> str:
     ]
     data = base64.b64encode(row.thumbnail).decode("ascii")
     return (
-        f'<figure><img loading="lazy" alt="believed map, {_name(where)}" src="data:image/png;base64,{data}">'
+        f'<figure><img loading="lazy" alt="believed map, {name_html(where)}" src="data:image/png;base64,{data}">'
         f"<figcaption>{'<br>'.join(lines)}</figcaption></figure>"
     )
 
@@ -247,11 +248,6 @@ def _made(config: dict[str, Any], config_text: str) -> str:
 
 
 # ---- small pieces ----------------------------------------------------------------------------------------------
-
-
-def _name(text: str, longest: int = 120) -> str:
-    """Return text in which a name from outside stands, as HTML."""
-    return escape(plain_name(text, longest))
 
 
 def _key(colour: int) -> str:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import Literal
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from slam.files import plain_name
 from slam.types import Array
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
+from training.figures.page import name_html
 from training.figures.statistics import Interval
 
 __all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts"]
@@ -98,10 +97,8 @@ def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int
         parts.append(f'<path class="band c{colour % COLOURS}" d="{_outline(b, last)}"/>')
     for b, colour in zip(bands, colours, strict=True):
         dashed = " dashed" if colour >= COLOURS else ""
-        path = _polyline(b.x, b.middle, last)
-        parts.append(
-            f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{_name(b.name)}</title></path>'
-        )
+        path, name = _polyline(b.x, b.middle, last), name_html(b.name, 400)
+        parts.append(f'<path class="line c{colour % COLOURS}{dashed}" d="M{path}"><title>{name}</title></path>')
     return _chart(f"Coverage against {_LABELS[along]}: {names}", parts, up="coverage [%]", along=_LABELS[along])
 
 
@@ -109,14 +106,10 @@ def _chart(told: str, parts: Sequence[str], *, up: str, along: str) -> str:
     """Return the chart of these parts, what it tells in words, and the labels of its axes."""
     middle = 0.5 * (_LEFT + _WIDTH - _RIGHT)
     return (
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{_name(told)}">{"".join(parts)}'
-        f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{_name(up)}</text>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{name_html(told, 400)}">{"".join(parts)}'
+        f'<text class="label" x="{_LEFT}" y="{_TOP - 9}">{name_html(up, 400)}</text>'
         f'<text class="label" x="{middle}" y="{_HEIGHT - 6}" text-anchor="middle">{along}</text></svg>'
     )
-
-
-def _name(text: str) -> str:
-    return escape(plain_name(text, 400))
 
 
 def _to_x(value: float, last: float) -> float:
@@ -193,7 +186,7 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
             parts.append(f'<path class="{kind} dashed ideal" d="{path(points)}"/>')
         if line:
             points = [at(n, f.value, k) for n, f in line]
-            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{_name(name)}</title></path>')
+            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{name_html(name, 400)}</title></path>')
         for n, f in line:
             if math.isfinite(f.low) and math.isfinite(f.high):
                 limits = path([at(n, f.low, k), at(n, f.high, k)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -116,10 +115,17 @@ class BenchmarkPlan:
             "rooms": place.rooms,
         }  # fmt: skip
 
+    def _seeds_of(self, suite: Suite) -> list[int]:
+        return list(self.seeds or suite.seeds(self.split))
+
+    def _told_teams(self) -> dict[str, Any]:
+        """Return the settings of the teams under their name, nothing where there are none."""
+        teams = [to_mapping(team) for team in self.teams if team is not None]
+        return {"teams": teams} if teams else {}
+
     @cached_property
     def jobs(self) -> tuple[EpisodeJob, ...]:
         """Every episode; all agents get to a seed before any gets to the next."""
-        seeds = {suite.name: self.seeds or tuple(suite.seeds(self.split)) for suite in self.suites}
         found = [
             (rank, _job(
                 team, suite=suite.name, place=place.name, seed=seed, agent=agent, slam=backend,
@@ -130,7 +136,7 @@ class BenchmarkPlan:
             for backend in self.backends
             for agent in self.agents
             for team in self.teams
-            for rank, seed in enumerate(seeds[suite.name])
+            for rank, seed in enumerate(self._seeds_of(suite))
         ]  # fmt: skip
         return tuple(job for _, job in sorted(found, key=lambda pair: pair[0]))
 
@@ -168,15 +174,27 @@ class BenchmarkPlan:
             "agents": list(self.agents),
             "backends": list(self.backends),
             "split": self.split if self.seeds is None else "given seeds",
-            "seeds": {s.name: list(self.seeds or s.seeds(self.split)) for s in self.suites},
+            "seeds": {s.name: self._seeds_of(s) for s in self.suites},
             "step_limit": self.settings()["max_steps"],
             "versions": versions(),
         }  # fmt: skip
         if self.baseline is not None:
             run["baseline"] = self.baseline
-        if teams := [to_mapping(team) for team in self.teams if team is not None]:
-            run["teams"] = teams
+        run |= self._told_teams()
         return self._config_text(self.suites[0], self.backends[0]) + "\n" + tomli_w.dumps({"run": run})
+
+    def described(self) -> dict[str, Any]:
+        """Return what was asked for, as a report tells it."""
+        return {
+            "suites": [suite.name for suite in self.suites],
+            "agents": list(self.agents),
+            "backends": list(self.backends),
+            "split": self.split if self.seeds is None else None,
+            "seeds": {s.name: self._seeds_of(s) for s in self.suites},
+            "baseline": self.baseline,
+            **self._told_teams(),
+            **self.settings(),
+        }
 
     def _config_text(self, suite: Suite, backend: str) -> str:
         config = make_config(slam=backend, **self._world(suite, suite.places[0]))
@@ -212,7 +230,7 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
         # same in any number of workers.
         run_all(missing, run_job, workers=workers, keep=keep, what="episodes", apart=True)
         groups = _groups(plan, store)
-    report = Report.of(groups, baseline=plan.baseline, config=_described(plan))
+    report = Report.of(groups, baseline=plan.baseline, config=plan.described())
     write_tables(out, report)
     atomic_write(out / "tables.md", markdown(report))
     if failures:
@@ -272,18 +290,3 @@ def _behind_agent(name: str) -> tuple[str, str]:
     policy: Path | None = getattr(agent, "policy_path", None)
     files = [] if policy is None else [policy, policy.with_suffix(".json")]
     return type(agent).__module__, short_digest(file.read_bytes() for file in files)
-
-
-def _described(plan: BenchmarkPlan) -> dict[str, Any]:
-    seeds: Sequence[int] | None = plan.seeds
-    teams = [to_mapping(team) for team in plan.teams if team is not None]
-    return {
-        "suites": [suite.name for suite in plan.suites],
-        "agents": list(plan.agents),
-        "backends": list(plan.backends),
-        "split": plan.split if seeds is None else None,
-        "seeds": {s.name: list(seeds or s.seeds(plan.split)) for s in plan.suites},
-        "baseline": plan.baseline,
-        **({"teams": teams} if teams else {}),
-        **plan.settings(),
-    }

@@ -18,17 +18,9 @@ from training.runs.provenance import short_digest
 from training.runs.typed import parts_of, whole_numbers
 
 __all__ = [
-    "FLOOR_PLANS",
-    "NOMINAL",
-    "SLIPPERY",
-    "SPLITS",
-    "Place",
-    "Suite",
-    "choose",
-    "names",
-    "read_floor_plans",
+    "FLOOR_PLANS", "NOMINAL", "SLIPPERY", "SPLITS", "Place", "Suite", "choose", "names", "read_floor_plans",
     "teams_of",
-]
+]  # fmt: skip
 
 SPLITS: dict[str, range] = {
     "train": range(0, 1000),

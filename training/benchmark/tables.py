@@ -12,6 +12,7 @@ from typing import Literal
 from slam.files import plain_name
 from training.benchmark.figures import METRICS, REGRETS, Metric
 from training.benchmark.suites import SLIPPERY
+from training.figures.page import name_html
 from training.figures.statistics import NONE, Comparison, Interval
 from training.figures.tables import markdown_name, markdown_table, text_table
 from training.truth.known_map import KNOWN_MAPS
@@ -248,8 +249,7 @@ def html(table: Table, keys: Mapping[str, str] | None = None) -> str:
     """Return a table that scrolls sideways; ``keys`` are what stands before an agent's name, as HTML."""
     head = "".join(f"<th>{_unbroken(heading)}</th>" for heading in ("", *table.head[1:]))
     rows = [
-        f"<tr><th>{keys[name] if keys else ''}{escape(plain_name(name))}</th>"
-        f"{''.join(map(_html_cell, cells))}</tr>"
+        f"<tr><th>{keys[name] if keys else ''}{name_html(name)}</th>{''.join(map(_html_cell, cells))}</tr>"
         for name, cells in table.rows
     ]
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
@@ -263,4 +263,4 @@ def _html_cell(cell: Cell) -> str:
 
 
 def _unbroken(heading: str) -> str:
-    return escape(plain_name(heading)).replace(" %", "\u00a0%").replace(" [", "<br>[")
+    return name_html(heading).replace(" %", "\u00a0%").replace(" [", "<br>[")

@@ -39,10 +39,12 @@ def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
     return single.run_job(job, _run_team if isinstance(job, TeamJob) else single.run_single)
 
 
-def _run_team(job: TeamJob) -> EpisodeRow | None:
+def _run_team(job: TeamJob) -> EpisodeRow:
     episode = prepare(job.team, **job.options)
     run(episode, lambda **_: None)
-    return None if episode.interrupted else _row(episode)
+    if episode.interrupted:
+        raise KeyboardInterrupt
+    return _row(episode)
 
 
 def _row(episode: TeamEpisode) -> EpisodeRow:

@@ -10,6 +10,7 @@ import typer
 
 from training.runs import options as opt
 from training.runs.errors import BadInput, suggestion
+from training.runs.typed import parts_of
 
 __all__ = ["benchmark"]
 
@@ -111,7 +112,7 @@ def benchmark(
         assert maps is not None
         from training.dungeons import protocol as dungeons
 
-        names = [part.strip() for part in agents.split(",") if part.strip()]
+        names = [name for name in parts_of(agents) if name]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
         summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan, sensor=sensor)

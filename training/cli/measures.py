@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Json, Out, Ray, Workers, workers_of
+from training.runs.options import Backends, Json, Out, Ray, RoomSeed, Workers, workers_of
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -19,7 +19,7 @@ def speed(
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     slam: Annotated[str, typer.Option(help="SLAM backend.")] = "ekf",
     beams: Annotated[int, typer.Option(min=8, max=10_000, help="Beams of the lidar.")] = 360,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of the room and the noise.")] = 0,
+    seed: RoomSeed = 0,
     peer: Annotated[
         str | None, typer.Option(help="Another simulator to measure in turn, in the same rooms: navground.")
     ] = None,

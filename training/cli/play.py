@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from typing import Annotated, Any
 import typer
 
 from training.runs import options as opt
-from training.runs.errors import BadInput
 
 __all__ = ["play"]
 
@@ -57,8 +55,6 @@ def play(
       mecanum play --robots 2 --communication walls
       SDL_VIDEODRIVER=dummy mecanum play --frames 100
     """  # noqa: D301
-    if not (math.isfinite(speed) and 0.01 <= speed <= 1000):
-        raise BadInput(f"--speed must be from 0.01 to 1000, got {speed}")
     from training.episodes.team import read_team
     from training.play.game import Game, open_window
     from training.play.session import Session

@@ -11,6 +11,7 @@ import typer
 from training.runs import options as opt
 from training.runs.errors import Interrupted
 from training.runs.progress import Progress
+from training.runs.typed import LAST_SEED
 
 __all__ = ["replay"]
 
@@ -52,7 +53,7 @@ def replay(
         ),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="Of backends that draw samples.  [default: 0]")
+        int | None, typer.Option(min=0, max=LAST_SEED, help="Of backends that draw samples.  [default: 0]")
     ] = None,
     limit_s: Annotated[
         float | None, typer.Option(min=0.001, max=1e9, help="Stop after so many seconds of the log.")

@@ -12,6 +12,7 @@ import typer
 
 from training.runs.errors import BadInput, Interrupted, bad_input, check_writable, needs_extra, suggestion
 from training.runs.options import Ray, workers_of
+from training.runs.typed import LAST_SEED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +31,7 @@ def train(
         str, typer.Option(help="Name of a configuration that comes with the package, or a TOML file.")
     ] = "ppo-frontier",
     seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="Another seed than the configuration's.")
+        int | None, typer.Option(min=0, max=LAST_SEED, help="Another seed than the configuration's.")
     ] = None,
     workers: Annotated[
         int | None,

@@ -53,24 +53,15 @@ _LIDAR = LidarConfig(beams=720, range_max_m=RANGE_M, offset_m=0.0)
 # Frontiers count as in sight from 16 m, as in the benchmark; and a metre costs a metre, near walls, too.
 _SETTINGS: dict[str, Any] = {
     "frontiers": {
-        "min_extent_m": 0.8,
-        "far_extent_m": 0.8,
-        "min_unknown_m2": 0.5,
-        "min_unknown_width_m": CELL_M,
-        "spacing_m": 1.6,
-        "view_range_m": 16.0,
-        "beyond_m": CELL_M,
+        "min_extent_m": 0.8, "far_extent_m": 0.8, "min_unknown_m2": 0.5, "min_unknown_width_m": CELL_M,
+        "spacing_m": 1.6, "view_range_m": 16.0, "beyond_m": CELL_M,
     },
     "planner": {
-        "resolution_m": CELL_M,
-        "unknown_margin_m": 0.0,
-        "preferred_m": 0.1,
-        "near_cost": 0.0,
-        "tight_cost": 0.0,
+        "resolution_m": CELL_M, "unknown_margin_m": 0.0, "preferred_m": 0.1, "near_cost": 0.0, "tight_cost": 0.0,
         "path_spacing_m": CELL_M,
     },
     "stations": {"spacing_m": STRIDE * CELL_M, "hop": HOP},
-}
+}  # fmt: skip
 
 
 def make_agent(name: str, extent_m: tuple[float, float] | None = None, *, sensor: str = SENSORS[0]) -> Agent:
@@ -178,14 +169,9 @@ class _Run:
         low = int(rows[0]), int(cols[0])
         part = self.known[low[0] : int(rows[-1]) + 1, low[1] : int(cols[-1]) + 1]
         origin = low[1] * CELL_M, low[0] * CELL_M
-        return Belief(
-            pose=np.array([*self._point(self._cell), self._heading]),
-            pose_cov=np.zeros((3, 3)),
-            landmarks=np.zeros((0, 2)),
-            landmark_cov=np.zeros((0, 2, 2)),
-            landmark_ids=np.zeros(0, np.int64),
-            grid=OccupancyGrid.from_classes(part, CELL_M, origin),
-        )
+        pose = np.array([*self._point(self._cell), self._heading])
+        grid = OccupancyGrid.from_classes(part, CELL_M, origin)
+        return Belief.without_landmarks(pose, np.zeros((3, 3)), grid)
 
     def _point(self, cell: tuple[int, int]) -> Array:
         """Return the centre (x, y) [m] of a cell."""

@@ -19,7 +19,7 @@ import numpy as np
 
 import agents
 from slam.formats import atomic_write
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import SENSORS, Dungeon, layout, load
@@ -74,9 +74,8 @@ def run_dungeons(
     with bad_input():
         for name in agent_names:
             agents.check(name, NEAREST, NEAREST_VIEW, *BOUNDS)
-    for option, given, valid in (("--scan", scan, SCANS), ("--sensor", sensor, SENSORS)):
-        if given not in valid:
-            raise BadInput(str(unknown_name(option, given, valid)))
+        check_name("--scan", scan, SCANS)
+        check_name("--sensor", sensor, SENSORS)
     paths = _maps(maps)
     if (out / _STORE).exists() and (out / _STORE).read_text("utf-8").startswith("{"):
         raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
@@ -90,8 +89,8 @@ def run_dungeons(
     done = resume(out / _STORE, [job for _, job in asked], partial(_run, files), workers=workers, what="episodes")
     rows = [done[job] | {"map": path.stem, "layout": layouts[path]} for path, job in asked]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
-    shown = [{name: _cell(row[name]) for name in _COLUMNS} for row in rows]
-    atomic_write(out / _CSV, csv_table(shown, _COLUMNS))
+    shown = [{name: row[name] for name in _COLUMNS} for row in rows]
+    atomic_write(out / _CSV, csv_table(shown, _COLUMNS, digits=6))
     write_json(out / _SUMMARY, summary)
     return summary
 
@@ -201,7 +200,3 @@ def _bound(dungeon: Dungeon, name: str, sensor: str) -> Row:
         "unseen_cells": 0,
         "end": "covered",
     }
-
-
-def _cell(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value

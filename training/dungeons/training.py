@@ -34,9 +34,9 @@ from training.dungeons.episode import explore
 from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.plans import dungeon_plan
+from training.runs import options as opt
 from training.runs.campaign import Workers, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Ray, workers_of
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
 
@@ -270,9 +270,9 @@ def study(
     start: Annotated[
         str, typer.Option(metavar="FILE", help="Policy (.safetensors) whose weights the network begins with.")
     ] = "",
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 0,
+    seed: opt.Seed = 0,
     workers: Annotated[int, typer.Option(min=1, max=1024, help="Processes that gather lessons.")] = 1,
-    ray: Ray = None,
+    ray: opt.Ray = None,
 ) -> None:
     """Train learned-tour: lessons on plans like the benchmark's, and a network that foresees them."""
     if start:
@@ -283,7 +283,7 @@ def study(
         batch=batch, rate=rate, weight_decay=weight_decay, untold=untold, free_weight=free_weight, members=members,
         trust=trust, start=start, seed=seed,
     )  # fmt: skip
-    run(out, config, workers=workers_of(workers, ray))
+    run(out, config, workers=opt.workers_of(workers, ray))
     print(out / _WEIGHTS)
 
 

@@ -35,16 +35,8 @@ from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.world import CELL_M, Dungeon, scan
 
 __all__ = [
-    "BLIND_REACH",
-    "LUCK",
-    "MOST",
-    "REACH",
-    "LearnedDriver",
-    "Stop",
-    "TourDriver",
-    "Walk",
-    "rest_of_the_tour",
-]
+    "BLIND_REACH", "LUCK", "MOST", "REACH", "LearnedDriver", "Stop", "TourDriver", "Walk", "rest_of_the_tour",
+]  # fmt: skip
 
 MOST = 5
 """Openings that are weighed at a stop."""

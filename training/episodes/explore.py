@@ -28,7 +28,7 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "done", "make_agent", "prepare", "run",
+    "done", "make_agent", "prepare", "run", "run_whole",
 ]  # fmt: skip
 
 FILES = (
@@ -254,3 +254,18 @@ def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ())
                 continue
             break
     episode.wall_time_s = time.perf_counter() - began
+
+
+def run_whole(witnesses: Sequence[Witness] = (), **options: Any) -> Episode:
+    """Run an episode in silence, of what :func:`prepare` is asked for, and return it.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C: half an episode is no result.
+    """
+    episode = prepare(**options)
+    run(episode, lambda **_: None, witnesses)
+    if episode.interrupted:
+        raise KeyboardInterrupt
+    return episode

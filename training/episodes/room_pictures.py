@@ -13,11 +13,12 @@ from mecanum_env.views.plans import contact_sheet, draw_plan
 from slam.formats import atomic_write
 from slam.settings import check_name
 from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.typed import LAST_SEED
 
 __all__ = ["draw_rooms", "parse_seeds"]
 
 MOST_SEEDS = 100
-_MOST_SEED = 2**31 - 1
+_COLUMNS = 5  # of the contact sheet
 
 
 def parse_seeds(text: str, *, most: int = MOST_SEEDS) -> list[int]:
@@ -35,8 +36,8 @@ def parse_seeds(text: str, *, most: int = MOST_SEEDS) -> list[int]:
         if not (first.isascii() and first.isdigit() and (not colon or (last.isascii() and last.isdigit()))):
             raise BadInput(f"--seeds {text!r} are no seeds; give 3, 0:9 (both included) or 1,4,7")
         low, high = int(first), int(last) if colon else int(first)
-        if low > high or high > _MOST_SEED:
-            raise BadInput(f"--seeds {part.strip()!r} must run upwards from 0 to at most {_MOST_SEED}")
+        if low > high or high > LAST_SEED:
+            raise BadInput(f"--seeds {part.strip()!r} must run upwards from 0 to at most {LAST_SEED}")
         if high - low >= most or len(seeds) > most:
             raise too_many
         seeds |= dict.fromkeys(range(low, high + 1))
@@ -45,7 +46,7 @@ def parse_seeds(text: str, *, most: int = MOST_SEEDS) -> list[int]:
     return list(seeds)
 
 
-def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str = "youbot", columns: int = 5) -> dict[str, Any]:
+def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str) -> dict[str, Any]:
     """Draw each seed's plan, and all of them on a contact sheet; return what was written.
 
     Raises
@@ -67,7 +68,7 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str = "youbot", colum
         atomic_write(path, cv2.imencode(".png", draw_plan(plan, pixels_per_m=60.0, robot=body))[1].tobytes())
         files.append(str(path))
     sheet = out / sheet_name
-    picture = contact_sheet(plans, columns, pixels_per_m=24.0)
+    picture = contact_sheet(plans, _COLUMNS, pixels_per_m=24.0)
     atomic_write(sheet, cv2.imencode(".png", picture)[1].tobytes())
     areas = {str(seed): round(plan.area_m2, 3) for seed, plan in zip(chosen, plans, strict=True)}
     return {"rooms": kind, "seeds": chosen, "area_m2": areas, "files": files, "sheet": str(sheet)}

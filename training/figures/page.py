@@ -11,7 +11,7 @@ from html import escape
 from slam.files import plain_name
 from training.figures.page_style import STYLE
 
-__all__ = ["HEAD", "html_page", "security_policy", "text_html"]
+__all__ = ["HEAD", "html_page", "name_html", "security_policy", "text_html"]
 
 HEAD = (
     '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -47,6 +47,11 @@ def _hash(text: str) -> str:
 def text_html(text: str) -> str:
     """Return lines of text as HTML, in which nothing acts: control characters and marks are written out."""
     return escape("\n".join(plain_name(line, sys.maxsize) for line in text.split("\n")))
+
+
+def name_html(text: str, longest: int = 120) -> str:
+    """Return text in which a name from outside stands, as HTML, on one line and cut where it is long."""
+    return escape(plain_name(text, longest))
 
 
 def html_page(title: str, body: str) -> str:

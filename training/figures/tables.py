@@ -40,11 +40,18 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
-def csv_table(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = ()) -> str:
-    """Return rows as CSV with the first columns and every other that a row has; empty where there is no value."""
+def csv_table(rows: Sequence[Mapping[str, Any]], first: Sequence[str] = (), *, digits: int | None = None) -> str:
+    """Return rows as CSV with the first columns and every other that a row has; empty where there is no value.
+
+    Numbers with a point have so many significant digits; ``None``: all.
+    """
     file = io.StringIO()
     columns = dict.fromkeys((*first, *(name for row in rows for name in row)))
     writer = csv.DictWriter(file, list(columns), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    for row in rows:
+        writer.writerow({
+            name: f"{value:.{digits}g}" if digits is not None and isinstance(value, float) else value
+            for name, value in row.items()
+        })  # fmt: skip
     return file.getvalue()

@@ -22,12 +22,11 @@ from slam.files import plain_name
 from training.episodes.explore import make_agent
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
+from training.runs.typed import LAST_SEED
 
 __all__ = ["Session"]
 
 T = TypeVar("T")
-
-_LAST_SEED = 2**31 - 1
 
 
 class Session:
@@ -145,7 +144,7 @@ class Session:
                 rooms, floor_plan = _after((config.rooms, config.floor_plan), self._kinds)
                 config = replace(config, rooms=rooms, rooms_config={}, floor_plan=floor_plan)
             case Command.NEXT_ROOM:
-                seed = min(seed + 1, _LAST_SEED)
+                seed = min(seed + 1, LAST_SEED)
             case Command.PREVIOUS_ROOM:
                 seed = max(seed - 1, 0)
             case Command.RESTART:

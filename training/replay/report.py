@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,9 +24,9 @@ from slam.settings import to_mapping
 from slam.types import Array
 from training.figures.charts import png
 from training.replay.picture import draw_belief, draw_replay
-from training.replay.run import FILES, Replay
+from training.replay.run import Replay
 from training.replay.scans import scan_metrics
-from training.runs.running import plain, versions, written_together
+from training.runs.running import plain, versions, write_json, written_together
 
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
 
@@ -114,7 +113,7 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
     atomic_write(folder / "trajectory.png", png(figure))
     atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": _run_values(replay)}))
     found = metrics(replay)
-    atomic_write(folder / "metrics.json", json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / "metrics.json", found)
     return found
 
 
@@ -147,7 +146,7 @@ def _at(times: Array, stamps: Array, poses: Array) -> Array:
     return np.column_stack([np.interp(times, stamps, column) for column in columns])
 
 
-def summary(found: Mapping[str, Any], out: Path, files: Sequence[str] = FILES) -> str:
+def summary(found: Mapping[str, Any], out: Path, files: Sequence[str]) -> str:
     """Return what is printed at the end, where no JSON is wanted."""
 
     def shown(key: str, unit: str, digits: int = 2) -> str:

@@ -23,15 +23,7 @@ from training.runs.config_files import read_config
 from training.runs.errors import bad_input, check_writable
 from training.runs.signals import interrupt_flag
 
-__all__ = [
-    "FILES",
-    "MAP_FILES",
-    "Replay",
-    "ReplayConfig",
-    "prepare",
-    "run",
-    "sample_times",
-]
+__all__ = ["FILES", "MAP_FILES", "Replay", "ReplayConfig", "prepare", "run", "sample_times"]
 
 FILES = (
     "trajectory_estimate.tum", "trajectory_true.tum", "landmarks.db", "landmarks.csv", "trajectory.png",
@@ -85,7 +77,6 @@ class Replay:
     wall_time_s: float = 0.0
 
     def __post_init__(self) -> None:
-        self.headings = self.log.has_heading
         self.files = (*MAP_FILES, *FILES) if isinstance(self.log, ScanLog) else FILES
 
     def trajectories(self) -> tuple[Array, Array, Array]:
@@ -250,7 +241,7 @@ def _sample(replay: Replay, before: float, twist: Any) -> None:
         replay.estimates.append(move(backend.pose, twist, float(replay.sample_times[k]) - now))
         replay.covs.append(backend.pose_cov)
         replay.health.append(backend.health)
-        true_pose = log.reference_at(now) if replay.headings and replay.sample_rows[k] >= 0 else None
+        true_pose = log.reference_at(now) if log.has_heading and replay.sample_rows[k] >= 0 else None
         replay.nees.append(math.nan if true_pose is None else _pose_nees(backend, true_pose))
 
 

@@ -10,7 +10,8 @@ import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
@@ -48,6 +49,21 @@ _TOO_FAST = 3.0  # times its limits: no robot's motion, but odometry that began 
 _BESIDE_M = 0.05  # that a lidar may sit off the middle line of the body that the agents drive
 _NARROWEST_RAD = math.radians(30.0)
 _STAND = (0.0, 0.0, 0.0)
+
+_Heard = ParamSpec("_Heard")
+
+
+def _guarded(hear: Callable[Concatenate[Driver, _Heard], None]) -> Callable[Concatenate[Driver, _Heard], None]:
+    """Pass over a message that says what no robot does: where none is good, it will be late, and stand."""
+
+    @wraps(hear)
+    def guarded(self: Driver, /, *heard: _Heard.args, **named: _Heard.kwargs) -> None:
+        try:
+            hear(self, *heard, **named)
+        except ValueError as error:
+            self._complain(f"{hear.__name__.removeprefix('hear_')} {error}")
+
+    return guarded
 
 
 class Driver:
@@ -97,30 +113,15 @@ class Driver:
 
     # ---- what it hears -------------------------------------------------------------------------------------
 
+    @_guarded
     def hear_transforms(self, message: Any) -> None:
         """Take a ``tf2_msgs/TFMessage`` of transforms that stand still."""
-        self._guarded(self._take_transforms, message)
-
-    def hear_odometry(self, message: Any, now_s: float) -> None:
-        """Take a ``nav_msgs/Odometry`` that came at a time of the caller's clock [s]."""
-        self._guarded(self._take_odometry, message, now_s)
-
-    def hear_scan(self, message: Any, now_s: float) -> None:
-        """Take a ``sensor_msgs/LaserScan`` that came at a time of the caller's clock [s]."""
-        self._guarded(self._take_scan, message, now_s)
-
-    def _guarded(self, take: Callable[..., None], message: Any, *when: float) -> None:
-        """Pass over a message that says what no robot does: where none is good, it will be late, and stand."""
-        try:
-            take(message, *when)
-        except ValueError as error:
-            self._complain(f"{take.__name__.rpartition('_')[2]} {error}")
-
-    def _take_transforms(self, message: Any) -> None:
         for placed in transforms_of(message):
             self._frames.add(placed)
 
-    def _take_odometry(self, message: Any, now_s: float) -> None:
+    @_guarded
+    def hear_odometry(self, message: Any, now_s: float) -> None:
+        """Take a ``nav_msgs/Odometry`` that came at a time of the caller's clock [s]."""
         at, pose = stamp_of(message), odometry_of(message)
         if self._odometry and at <= self._odometry[-1][0]:
             return  # out of order, or a clock that was set back: late before long
@@ -130,7 +131,9 @@ class Driver:
         self._heard["odometry"] = now_s
         self._advance(now_s)
 
-    def _take_scan(self, message: Any, now_s: float) -> None:
+    @_guarded
+    def hear_scan(self, message: Any, now_s: float) -> None:
+        """Take a ``sensor_msgs/LaserScan`` that came at a time of the caller's clock [s]."""
         self._pending = stamp_of(message), message.header.frame_id.lstrip("/"), scan_of(message)
         self._advance(now_s)
 

@@ -28,12 +28,12 @@ _REMEDY = (
 class Topics:
     """Names of what it hears and says."""
 
-    scan: str = "/scan"
-    odom: str = "/odom"
-    cmd_vel: str = "/cmd_vel"
-    map: str = "/map"
-    pose: str = "/pose"
-    stamped: bool = False  # cmd_vel as a TwistStamped
+    scan: str
+    odom: str
+    cmd_vel: str
+    map: str
+    pose: str
+    stamped: bool  # cmd_vel as a TwistStamped
 
 
 def check_ros() -> None:

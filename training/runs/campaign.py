@@ -20,15 +20,7 @@ from training.runs.progress import Progress
 from training.runs.running import versions, write_json
 from training.runs.typed import parts_of
 
-__all__ = [
-    "Pool",
-    "Workers",
-    "backend_names",
-    "installed_version",
-    "keep_settings",
-    "run_all",
-    "worker_pool",
-]
+__all__ = ["Pool", "Workers", "backend_names", "installed_version", "keep_settings", "run_all", "worker_pool"]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

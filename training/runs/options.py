@@ -12,17 +12,16 @@ import typer
 from typer.core import TyperCommand
 
 from training.runs.compiling import compiling_shown
+from training.runs.typed import LAST_SEED
 
 if TYPE_CHECKING:
     from training.runs.campaign import Workers as Whose
 
 __all__ = [
-    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "Json", "MaxSteps", "Noise", "Out",
-    "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam", "Starts",
-    "UnknownStarts", "Workers", "workers_of",
+    "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "JointBelief", "Json", "MaxSteps",
+    "Noise", "Out", "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam",
+    "Starts", "UnknownStarts", "Workers", "workers_of",
 ]  # fmt: skip
-
-_LAST_SEED = 2**31 - 1
 
 Backends = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
 Communication = Annotated[
@@ -58,11 +57,11 @@ Range = Annotated[
 ]
 Robot = Annotated[str | None, typer.Option(help="Robot preset, with its lidar and noise.  [default: youbot]")]
 Rooms = Annotated[str | None, typer.Option(help="Generator of the rooms.  [default: apartment]")]
-RoomSeed = Annotated[int, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.")]
+RoomSeed = Annotated[int, typer.Option(min=0, max=LAST_SEED, help="Of the room and the noise.")]
 RoomSeedOrNone = Annotated[
-    int | None, typer.Option(min=0, max=_LAST_SEED, help="Of the room and the noise.  [default: 0]")
+    int | None, typer.Option(min=0, max=LAST_SEED, help="Of the room and the noise.  [default: 0]")
 ]
-Seed = Annotated[int, typer.Option(min=0, max=_LAST_SEED)]
+Seed = Annotated[int, typer.Option(min=0, max=LAST_SEED)]
 Seeds = Annotated[str, typer.Option(help="3, 0:9 (both included) or 1,4,7.")]
 Slam = Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")]
 Starts = Annotated[

@@ -5,16 +5,18 @@ from __future__ import annotations
 import multiprocessing
 import os
 import queue
+import re
 import signal
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import cv2
 
-__all__ = ["ONE_THREAD", "ProcessPool", "one_thread_each", "process_pool", "start_worker"]
+__all__ = ["ONE_THREAD", "ProcessPool", "memory_mb", "one_thread_each", "process_pool", "start_worker"]
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
@@ -73,6 +75,16 @@ def start_worker() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     cv2.setNumThreads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def memory_mb(what: str = "VmRSS") -> float:
+    """Return the memory [MB of 2²⁰ bytes] that this process has resident; 0 where the system does not tell.
+
+    ``VmHWM`` is the most that it ever had, ``VmSize`` all that it has reserved.
+    """
+    status = Path("/proc/self/status")
+    found = re.search(rf"{what}:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    return int(found[1]) / 1024.0 if found else 0.0
 
 
 def _end_with_parent() -> None:

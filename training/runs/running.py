@@ -1,4 +1,4 @@
-"""What every long run needs: lists as typed, files that come together, values as JSON has them, versions."""
+"""What every long run needs: files that come together, values as JSON has them, versions."""
 
 from __future__ import annotations
 

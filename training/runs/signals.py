@@ -30,10 +30,12 @@ class _Flag:
 def interrupt_flag() -> Iterator[threading.Event]:
     """Turn Ctrl-C into a flag, so that it takes effect between two steps; the second one breaks off at once.
 
-    Within another such block, that one is told, too, when this one ends.
+    Within another such block, that one is told, too, when this one ends. In a worker, which leaves both signals to
+    its parent, it is never pressed.
     """
     flag = _Flag()
-    if threading.current_thread() is not threading.main_thread():
+    worker = all(signal.getsignal(each) is signal.SIG_IGN for each in (signal.SIGINT, signal.SIGTERM))
+    if worker or threading.current_thread() is not threading.main_thread():
         yield flag.pressed  # only the main thread may handle signals
         return
     before = signal.signal(signal.SIGINT, flag)

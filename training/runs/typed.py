@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from training.runs.errors import BadInput
 
-__all__ = ["parts_of", "whole_numbers"]
+__all__ = ["LAST_SEED", "parts_of", "whole_numbers"]
+
+LAST_SEED = 2**31 - 1
+"""The largest seed that may be typed."""
 
 
 def parts_of(text: str) -> list[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,14 +17,15 @@ import typer
 import agents
 from mecanum_env.arguments import make_config
 from slam.formats import atomic_write
-from training.episodes.explore import prepare, run
+from training.episodes.explore import run_whole
 from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number
+from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
-from training.runs.running import write_json
+from training.runs.running import versions, write_json
 from training.runs.typed import parts_of
 
 __all__ = ["study", "summarise"]
@@ -33,6 +33,8 @@ __all__ = ["study", "summarise"]
 Job = tuple[str, str, int, str, str]  # rooms, backend, seed, agent, noise
 Row = dict[str, Any]
 
+FILES = ("episodes.csv", "summary.json")
+STORE = "episodes.jsonl"
 _MEDIANS = (
     "coverage", "time_s", "time_to_95_s", "path_length_m", "map_iou", "corner_mean_m", "corner_max_m",
     "ate_rmse_m", "final_position_error_m", "final_heading_error_rad", "anees", "landmarks",
@@ -43,10 +45,7 @@ def run_job(job: Job) -> Row:
     """Run one episode; return its metrics, and its pose NEES once a simulated second."""
     rooms, backend, seed, agent, noise = job
     with tempfile.TemporaryDirectory() as folder:
-        episode = prepare(out=Path(folder), agent=agent, rooms=rooms, slam=backend, seed=seed, noise=noise)
-        run(episode, lambda **_: None)
-    if episode.interrupted:  # what there is of it is no result
-        raise KeyboardInterrupt
+        episode = run_whole(out=Path(folder), agent=agent, rooms=rooms, slam=backend, seed=seed, noise=noise)
     every = round(1.0 / episode.config.step_s)
     nees = [round(float(v), 4) for v in episode.env.truth.record.nees[every::every]]
     return episode.metrics() | {"nees_each_s": nees, "noise": noise}
@@ -55,8 +54,8 @@ def run_job(job: Job) -> Row:
 _NOT_IN_CSV = ("nees_each_s", "floor_plan", "wall_time_s", "decision_ms_median")
 
 
-def summarise(rows: list[Row]) -> list[Row]:
-    """Return one summary per rooms and backend."""
+def summarise(rows: list[Row], seeds: str) -> list[Row]:
+    """Return one summary per rooms and backend; it names the seeds as typed."""
     out = []
     for rooms, backend in sorted({(r["rooms"], r["slam"]) for r in rows}):
         group = [r for r in rows if (r["rooms"], r["slam"]) == (rooms, backend)]
@@ -66,7 +65,7 @@ def summarise(rows: list[Row]) -> list[Row]:
             "noise": group[0]["noise"],
             "agent": group[0]["agent"],
             "episodes": len(group),
-            "seeds": f"{group[0]['seed']}:{group[-1]['seed']}",
+            "seeds": seeds,
             "covered_95": sum(r["coverage"] >= 0.95 for r in group),
             "without_collision": sum(r["collisions"] == 0 for r in group),
         }
@@ -109,10 +108,6 @@ def _table(summaries: list[Row]) -> str:
     return markdown_table(head, rows)
 
 
-def _shown(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value
-
-
 def study(
     rooms: Annotated[
         str, typer.Option(help="Generators of rooms, separated by commas.")
@@ -134,11 +129,11 @@ def study(
                 make_config(rooms=kind, slam=backend, noise=noise)
         jobs = [(r, b, s, agent, noise) for s in parse_seeds(seeds) for r in kinds for b in backends]
     who = workers_of(workers, ray)
-    every = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")
+    keep_settings(out, {"version": installed_version()}, FILES)
+    every = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     rows = [every[job] for job in sorted(set(jobs))]
-    summaries = summarise(rows)
-    versions = {name: version(name) for name in ("mecanum-slam", "numpy", "numba", "pymunk", "gymnasium")}
-    write_json(out / "summary.json", {"versions": versions, "summaries": summaries})
-    shown = [{key: _shown(value) for key, value in row.items() if key not in _NOT_IN_CSV} for row in rows]
-    atomic_write(out / "episodes.csv", csv_table(shown))
+    summaries = summarise(rows, seeds)
+    write_json(out / "summary.json", {"versions": versions(), "summaries": summaries})
+    shown = [{key: value for key, value in row.items() if key not in _NOT_IN_CSV} for row in rows]
+    atomic_write(out / "episodes.csv", csv_table(shown, digits=6))
     print(_table(summaries))

@@ -23,7 +23,7 @@ from mecanum_env.env import ExploreEnv
 from slam.backend import Backend
 from slam.formats import atomic_write
 from slam.metrics.measures import nees_band
-from slam.settings import unknown_name
+from slam.settings import check_name
 from slam.types import Array
 from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
@@ -129,8 +129,7 @@ def consistency(
     world = WORLDS.get(rooms)
     with bad_input():
         names = backend_names(backends, without=_NOT_HERE | (not_observing() if world else {}))
-        if world is None and rooms not in room_registry.names():
-            raise unknown_name("rooms", rooms, (*WORLDS, *room_registry.names()))
+        check_name("rooms", rooms, (*WORLDS, *room_registry.names()))
         if not (math.isfinite(noise) and noise > 0):
             raise ValueError(f"--noise must be a finite number above 0, got {noise}")
         if world is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig, to_toml
 from slam.formats import atomic_write
-from training.episodes.explore import prepare, run
+from training.episodes.explore import run_whole
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import csv_table, markdown_table
 from training.runs.campaign import backend_names, keep_settings
@@ -88,13 +88,10 @@ def run_job(job: Job) -> Row:
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "world.toml"
         config.write_text(to_toml(world), encoding="utf-8")
-        episode = prepare(
+        episode = run_whole(
             out=Path(folder) / "out", config=config, agent=agent, seed=seed,
             max_steps=round(_LIMIT_S / world.step_s),
         )  # fmt: skip
-        run(episode, lambda **_: None)
-    if episode.interrupted:  # what there is of it is no result
-        raise KeyboardInterrupt
     metrics = episode.metrics()
     return {"rooms": world.rooms, "agent": agent} | {key: metrics[key] for key in _KEPT}
 

@@ -29,6 +29,7 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.ground_truth import GroundTruth
 from slam.geometry import transform_points
 from slam.types import Array
+from training.truth.places import cells_per_tile
 from training.truth.sights import Eye
 
 __all__ = ["Tiles", "least_length", "lower_bound", "shortest_hops"]
@@ -93,10 +94,10 @@ class Tiles:
         nodes[tuple(start)] = True
         reached = np.isfinite(_distances(nodes, start[None]))
         self.places = np.vstack([start[None], np.argwhere(reached[::_VIEW, ::_VIEW]) * _VIEW])
-        cells = _by_tile(ground.mappable)
+        cells = cells_per_tile(ground.mappable, _TILE).ravel()
         eye = Eye(ground, lidar)
         eyes = (self.places[:, ::-1] + 0.5 + corner) * cell
-        sees = np.array([_by_tile(eye.sees(point) & ground.mappable) > 0 for point in eyes])
+        sees = np.array([cells_per_tile(eye.sees(point) & ground.mappable, _TILE).ravel() > 0 for point in eyes])
         kept = (cells > 0) & sees.any(axis=0)
         self.cells, self.sees = np.floor((1.0 - _LEAK) * cells[kept]).astype(np.int64), sees[:, kept]
         starts = [self.places[:1], *(self.places[seen] for seen in self.sees.T)]
@@ -106,13 +107,6 @@ class Tiles:
         self.apart[:, 1:] = np.maximum(to_tiles * cell / _LONGER - _RASTER_M - 2.0 * _REACH_M, 0.0)
         self.apart[0, 1:] = np.maximum(to_tiles[0] * cell / _LONGER - _RASTER_M - _REACH_M, 0.0)
         self.apart[1:, 0] = self.apart[0, 1:]
-
-
-def _by_tile(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return how many cells are set in each tile ``(tiles,)``."""
-    rows, cols = (np.arange(0, side, _TILE) for side in cells.shape)
-    along = np.add.reduceat(cells, rows, axis=0, dtype=np.int64)
-    return np.asarray(np.add.reduceat(along, cols, axis=1).ravel())
 
 
 def least_length(apart: Array, cells: NDArray[np.int64], spare: float) -> float:

@@ -62,8 +62,8 @@ class TruePlaces:
         self._whole = cells_per_tile(ground.mappable)
         self.map = true_cost_map(ground, planner, robot)
         reached = np.isfinite(travel_costs(self.map).cost)
-        self.stride = max(1, round(_PLACES_M / self.map.resolution))
-        self.cells = np.argwhere(reached[:: self.stride, :: self.stride]) * self.stride
+        stride = max(1, round(_PLACES_M / self.map.resolution))
+        self.cells = np.argwhere(reached[::stride, ::stride]) * stride
         self.distance = np.array([self.costs_from(cell) for cell in self.cells]).reshape(-1, len(self.cells))
         self.sight = self._sights(lidar)
 
@@ -105,12 +105,11 @@ def true_cost_map(ground: GroundTruth, planner: PlannerConfig, robot: RobotConfi
     return cost_maps.build(belief, planner, robot)
 
 
-def cells_per_tile(cells: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the number of cells set in each tile."""
-    rows, cols = (-(-side // TILE) for side in cells.shape)
-    padded = np.zeros((rows * TILE, cols * TILE), dtype=np.int64)
-    padded[: cells.shape[0], : cells.shape[1]] = cells
-    return np.asarray(padded.reshape(rows, TILE, cols, TILE).sum(axis=(1, 3)))
+def cells_per_tile(cells: NDArray[np.bool_], side: int = TILE) -> NDArray[np.int64]:
+    """Return the number of cells set in each tile ``(rows, columns)`` of so many cells a side."""
+    rows, cols = (np.arange(0, length, side) for length in cells.shape)
+    along = np.add.reduceat(cells, rows, axis=0, dtype=np.int64)
+    return np.asarray(np.add.reduceat(along, cols, axis=1))
 
 
 @njit(cache=True, nogil=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from training.episodes.explore import ENDINGS, EXTRAS, FILES, Course, Episode
 from training.episodes.recording import Recording
 from training.episodes.team import FILES as TEAM_FILES
 from training.episodes.team import ROBOT_FILE, TeamEpisode
-from training.runs.running import versions, written_together
+from training.runs.running import versions, write_json, written_together
 from training.views.film import check_video
 from training.views.mcap_file import check_mcap, write_mcap
 from training.views.report_page import episode_page
@@ -122,7 +121,6 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     page = episode_page(
         env, recording, title=f"{where}: {who} on {episode.config.slam}",
         metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
-        command="mecanum explore --config config.toml --out again",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
     title = f"{where}, {who} on {episode.config.slam}"
@@ -131,7 +129,7 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
         write_mcap(recording, folder / EXTRAS["mcap"], robot=robot, lidar=episode.config.lidar, about=about)
     if "rerun" in extras:
         write_rerun(recording, folder / EXTRAS["rerun"], robot=robot, lidar=episode.config.lidar, name=title)
-    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
     return metrics
 
 

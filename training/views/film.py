@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,13 +91,6 @@ class TeamCamera:
         self._write(render_team(team))
 
 
-class _Takes(Protocol):
-    """A camera, of one robot or of a team."""
-
-    def take(self, filmed: Any, goal: Any, /) -> None:
-        """Film it as it is now."""
-
-
 @contextmanager
 def film_episode(
     path: str | Path, config: EnvConfig, *, speed: int = 1, substeps: bool = False
@@ -124,7 +117,7 @@ def film_episode(
 class Film:
     """A camera whose film may fail: then it films no more, and what it was told of the episode goes on."""
 
-    def __init__(self, path: Path, camera: _Takes, stack: ExitStack) -> None:
+    def __init__(self, path: Path, camera: Camera | TeamCamera, stack: ExitStack) -> None:
         self._path, self._camera, self._open = path, camera, stack
         self.failure: OSError | None = None
 
@@ -152,7 +145,7 @@ def filmed(out: Path, config: EnvConfig, *, substeps: bool = False, team: bool =
     with tempfile.TemporaryDirectory(prefix=".filming-", dir=out) as folder, ExitStack() as stack:
         path = Path(folder) / "episode.mp4"
         if team:
-            camera: _Takes = TeamCamera(stack.enter_context(film(path, fps=1.0 / config.step_s)))
+            camera: Camera | TeamCamera = TeamCamera(stack.enter_context(film(path, fps=1.0 / config.step_s)))
         else:
             camera = stack.enter_context(film_episode(path, config, substeps=substeps))
         yield Film(path, camera, stack)

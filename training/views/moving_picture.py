@@ -15,8 +15,9 @@ import typer
 from numpy.typing import NDArray
 
 from training.episodes import explore
-from training.runs.errors import Interrupted, bad_input
-from training.views.film import Camera, film
+from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.options import Seed
+from training.views.film import Camera, check_video, film
 
 __all__ = ["moving_picture", "study"]
 
@@ -60,15 +61,18 @@ class _Enough(Exception):
 def study(
     agent: Annotated[str, typer.Option(help="Who explores.")] = "brisk-tour",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1)] = 4,
+    seed: Seed = 4,
     speed: Annotated[int, typer.Option(min=1, max=100, help="Times as fast as true.")] = 4,
     width: Annotated[int, typer.Option(min=16, max=4096, help="Of the picture [pixels].")] = 800,
     until: Annotated[float, typer.Option(min=0, max=1, help="Coverage at which it ends.")] = 0.97,
     out: Annotated[Path, typer.Option(metavar="FILE.gif")] = Path("out/explore.gif"),
 ) -> None:
     """Make the README's moving picture of one episode."""
-    with bad_input():
-        out.parent.mkdir(parents=True, exist_ok=True)
-        episode = explore.prepare(out=out.parent, agent=agent, rooms=rooms, seed=seed)
-        count = moving_picture(episode, out, speed=speed, width=width, until=until)
+    if width % 2:
+        raise BadInput(f"--width {width} is odd; give {width - 1} or {width + 1}: colours are kept for two pixels")
+    check_video()
+    check_writable(out.parent, [out.name])
+    episode = explore.prepare(out=out.parent, agent=agent, rooms=rooms, seed=seed)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    count = moving_picture(episode, out, speed=speed, width=width, until=until)
     print(f"{out}: {count} frames, {out.stat().st_size / 1e6:.1f} MB")

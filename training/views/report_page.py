@@ -25,11 +25,10 @@ from mecanum_env.physics.robot import wheel_positions
 from mecanum_env.views.canvas import Canvas, View
 from mecanum_env.views.paint import paint_plan
 from mecanum_env.views.pictures import episode_view
-from slam.files import plain_name
 from slam.geometry import inverse
 from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
-from training.figures.page import HEAD, security_policy, text_html
+from training.figures.page import HEAD, name_html, security_policy, text_html
 from training.figures.page_style import STYLE
 
 if TYPE_CHECKING:
@@ -57,7 +56,6 @@ Arrays = dict[str, NDArray[Any]]
 
 def episode_page(
     env: ExploreEnv, recording: Recording, *, title: str, metrics: Mapping[str, Any], ending: str, config: str,
-    command: str,
 ) -> str:  # fmt: skip
     """Return the page.
 
@@ -67,8 +65,8 @@ def episode_page(
         At the end of the episode: for the true plan, and what the robot is like.
     recording : Recording
         What happened.
-    title, ending, command : str
-        What was explored by whom, why it ended, and how to have it again.
+    title, ending : str
+        What was explored by whom, and why it ended.
     metrics : mapping
         As in ``metrics.json``.
     config : str
@@ -82,7 +80,6 @@ def episode_page(
         "ENDING": text_html(ending),
         "TILES": tiles(first_asked(metrics)),
         "METRICS": metrics_table(metrics),
-        "COMMAND": text_html(command),
         "CONFIG": text_html(config),
         "SCRIPT": assets(_SCRIPTS),
     })  # fmt: skip
@@ -294,5 +291,5 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
         if name in _WALL_CLOCK:
             continue
         text = "–" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-        rows.append(f"<tr><th>{escape(name)}</th><td>{escape(plain_name(text, 400))}</td></tr>")
+        rows.append(f"<tr><th>{escape(name)}</th><td>{name_html(text, 400)}</td></tr>")
     return "".join(rows)

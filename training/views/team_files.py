@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from training.episodes.explore import ENDINGS
 from training.episodes.recording import Recording
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
+from training.runs.running import write_json
 from training.views.episode_files import config_text, episode_folder, place_of, who_of
 from training.views.team_page import team_page
 
@@ -65,8 +65,7 @@ def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recordi
         episode, recordings, metrics=metrics, config=config,
         title=f"{place_of(episode)}: {team.team.robots} robots, {who} on {episode.config.slam}",
         ending=f"{episode.end}: {ENDINGS[episode.end]}",
-        command="mecanum explore --config config.toml --out again",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
-    atomic_write(folder / "metrics.json", json.dumps(metrics, indent=2, ensure_ascii=False) + "\n")
+    write_json(folder / "metrics.json", metrics)
     return metrics

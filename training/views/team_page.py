@@ -43,7 +43,7 @@ _COLUMNS = (
 
 def team_page(
     episode: TeamEpisode, recordings: Sequence[Recording], *, title: str, metrics: Mapping[str, Any], ending: str,
-    config: str, command: str,
+    config: str,
 ) -> str:  # fmt: skip
     """Return the page; parameters as of :func:`training.views.report_page.episode_page`."""
     team, log = episode.team, episode.log
@@ -72,7 +72,6 @@ def team_page(
         "ROBOTS": _robots_table(metrics["per_robot"]),
         "MAPS": "".join(f'<option value="{k}">robot {k}</option>' for k in range(n)),
         "METRICS": metrics_table({key: v for key, v in metrics.items() if key != "per_robot"}),
-        "COMMAND": text_html(command),
         "CONFIG": text_html(config),
         "SCRIPT": assets(_SCRIPTS),
     }, style="".join(f".robot-{k} {{ --c: {colour(k)} }}\n" for k in range(n)))  # fmt: skip

@@ -16,12 +16,12 @@ from training.benchmark.store import FILE, Store
 
 
 def test_ctrl_c_in_an_episode_leaves_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    from training.benchmark import episode as benchmark_episode
+    from training.episodes import explore
 
-    def pressed(found: Any, progress: Any) -> None:
+    def pressed(found: Any, *_: Any) -> None:
         found.end, found.interrupted = "interrupted", True
 
-    monkeypatch.setattr(benchmark_episode, "run", pressed)
+    monkeypatch.setattr(explore, "run", pressed)
     with pytest.raises(KeyboardInterrupt):
         run_job(EpisodeJob(
             suite="rooms", place="rectangular", rooms="rectangular", seed=0, agent="random", slam="odometry",

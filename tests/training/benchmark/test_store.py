@@ -20,9 +20,7 @@ from training.studies.reliability.files import results
 
 @pytest.fixture(scope="module")
 def sound() -> bytes:
-    content = results.store()["results.sqlite"]
-    assert isinstance(content, bytes)
-    return content
+    return results.store()["results.sqlite"]
 
 
 def stored(folder: Path, sound: bytes, script: str = "") -> Path:

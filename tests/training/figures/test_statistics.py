@@ -30,8 +30,7 @@ def test_iqm_is_the_mean_of_the_middle(n: int) -> None:
     np.testing.assert_allclose(stats.trim_mean(values, 0.25), expected)
     np.testing.assert_allclose(median(np.stack([values, -values])), [np.median(values), -np.median(values)])
     np.testing.assert_allclose(iqm(values), expected)
-    for axis, both in ((-1, np.stack([values, 2 * values])), (0, np.column_stack([values, 2 * values]))):
-        np.testing.assert_allclose(iqm(both, axis=axis), [expected, 2 * expected])
+    np.testing.assert_allclose(iqm(np.stack([values, 2 * values])), [expected, 2 * expected])
 
 
 def test_an_iqm_is_not_moved_by_a_few_outliers() -> None:

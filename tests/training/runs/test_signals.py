@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from training.cli import main
+from training.runs.processes import process_pool
 from training.runs.signals import heed_sigterm, interrupt_flag
 
 
@@ -40,6 +41,18 @@ def test_sigterm_takes_effect_between_two_steps() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.01)
         assert came.is_set() and interrupted.is_set()
+
+
+def test_a_worker_leaves_ctrl_c_to_its_parent() -> None:
+    with process_pool(1) as pool:
+        assert pool.submit(_pressed_twice).result() is False
+
+
+def _pressed_twice() -> bool:
+    with interrupt_flag() as interrupted:
+        for _ in range(2):
+            signal.raise_signal(signal.SIGINT)
+        return interrupted.is_set()
 
 
 @pytest.mark.parametrize("broken", [False, True])

@@ -1,12 +1,14 @@
-"""``mecanum study accuracy``: what it refuses, before any episode is run."""
+"""``mecanum study accuracy``: what it refuses before any episode is run, and its summary."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from training.cli import main
+from training.studies import accuracy
 
 
 @pytest.mark.parametrize(
@@ -26,3 +28,29 @@ def test_bad_options_are_refused_in_one_line(
     error = capsys.readouterr().err
     assert hint in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("study", ["accuracy", "team-filters"])
+def test_a_folder_that_is_not_to_be_used_is_refused_before_any_work(
+    study: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    older = tmp_path / "older"
+    older.mkdir()
+    (older / "settings.json").write_text('{"version": "0.0.1"}')
+    for out in (tmp_path / "file", older):
+        assert main(["study", study, "--out", str(out)]) == 2
+        assert "choose another --out" in capsys.readouterr().err
+
+
+def test_the_summary_has_the_seeds_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = {name: 1.0 for name in accuracy._MEDIANS} | {"collisions": 0, "nees_each_s": [3.0, 3.0]}
+
+    def quick(job: accuracy.Job) -> accuracy.Row:
+        return row | dict(zip(("rooms", "slam", "seed", "agent", "noise"), job, strict=True))
+
+    monkeypatch.setattr(accuracy, "run_job", quick)
+    command = ["study", "accuracy", "--rooms", "cave", "--slam", "ekf", "--seeds", "1,4,7", "--workers", "1"]
+    assert main([*command, "--out", str(tmp_path)]) == 0
+    (summary,) = json.loads((tmp_path / "summary.json").read_text())["summaries"]
+    assert summary["seeds"] == "1,4,7" and summary["episodes"] == 3

@@ -9,6 +9,7 @@ import pytest
 
 from mecanum_env.config import from_toml
 from training.cli import main
+from training.episodes import explore
 from training.studies import accuracy, worlds
 
 FINE: worlds.Row = {
@@ -64,6 +65,6 @@ def test_who_knows_where_it_is_is_not_asked(tmp_path: Path, capsys: pytest.Captu
     ("study", "job"), [(worlds, (0, "ekf")), (accuracy, ("rectangular", "ekf", 0, "nearest-frontier", "nominal"))]
 )
 def test_an_episode_that_was_broken_off_is_no_result(study, job, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(study, "run", lambda episode, _: setattr(episode, "interrupted", True))
+    monkeypatch.setattr(explore, "run", lambda episode, *_: setattr(episode, "interrupted", True))
     with pytest.raises(KeyboardInterrupt):
         study.run_job(job)

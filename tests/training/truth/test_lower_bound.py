@@ -15,13 +15,14 @@ from mecanum_env.rooms import make
 from training.truth.lower_bound import (
     _LEAK,
     _REACH_M,
+    _TILE,
     Tiles,
-    _by_tile,
     _distances,
     least_length,
     lower_bound,
     shortest_hops,
 )
+from training.truth.places import cells_per_tile
 from training.truth.sights import Eye
 
 ROBOT, LIDAR = RobotConfig(), LidarConfig()
@@ -81,7 +82,7 @@ def test_a_place_nearby_sees_every_tile_of_which_more_than_a_rim_is_seen_from_an
     ground = GroundTruth(plan, np.array(plan.start), robot=ROBOT, lidar=LIDAR, resolution=0.05)
     tiles = Tiles(ground, robot=ROBOT, lidar=LIDAR)
     eye, rng, cell = Eye(ground, LIDAR), np.random.default_rng(seed), ground.resolution
-    every = _by_tile(ground.mappable)
+    every = cells_per_tile(ground.mappable, _TILE).ravel()
     looked_at = every > 0
     assert looked_at.sum() == tiles.sees.shape[1]
     centres = (tiles.places[:, ::-1] + 0.5 + np.array(ground.lattice_origin[::-1])) * cell
@@ -90,7 +91,7 @@ def test_a_place_nearby_sees_every_tile_of_which_more_than_a_rim_is_seen_from_an
         row, col = np.floor(point[::-1] / cell).astype(int) - np.array(ground.lattice_origin)
         if not ground.mappable[row, col]:
             continue
-        seen = (_by_tile(eye.sees(point) & ground.mappable) > _LEAK * every)[looked_at]
+        seen = (cells_per_tile(eye.sees(point) & ground.mappable, _TILE).ravel() > _LEAK * every)[looked_at]
         near = np.hypot(*(centres - point).T) <= _REACH_M
         assert not (seen & ~tiles.sees[near].any(axis=0)).any()
 
@@ -110,4 +111,4 @@ def test_the_bound_grows_with_what_must_be_seen():
 def test_tiles_at_the_rim_are_counted_too():
     cells = np.zeros((25, 13), dtype=bool)
     cells[[0, 11, 12, 24], [0, 11, 12, 12]] = True
-    np.testing.assert_array_equal(_by_tile(cells), [2, 0, 0, 1, 0, 1])
+    np.testing.assert_array_equal(cells_per_tile(cells, 12), [[2, 0], [0, 1], [0, 1]])

@@ -20,6 +20,7 @@ from mecanum_env.config import EnvConfig
 from mecanum_env.views.render import FRAME_SHAPE, render_frame
 from slam.geometry import compose, exp, inverse, log
 from tests.training.recorded_episode import explore
+from training.cli import main
 from training.runs.errors import BadInput
 from training.views.film import Camera, check_video, film, film_episode
 
@@ -205,3 +206,15 @@ def test_gymnasiums_own_recorder_films_the_environment(tmp_path: Path) -> None:
     # Eleven were recorded; moviepy counts them by a sum of tenths, which may fall short of 1.1 s.
     assert frames in (10, 11) and seconds == pytest.approx(frames / 10, abs=0.02)
     assert frames_of(path)[0]["size"] == FRAME_SHAPE[::-1]
+
+
+def test_the_readme_s_picture_says_at_once_what_it_cannot_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("training.episodes.explore.run", None)  # nothing is explored before
+    out = tmp_path / "explore.gif"
+    assert main(["study", "moving-picture", "--width", "801", "--out", str(out)]) == 2
+    assert "give 800 or 802" in capsys.readouterr().err
+    out.mkdir()
+    assert main(["study", "moving-picture", "--out", str(out)]) == 2
+    assert "it is a folder" in capsys.readouterr().err

@@ -41,7 +41,7 @@ def measure(**options: Any) -> dict[str, Any]:
         if recorded:
             kept, recording = episode, recorder.recording()
     began = time.process_time()
-    page = episode_page(kept.env, recording, title="", metrics=kept.metrics(), ending="", config="", command="")
+    page = episode_page(kept.env, recording, title="", metrics=kept.metrics(), ending="", config="")
     without, with_it = (statistics.mean(spent[recorded]) for recorded in (False, True))
     return {
         "seed": options["seed"], "episode_s": float(recording.times[-1]), "cpu_s": without,
@@ -67,7 +67,7 @@ def study(
             "floor_plan": floor_plan, "max_steps": max_steps,
         }  # fmt: skip
         if not rows:
-            explore.run(explore.prepare(**given), lambda **_: None, [Recorder()])  # compile first
+            explore.run_whole([Recorder()], **given)  # compile first
         rows.append(measure(**given))
         print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     medians = {key: statistics.median(row[key] for row in rows) for key in rows[0] if key != "seed"}

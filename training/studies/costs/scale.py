@@ -6,7 +6,6 @@ measured.
 
 from __future__ import annotations
 
-import resource
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -22,12 +21,13 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.formats import atomic_write
 from slam.types import Array
-from training.episodes.explore import Episode, prepare, run
+from training.episodes.explore import Episode, prepare, run, run_whole
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import BadInput, bad_input
 from training.runs.options import Out, Seed
+from training.runs.processes import memory_mb
 from training.runs.rows import resume
 from training.runs.running import write_json
 from training.runs.typed import parts_of
@@ -76,11 +76,13 @@ def explore(job: Job) -> dict[str, Any]:
     takes between two steps where it does not choose and where it does (``driving_ms``, ``decision_ms``).
     """
     plan, agent, seed, minutes, folder = job
-    warm = prepare(out=Path(folder), agent=agent, floor_plan=Path(plan), seed=seed, max_steps=300)
-    run(warm, _silent)  # compiles what is still to be compiled
-    episode = prepare(out=Path(folder), agent=agent, floor_plan=Path(plan), seed=seed)
+    asked: dict[str, Any] = {"out": Path(folder), "agent": agent, "floor_plan": Path(plan), "seed": seed}
+    run_whole(**asked, max_steps=300)  # compiles what is still to be compiled
+    episode = prepare(**asked)
     watch = _Watch(episode, 60.0 * minutes)
-    run(episode, _silent, [watch])
+    run(episode, lambda **_: None, [watch])
+    if episode.interrupted:
+        raise KeyboardInterrupt
     area, step, rest, chose = np.array(watch.rows).T
     choice = chose > 0.0
     rows = []
@@ -97,15 +99,11 @@ def explore(job: Job) -> dict[str, Any]:
     return {
         "plan": Path(plan).stem, "agent": agent, "area_m2": episode.env.truth.ground.plan.area_m2,
         "end": "minutes" if episode.wall_time_s > 60.0 * minutes else episode.end,
-        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "memory_mb": memory_mb("VmHWM"),
         "step_ms": _spread(step), "driving_ms": _spread(rest[~choice]), "decision_ms": _spread(rest[choice]),
         **{key: metrics[key] for key in kept},
         "rows": rows,
     }  # fmt: skip
-
-
-def _silent(**_: Any) -> None:
-    pass
 
 
 def _spread(values: Array) -> dict[str, float] | None:

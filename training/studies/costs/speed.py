@@ -19,9 +19,12 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
 from training.figures.tables import text_table
+from training.runs.processes import memory_mb
 from training.studies.costs import peers
 
-__all__ = ["REPEATS", "measure", "run"]
+__all__ = ["ID", "REPEATS", "make_env", "measure", "run", "settings_of", "unwrapped"]
+
+ID = "mecanum_env:mecanum_env/Explore-v0"
 
 REPEATS = 10
 """How often, at least, each recorded step is driven again."""
@@ -91,7 +94,7 @@ class _Stopwatch:
 
 def _record(env: gymnasium.Env[Observation, Any], steps: int, seed: int) -> list[tuple[int, list[Any]]]:
     """Explore until there are ``steps`` actions; return them by episode, with its seed."""
-    inner = _unwrapped(env)
+    inner = unwrapped(env)
     agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
     episodes: list[tuple[int, list[Any]]] = []
     total = 0
@@ -114,7 +117,7 @@ def _replay(
     env: gymnasium.Env[Observation, Any], episodes: list[tuple[int, list[Any]]], watch: _Stopwatch | None
 ) -> tuple[list[float], list[int]]:
     """Drive recorded episodes again; return the time of each step [s] and the landmarks at each."""
-    inner = _unwrapped(env)
+    inner = unwrapped(env)
     times: list[float] = []
     landmarks: list[int] = []
     clock = time.perf_counter
@@ -133,15 +136,18 @@ def _replay(
     return times, landmarks
 
 
-def _make_env(rooms: str, slam: str, beams: int) -> gymnasium.Env[Observation, Any]:
-    return gymnasium.make(
-        "mecanum_env:mecanum_env/Explore-v0",
-        rooms=rooms, slam=slam, lidar={"beams": beams}, config={"coverage_target": 1.0},
-        max_episode_steps=mecanum_env.MAX_EPISODE_STEPS,
-    )  # fmt: skip
+def settings_of(rooms: str, slam: str, beams: int) -> dict[str, Any]:
+    """Return the settings of the environment that is measured."""
+    return {"rooms": rooms, "slam": slam, "lidar": {"beams": beams}, "config": {"coverage_target": 1.0}}
 
 
-def _unwrapped(env: gymnasium.Env[Observation, Any]) -> ExploreEnv:
+def make_env(settings: dict[str, Any]) -> gymnasium.Env[Observation, Any]:
+    """Return it as Gymnasium wraps it."""
+    return gymnasium.make(ID, max_episode_steps=mecanum_env.MAX_EPISODE_STEPS, **settings)
+
+
+def unwrapped(env: gymnasium.Env[Observation, Any]) -> ExploreEnv:
+    """Return the environment within."""
     inner = env.unwrapped
     assert isinstance(inner, ExploreEnv)
     return inner
@@ -153,10 +159,10 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
     An agent explores first, and its actions are driven again: one seed is one episode, so these are the very
     steps of an exploration, with its map and landmarks, but without the agent's own work in between.
     """
-    env = _make_env(rooms, slam, beams)
+    env = make_env(settings_of(rooms, slam, beams))
     episodes = _record(env, min(max(steps // REPEATS, 100), 20_000), seed)
     _replay(env, episodes, None)  # every buffer reaches the size that these rooms ask for
-    rss_before = _rss_mb()
+    rss_before = memory_mb()
     times: list[float] = []
     landmarks: list[int] = []
     replays: list[list[float]] = []
@@ -165,10 +171,10 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
         replays.append(more_times)
         times += more_times
         landmarks += more_landmarks
-    rss_after = _rss_mb()
+    rss_after = memory_mb()
     watch = _Stopwatch()
     timed, _ = _replay(env, episodes, watch)
-    inner = _unwrapped(env)
+    inner = unwrapped(env)
     # Rates of a tenth of the steps each: their median stands up to what else the machine is doing.
     parts = [part for part in np.array_split(np.array(times), 10) if len(part)]
     return {
@@ -191,8 +197,8 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
 
 def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict[str, Any]:
     """Measure ours and a peer in turn, over one exploration's rooms (``training.studies.costs.peers.compare``)."""
-    env = _make_env(rooms, slam, beams)
-    inner = _unwrapped(env)
+    env = make_env(settings_of(rooms, slam, beams))
+    inner = unwrapped(env)
     episodes = _record(env, min(max(steps // peers.ROUNDS, 1), 20_000), seed)
     drives = []
     for episode_seed, actions in episodes:
@@ -241,15 +247,3 @@ def _against(peer: dict[str, Any]) -> str:
         f"{peer['steps_per_second']:,.0f} steps per second, ratio {peer['ratio']:.2f} (medians of {rounds} rounds "
         f"of {peer['steps']:,} steps; theirs has no dynamics and no SLAM)"
     )
-
-
-def _rss_mb() -> float:
-    """Return this process's resident memory [MB]; 0 where the platform does not tell."""
-    try:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            pages = int(file.read().split()[1])
-    except OSError:
-        return 0.0
-    import resource
-
-    return pages * resource.getpagesize() / 1e6

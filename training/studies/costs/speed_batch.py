@@ -16,27 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 import agents
-import mecanum_env
-from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from training.figures.tables import text_table
 from training.studies.costs import peers
+from training.studies.costs.speed import ID, make_env, settings_of, unwrapped
 
 __all__ = ["WAYS", "measure", "run"]
 
-ID = "mecanum_env:mecanum_env/Explore-v0"
 WAYS = ("one", "sync", "async", "vector_entry_point")
 """One environment after the other, Gymnasium's two ways of many at once, and ours."""
 
-_ROUNDS = 5
 _LONGEST = 300  # steps of an episode: in apartments nobody is done by then
 
 Actions = NDArray[np.float32]
 Times = NDArray[np.float64]
-
-
-def _settings(rooms: str, slam: str, beams: int) -> dict[str, Any]:
-    return {"rooms": rooms, "slam": slam, "lidar": {"beams": beams}, "config": {"coverage_target": 1.0}}
 
 
 def _record(settings: dict[str, Any], seeds: Sequence[int], steps: int) -> tuple[Actions, list[FloorPlan]]:
@@ -44,9 +37,8 @@ def _record(settings: dict[str, Any], seeds: Sequence[int], steps: int) -> tuple
 
     And the rooms that it does so in.
     """
-    env = gymnasium.make(ID, max_episode_steps=mecanum_env.MAX_EPISODE_STEPS, **settings)
-    inner = env.unwrapped
-    assert isinstance(inner, ExploreEnv)
+    env = make_env(settings)
+    inner = unwrapped(env)
     ways, plans = [], []
     for seed in seeds:
         agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
@@ -63,7 +55,7 @@ def _record(settings: dict[str, Any], seeds: Sequence[int], steps: int) -> tuple
 
 def _drivers(settings: dict[str, Any], seeds: Sequence[int]) -> dict[str, tuple[Callable[[Actions], Times], Any]]:
     """Return for each way what drives recorded actions and tells how long each step of all took, and its envs."""
-    one = gymnasium.make(ID, max_episode_steps=mecanum_env.MAX_EPISODE_STEPS, **settings)
+    one = make_env(settings)
     clock = time.perf_counter
 
     def drive_one(actions: Actions) -> Times:
@@ -105,8 +97,8 @@ def measure(
     in ``steps_per_second_undisturbed`` the fastest time of each step counts. A peer does as many steps in the same
     rooms in every round; its ways are named after it.
     """
-    settings, seeds = _settings(rooms, slam, beams), range(seed, seed + envs)
-    actions, plans = _record(settings, seeds, min(max(steps // (envs * _ROUNDS), 1), _LONGEST))
+    settings, seeds = settings_of(rooms, slam, beams), range(seed, seed + envs)
+    actions, plans = _record(settings, seeds, min(max(steps // (envs * peers.ROUNDS), 1), _LONGEST))
     ways, done_each = _drivers(settings, seeds), actions.shape[0] * envs
     rates: dict[str, list[float]] = {}
     times: dict[str, list[Times]] = {way: [] for way in ways}
@@ -120,8 +112,8 @@ def measure(
             theirs = stack.enter_context(peers.peer_batch(peers.peer_setup(config), drives))
         for drive, _ in ways.values():
             drive(actions[:20])  # every buffer reaches its size
-        for done in range(_ROUNDS):
-            progress(done, _ROUNDS)
+        for done in range(peers.ROUNDS):
+            progress(done, peers.ROUNDS)
             for way, (drive, _) in ways.items():
                 times[way].append(drive(actions))
             found = {way: done_each / float(taken[-1].sum()) for way, taken in times.items()}
@@ -151,7 +143,9 @@ def run(
     if as_json:
         print(json.dumps(result))
         return result
-    print(f"{envs} environments, {result['steps']} steps, {result['cores']} cores; medians of {_ROUNDS} rounds")
+    print(
+        f"{envs} environments, {result['steps']} steps, {result['cores']} cores; medians of {peers.ROUNDS} rounds"
+    )
     best = result["steps_per_second_undisturbed"]
     rows = []
     for way, rate in result["steps_per_second"].items():

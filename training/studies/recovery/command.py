@@ -20,7 +20,7 @@ from training.figures.charts import png
 from training.figures.tables import number, text_table
 from training.runs.campaign import backend_names, installed_version, keep_settings
 from training.runs.errors import bad_input
-from training.runs.options import Backends, MaxSteps, Out, Ray, Seeds, Workers, workers_of
+from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
 from training.runs.running import write_json
 from training.runs.typed import parts_of
@@ -44,7 +44,7 @@ def study(
     ] = "apartment",
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     seeds: Seeds = "10000:10049",
-    max_steps: MaxSteps = 3000,
+    max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Step limit.")] = 3000,
     workers: Workers = None,
     ray: Ray = None,
     out: Out = Path("out/recovery"),
@@ -64,7 +64,7 @@ def study(
     who = workers_of(workers, ray)
     keep_settings(out, settings, FILES)
     jobs: list[Job] = [
-        (fault, name, agent, place, noise, seed, max_steps or 3000)
+        (fault, name, agent, place, noise, seed, max_steps)
         for seed in parse_seeds(seeds, most=_MOST_SEEDS) for fault in chosen for place in places for name in names
     ]  # fmt: skip
     rows = resume(out / STORE, jobs, run_job, workers=who, what="episodes")

@@ -15,14 +15,6 @@ from slam.types import Array, Scan
 
 __all__ = ["FAULTS", "Fault", "make_fault"]
 
-FAULTS = {
-    "none": "nothing goes wrong",
-    "teleport": "the robot is put down 1 m away, turned by 20°",
-    "wheel": "the floor under one wheel has no friction for 3 s",
-    "blind": "the lidar loses every beam for 10 s",
-}
-"""Name → what happens."""
-
 _AWAY_M, _TURN_RAD = 1.0, math.radians(20.0)
 _TRIES = 400  # at a place that the robot fits in, with a clear line to it
 
@@ -42,6 +34,8 @@ class Fault:
 
 
 class _Teleport(Fault):
+    """The robot is put down 1 m away, turned by 20°."""
+
     def begin(self, env: ExploreEnv, rng: np.random.Generator) -> bool:
         world, plan = env.truth.world, env.truth.ground.plan
         x, y, theta = world.pose.tolist()
@@ -55,6 +49,8 @@ class _Teleport(Fault):
 
 
 class _Wheel(Fault):
+    """The floor under one wheel has no friction for 3 s."""
+
     duration_s = 3.0
 
     def begin(self, env: ExploreEnv, rng: np.random.Generator) -> bool:
@@ -81,6 +77,8 @@ class _BlindLidar:
 
 
 class _Blind(Fault):
+    """The lidar loses every beam for 10 s."""
+
     duration_s = 10.0
 
     def begin(self, env: ExploreEnv, rng: np.random.Generator) -> bool:
@@ -93,9 +91,12 @@ class _Blind(Fault):
         env.lidar = self._seeing
 
 
+FAULTS: dict[str, type[Fault]] = {"none": Fault, "teleport": _Teleport, "wheel": _Wheel, "blind": _Blind}
+
+
 def make_fault(name: str) -> Fault:
     """Return a fault of :data:`FAULTS`."""
-    return {"none": Fault, "teleport": _Teleport, "wheel": _Wheel, "blind": _Blind}[name]()
+    return FAULTS[name]()
 
 
 def _crosses(a: Array, b: Array, segments: Array) -> bool:

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from slam.formats import atomic_write
-from slam.settings import unknown_name
+from slam.settings import check_name
 from training.figures.tables import text_table
 from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
@@ -59,8 +59,7 @@ def study(
     with bad_input():
         chosen = parts_of(parts)
         for name in chosen:
-            if name not in PARTS:
-                raise unknown_name("part", name, PARTS)
+            check_name("part", name, PARTS)
     sizes = {"files": files, "steps": steps, "kills": kills, "places": places, "soak": soak}
     who = workers_of(workers, ray)
     keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])

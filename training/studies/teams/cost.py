@@ -16,7 +16,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import tell_goal
 from training.figures.tables import text_table
 from training.runs.errors import bad_input
-from training.runs.options import Seeds
+from training.runs.options import Json, Seeds
 from training.runs.typed import whole_numbers
 from training.studies.exploring import AGENT
 
@@ -52,7 +52,7 @@ def study(
     robots: Annotated[str, typer.Option(help="How many robots, separated by commas.")] = "1,2,3,5,8",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     steps: Annotated[int, typer.Option(min=_WARM_UP + 1, max=1_000_000, help="Of each episode.")] = 250,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, nothing else.")] = False,
+    as_json: Json = False,
 ) -> None:
     """Measure a step of a team that explores, resets and decisions left out."""
     with bad_input():

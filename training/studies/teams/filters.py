@@ -32,6 +32,7 @@ from slam.types import Array
 from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
+from training.runs.campaign import installed_version, keep_settings
 from training.runs.errors import bad_input
 from training.runs.options import Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -43,7 +44,7 @@ __all__ = ["SINGLE", "TEAM", "explore", "study", "table"]
 Job = tuple[int, int, int, float, float, str]  # room seed, robots, steps, start's σ [m, rad], noise
 
 TEAM, SINGLE = "centralised", ("ekf-lines", "invariant-ekf")
-FILES = ("team_filters.json",)
+FILE = "team_filters.json"
 STORE = "episodes.jsonl"
 _CLEARANCE_M = 0.5  # of another robot's start
 _STREAM = 1000  # a robot's seed is the room's and as much more for each before it, so that its noise is its own
@@ -211,8 +212,9 @@ def study(
         chosen = parse_seeds(seeds)
         make_config(noise=noise)
     who = workers_of(workers, ray)
+    keep_settings(out, {"version": installed_version()}, [FILE])
     turn = math.radians(start_sigma_deg)
     jobs: list[Job] = [(seed, robots, steps, start_sigma_m, turn, noise) for seed in chosen]
     rows = list(resume(out / STORE, jobs, explore, workers=who, what="episodes").values())
     print(table(rows))
-    write_json(out / FILES[0], {"jobs": jobs, "rows": rows})
+    write_json(out / FILE, {"jobs": jobs, "rows": rows})

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 
 from tests.training.plans import write_room
 from training.cli import main
+from training.episodes import explore
 from training.studies.costs import scale
 
 
@@ -27,6 +29,17 @@ def test_a_room_is_explored_and_measured(tmp_path: Path, monkeypatch: pytest.Mon
     assert picture is not None and picture.shape[1] > 500
     monkeypatch.setattr(scale, "explore", None)  # it is all there
     assert main(command) == 0
+
+
+def test_an_exploration_that_was_broken_off_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken_off(episode: explore.Episode, *_: Any) -> None:
+        episode.interrupted = True
+
+    job = (str(write_room(tmp_path / "hall.png")), "nearest-frontier", 0, 1.0, str(tmp_path))
+    for module in (scale, explore):  # the one that is measured, then the one before it
+        monkeypatch.setattr(module, "run", broken_off)
+        with pytest.raises(KeyboardInterrupt):
+            scale.explore(job)
 
 
 def test_what_was_typed_wrong_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from gymnasium import spaces
 import agents
 import slam
 from mecanum_env.env import ExploreEnv
+from training.studies.reliability.steps import team
 from training.studies.reliability.steps.items import NOISES, ROOMS, TEAMS, Item, items
 from training.studies.reliability.steps.nonsense import no_actions, refuse
 from training.studies.reliability.steps.part import STEPS
@@ -48,6 +49,17 @@ def test_items_have_fewer_steps_where_one_is_dear() -> None:
     easy = ("ekf", "flip", 3000)
     cheap = [item.steps for item in singles if (item.slam, item.driver, item.limit) == easy]
     assert 20 <= max(dear) < 1000 < 4000 < min(cheap)
+
+
+def test_every_kind_of_nonsense_comes_to_a_team(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def refuse(step: Any, nonsense: Any, k: int, found: Findings) -> None:
+        seen.append(k % len(nonsense))
+
+    monkeypatch.setattr(team, "refuse", refuse)
+    run(Item("team", "rectangular", "odometry", "nominal", "youbot", "nonsense", "silent", 3000, 10_000, 180))
+    assert set(seen) == set(range(len(no_actions(3))))
 
 
 def test_other_seeds_give_other_digests_and_the_same_gives_the_same() -> None:

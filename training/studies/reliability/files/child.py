@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from training.runs.errors import BadInput
+from training.runs.processes import memory_mb
 from training.studies.reliability.files.readers import READERS, Reader
 
 __all__ = ["BOUND_MB", "main", "one_file"]
@@ -28,7 +29,6 @@ BOUND_MB = 3072
 """Memory that reading a file may take beyond what the process had before."""
 
 _LONGEST = 600  # characters of an error
-_STATUS = Path("/proc/self/status")
 
 
 def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, A
     path = case.put(folder)
     row: dict[str, Any] = {"index": index, "case": case.name, "by_command": reader.by_command(index)}
     _forget_peak()
-    before, began = _memory_mb("VmRSS"), time.process_time()
+    before, began = memory_mb("VmRSS"), time.process_time()
     try:
         reader.read(path, index)
         row["end"] = "read"
@@ -51,7 +51,7 @@ def one_file(reader: Reader, seed: int, index: int, folder: Path) -> dict[str, A
     except Exception as error:
         row["end"], row["said"] = "traceback", f"{type(error).__name__}: {str(error)[:200]}; {_where(error)}"
     row["seconds"] = round(time.process_time() - began, 3)
-    row["mb"] = round(_memory_mb("VmHWM") - before, 1)
+    row["mb"] = round(memory_mb("VmHWM") - before, 1)
     return row
 
 
@@ -76,13 +76,6 @@ def _where(error: BaseException | None) -> str:
     return " < ".join(f"{Path(f.filename).name}:{f.lineno} {f.name}" for f in reversed(ours[-4:]))
 
 
-def _memory_mb(name: str) -> float:
-    if not _STATUS.exists():
-        return 0.0
-    found = re.search(rf"{name}:\s+(\d+) kB", _STATUS.read_text())
-    return int(found[1]) / 1024.0 if found else 0.0
-
-
 def _forget_peak() -> None:
     try:
         Path("/proc/self/clear_refs").write_text("5")
@@ -96,7 +89,7 @@ def main() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # what a reader prints is no answer
     sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    soft = int((_memory_mb("VmSize") + BOUND_MB) * 2**20)
+    soft = int((memory_mb("VmSize") + BOUND_MB) * 2**20)
     resource.setrlimit(resource.RLIMIT_AS, (soft, resource.RLIM_INFINITY))
     warm: set[str] = set()
     for line in sys.stdin:

@@ -7,17 +7,16 @@ import json
 import struct
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
 from training.studies.reliability.files import samples
-from training.studies.reliability.files.samples import Files, Link, Pipe, as_json
+from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, as_json, one
 
 __all__ = ["CONFIGS", "IMAGES", "MAPS", "POLICIES"]
-
-Hostile = Mapping[str, Callable[[], Files]]
 
 _DEEP = 100_000
 
@@ -35,12 +34,8 @@ def _map(**values: object) -> Callable[[], Files]:
     return lambda: {"plan.yaml": "\n".join(lines).encode()}
 
 
-def _yaml(text: str | bytes) -> Callable[[], Files]:
-    return lambda: {"plan.yaml": text.encode() if isinstance(text, str) else text}
-
-
-def _pgm(data: bytes) -> Callable[[], Files]:
-    return lambda: {"plan.pgm": data}
+_yaml = partial(one, "plan.yaml")
+_pgm = partial(one, "plan.pgm")
 
 
 def _laughs() -> Files:
@@ -75,22 +70,16 @@ MAPS: Hostile = {
     "a date": _map(resolution="2026-01-01", origin="2026-01-01"),
     "base sixty": _map(resolution="190:20:30"),
     "an integer of 5000 digits": _map(resolution="9" * 5000),
-    "an image outside": lambda: {"plan.yaml": _map(image="/etc/passwd")()["plan.yaml"]},
+    "an image outside": _map(image="/etc/passwd"),
     "an endless device": _map(image="/dev/zero"),
-    "an image above": lambda: {
-        "plan.yaml": _map(image="../given/../../plan.pgm")()["plan.yaml"],
-    },
-    "an image that a link leads out to": lambda: {
-        "plan.yaml": _map(image="link.pgm")()["plan.yaml"] , "plan.pgm": Link("/etc/passwd"),
-    },
-    "a link out of the folder": lambda: {"plan.pgm": Link("/etc/hostname")},
-    "a folder that is a link": lambda: {
-        "plan.yaml": _map(image="away/passwd.pgm")()["plan.yaml"], "plan.pgm": Link("/etc"),
-    },
-    "a link to itself": lambda: {"plan.pgm": Link("plan.pgm")},
-    "a description that links to itself": lambda: {"plan.yaml": Link("plan.yaml")},
-    "a pipe as image": lambda: {"plan.pgm": Pipe()},
-    "a pipe as description": lambda: {"plan.yaml": Pipe()},
+    "an image above": _map(image="../given/../../plan.pgm"),
+    "an image that a link leads out to": lambda: {**_map(image="link.pgm")(), "plan.pgm": Link("/etc/passwd")},
+    "a link out of the folder": _pgm(Link("/etc/hostname")),
+    "a folder that is a link": lambda: {**_map(image="away/passwd.pgm")(), "plan.pgm": Link("/etc")},
+    "a link to itself": _pgm(Link("plan.pgm")),
+    "a description that links to itself": _yaml(Link("plan.yaml")),
+    "a pipe as image": _pgm(Pipe()),
+    "a pipe as description": _yaml(Pipe()),
     "itself as image": _map(image="plan.yaml"),
     "a name of 5000 characters": _map(image="a" * 5000 + ".pgm"),
     "a name with a line break": _map(image='"a\\nb\\x1b[31m.pgm"'),
@@ -148,10 +137,6 @@ def _checks(rows: int, cols: int) -> NDArray[np.uint8]:
     return np.asarray(np.indices((rows, cols)).sum(axis=0) % 2 * 255, np.uint8)
 
 
-def _one(name: str, data: bytes) -> Callable[[], Files]:
-    return lambda: {name: data}
-
-
 _JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08" + struct.pack(">HH", 65535, 65535) + b"\x01\x01\x11\x00\xff\xd9"
 
 
@@ -180,32 +165,30 @@ IMAGES: Hostile = {
     "a line of 10,000 pixels": _encoded(np.full((1, 10_000), 255, np.uint8), "png"),
     "one pixel": _encoded(np.full((1, 1), 255, np.uint8), "png"),
     "all walls": _encoded(np.zeros((50, 50), np.uint8), "png"),
-    "JPEG of 65535²": _one("hostile.jpg", _JPEG),
+    "JPEG of 65535²": one("hostile.jpg", _JPEG),
     "a cut JPEG": lambda: {"hostile.jpg": _bytes_of(_noise(300, 300), "jpeg")[:900]},
-    "BMP of 10⁹ pixels": _one("hostile.bmp", _bmp(40_000, 25_000, 8)),
-    "BMP of a negative height": _one("hostile.bmp", _bmp(40, -2**31, 24)),
-    "PGM with a white of 0": _one("hostile.pgm", b"P5\n10 10\n0\n" + bytes(100)),
-    "PGM with a white of 65536": _one("hostile.pgm", b"P5\n10 10\n65536\n" + bytes(200)),
-    "PFM of nan": _one("hostile.pgm", b"Pf\n10 10\n-1.0\n" + b"\xff" * 400),
-    "an SVG under another name": _one("hostile.png", b"<svg xmlns='http://www.w3.org/2000/svg'><script>1</script></svg>"),
-    "EPS under another name": _one("hostile.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(a) print\n"),
+    "BMP of 10⁹ pixels": one("hostile.bmp", _bmp(40_000, 25_000, 8)),
+    "BMP of a negative height": one("hostile.bmp", _bmp(40, -2**31, 24)),
+    "PGM with a white of 0": one("hostile.pgm", b"P5\n10 10\n0\n" + bytes(100)),
+    "PGM with a white of 65536": one("hostile.pgm", b"P5\n10 10\n65536\n" + bytes(200)),
+    "PFM of nan": one("hostile.pgm", b"Pf\n10 10\n-1.0\n" + b"\xff" * 400),
+    "an SVG under another name": one("hostile.png", b"<svg xmlns='http://www.w3.org/2000/svg'><script>1</script></svg>"),
+    "EPS under another name": one("hostile.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n(a) print\n"),
     "TIFF under another name": _encoded(np.full((40, 40), 255, np.uint8), "tiff"),
-    "empty": _one("hostile.png", b""),
-    "an unknown suffix": _one("hostile.svg", b"<svg/>"),
-    "no suffix": _one("hostile", b"\x89PNG"),
+    "empty": one("hostile.png", b""),
+    "an unknown suffix": one("hostile.svg", b"<svg/>"),
+    "no suffix": one("hostile", b"\x89PNG"),
     "a folder": lambda: {"hostile.png/": b""},
-    "a pipe": lambda: {"hostile.png": Pipe()},
-    "a link to itself": lambda: {"hostile.png": Link("hostile.png")},
-    "an endless device": lambda: {"hostile.png": Link("/dev/zero")},
+    "a pipe": one("hostile.png", Pipe()),
+    "a link to itself": one("hostile.png", Link("hostile.png")),
+    "an endless device": one("hostile.png", Link("/dev/zero")),
 }  # fmt: skip
 
 
 # ---- configurations --------------------------------------------------------------------------------------------
 
 
-def _toml(text: str | bytes) -> Callable[[], Files]:
-    return lambda: {"config.toml": text.encode() if isinstance(text, str) else text}
-
+_toml = partial(one, "config.toml")
 
 CONFIGS: Hostile = {
     "deep lists": _toml("a = " + "[" * _DEEP),
@@ -228,10 +211,10 @@ CONFIGS: Hostile = {
     "a name with line breaks": _toml('slam = "a\\nb\\u001b[31m"'),
     "a key with line breaks": _toml('"a\\nb\\u001b[31m" = 1'),
     "a date": _toml("time_limit_s = 2026-01-01"),
-    "a pipe": lambda: {"config.toml": Pipe()},
+    "a pipe": _toml(Pipe()),
     "a folder": lambda: {"other.toml/": b""},
-    "an endless device": lambda: {"config.toml": Link("/dev/zero")},
-    "a link to itself": lambda: {"config.toml": Link("config.toml")},
+    "an endless device": _toml(Link("/dev/zero")),
+    "a link to itself": _toml(Link("config.toml")),
     **{f"{text}": _toml(text) for text in (
         "run = 3", "run = [1]", "[[run]]\nseed = 1", "[run]\nagent = 'a\\nb'",
         "[run]\nagent = '/dev/zero.safetensors'",
@@ -271,13 +254,7 @@ def _tensor(dtype: str = "F32", shape: object = (1,), offsets: object = (0, 4)) 
 
 def _changed(**values: object) -> Callable[[], Files]:
     """Return the JSON file beside the weights with some values replaced."""
-
-    def made() -> Files:
-        sound = samples.policies()["ppo.json"]
-        assert isinstance(sound, bytes)
-        return {"ppo.json": as_json(json.loads(sound) | values)}
-
-    return made
+    return lambda: {"ppo.json": as_json(json.loads(samples.policies()["ppo.json"]) | values)}
 
 
 def _filled(byte: bytes) -> Callable[[], Files]:
@@ -285,7 +262,6 @@ def _filled(byte: bytes) -> Callable[[], Files]:
 
     def made() -> Files:
         sound = samples.policies()["ppo.safetensors"]
-        assert isinstance(sound, bytes)
         begin = 8 + int.from_bytes(sound[:8], "little")
         return {"ppo.safetensors": sound[:begin] + byte * (len(sound) - begin)}
 
@@ -322,11 +298,11 @@ POLICIES: Hostile = {
     "JSON that is a list": lambda: {"ppo.json": b"[]"},
     "JSON that is empty": lambda: {"ppo.json": b""},
     "JSON in UTF-16": lambda: {"ppo.json": '{"a": 1}'.encode("utf-16")},
-    "JSON that is a folder": lambda: {"ppo.json": Link("/tmp")},
-    "JSON that is a pipe": lambda: {"ppo.json": Pipe()},
-    "JSON that is an endless device": lambda: {"ppo.json": Link("/dev/zero")},
-    "weights that are a pipe": lambda: {"ppo.safetensors": Pipe()},
-    "weights that are an endless device": lambda: {"ppo.safetensors": Link("/dev/zero")},
+    "JSON that is a folder": one("ppo.json", Link("/tmp")),
+    "JSON that is a pipe": one("ppo.json", Pipe()),
+    "JSON that is an endless device": one("ppo.json", Link("/dev/zero")),
+    "weights that are a pipe": one("ppo.safetensors", Pipe()),
+    "weights that are an endless device": one("ppo.safetensors", Link("/dev/zero")),
     "weights in pickle": lambda: {"ppo.safetensors": b"\x80\x04cos\nsystem\n(S'true'\ntR."},
     **{f"{key} = {value!r}": _changed(**{key: value}) for key, value in (
         ("format", "x" * 100_000), ("format", "a\nb"), ("format", None), ("format", []), ("planning", []),

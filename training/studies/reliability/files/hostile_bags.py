@@ -15,7 +15,7 @@ import numpy as np
 
 from slam.ros import Message, nanoseconds, odometry_message, rosbags_message, scan_message, transform_message
 from slam.types import Scan
-from training.studies.reliability.files.samples import Files, Link, Pipe
+from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, Sound, one
 
 __all__ = ["BAGS", "bags"]
 
@@ -90,7 +90,7 @@ def _db3(messages: _Messages, *, more: str = "") -> bytes:
 
 
 @cache
-def bags() -> Files:
+def bags() -> Sound:
     """Return a drive as MCAP and as SQLite."""
     return {"drive.mcap": _mcap(_drive()), "drive.db3": _db3(_drive())}
 
@@ -107,12 +107,11 @@ def _bomb(compression: str) -> Files:
     packed = (lz4.frame if compression == "lz4" else zstandard).compress(zeros)
     Chunk(compression, packed, 0, 0, 0, len(zeros)).write(builder)
     whole = bags()["drive.mcap"]
-    assert isinstance(whole, bytes)
     header = 8 + 9 + int.from_bytes(whole[9:17], "little")
     return {"drive.mcap": whole[:header] + builder.end() + whole[header:]}
 
 
-def _made(content: Callable[[], bytes | Link | Pipe], name: str = "drive.mcap") -> Callable[[], Files]:
+def _made(content: Callable[[], bytes], name: str = "drive.mcap") -> Callable[[], Files]:
     return lambda: {name: content()}
 
 
@@ -130,16 +129,16 @@ _MORE = {
     "escape sequences in names": "UPDATE topics SET name = char(27) || '[2J', type = 'a' || char(10) || 'b';",
     "no topics": "DELETE FROM topics;",
 }
-BAGS: Mapping[str, Callable[[], Files]] = {
+BAGS: Hostile = {
     "zstd of 600 MB": lambda: _bomb("zstd"),
     "lz4 of 600 MB": lambda: _bomb("lz4"),
-    "empty": _made(lambda: b""),
-    "the magic alone": _made(lambda: b"\x89MCAP0\r\n"),
-    "zeros behind the magic": _made(lambda: b"\x89MCAP0\r\n" + bytes(10**6)),
-    "a pipe": _made(Pipe),
-    "a link to itself": _made(lambda: Link("drive.mcap")),
-    "an endless device": _made(lambda: Link("/dev/zero")),
-    "a device that is empty": _made(lambda: Link("/dev/null")),
+    "empty": one("drive.mcap", b""),
+    "the magic alone": one("drive.mcap", b"\x89MCAP0\r\n"),
+    "zeros behind the magic": one("drive.mcap", b"\x89MCAP0\r\n" + bytes(10**6)),
+    "a pipe": one("drive.mcap", Pipe()),
+    "a link to itself": one("drive.mcap", Link("drive.mcap")),
+    "an endless device": one("drive.mcap", Link("/dev/zero")),
+    "a device that is empty": one("drive.mcap", Link("/dev/null")),
     **{f"a scan's {field} of {value}": _made(lambda f=field, v=value: _mcap(_drive(twisted={f: v})))  # type: ignore[misc]
        for field in ("angle_min", "angle_increment", "range_min", "range_max")
        for value in _NUMBERS if abs(value) < 1e38 or not math.isfinite(value)},

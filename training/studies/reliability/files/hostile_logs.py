@@ -4,31 +4,16 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import cache
 
 from training.studies.reliability.files import samples
-from training.studies.reliability.files.samples import Files, Link, Pipe
+from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, Sound, one
 
 __all__ = ["CARMEN", "DPSLAM", "PARK", "UTIAS"]
 
-Hostile = Mapping[str, Callable[[], Files]]
-
 _NUMBERS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e308",
-    "-1e308",
-    "1e999",
-    "5e-324",
-    "1e10",
-    "-1",
-    "0",
-    "1e5",
-    "1e3",
-    "9" * 400,
-    "x",
-)
+    "nan", "inf", "-inf", "1e308", "-1e308", "1e999", "5e-324", "1e10", "-1", "0", "1e5", "1e3", "9" * 400, "x",
+)  # fmt: skip
 
 
 @cache
@@ -37,13 +22,11 @@ def _bomb(piece: bytes, megabytes: int) -> bytes:
     return gzip.compress(piece * (2**20 // len(piece))) * megabytes
 
 
-def _lines(name: str, sound: Callable[[], Files]) -> list[bytes]:
-    content = sound()[name]
-    assert isinstance(content, bytes)
-    return content.splitlines()
+def _lines(name: str, sound: Callable[[], Sound]) -> list[bytes]:
+    return sound()[name].splitlines()
 
 
-def _with(name: str, sound: Callable[[], Files], row: int, word: int, value: str) -> Callable[[], Files]:
+def _with(name: str, sound: Callable[[], Sound], row: int, word: int, value: str) -> Callable[[], Files]:
     """Return a file with one word of one line replaced; rows and words count from 0, or back from the end."""
 
     def made() -> Files:
@@ -56,7 +39,7 @@ def _with(name: str, sound: Callable[[], Files], row: int, word: int, value: str
     return made
 
 
-def _every(name: str, sound: Callable[[], Files], word: int, value: str) -> Callable[[], Files]:
+def _every(name: str, sound: Callable[[], Sound], word: int, value: str) -> Callable[[], Files]:
     """Return a file with one word of every line replaced."""
 
     def made() -> Files:
@@ -94,7 +77,7 @@ def _any(name: str, line: bytes) -> dict[str, Callable[[], Files]]:
     }
 
 
-def _scan(name: str, sound: Callable[[], Files], scan: int, odometry: int, words: Mapping[str, int]) -> Hostile:
+def _scan(name: str, sound: Callable[[], Sound], scan: int, odometry: int, words: Mapping[str, int]) -> Hostile:
     """Return what harms a reader of scans: numbers in a scan's line and in an odometry's."""
     counts = ("1000000000", "-1", "0", "1", "2", "١٨٠", "1e3", "0x10", "9" * 5000, "180.0")
     return {
@@ -110,7 +93,7 @@ def _scan(name: str, sound: Callable[[], Files], scan: int, odometry: int, words
     }  # fmt: skip
 
 
-def _lines_with_ranges(name: str, sound: Callable[[], Files], value: bytes) -> bytes:
+def _lines_with_ranges(name: str, sound: Callable[[], Sound], value: bytes) -> bytes:
     rows = [line.split() for line in _lines(name, sound)]
     for words in rows:
         if words[0] in (b"FLASER", b"Laser"):
@@ -128,11 +111,7 @@ DPSLAM: Hostile = {
 }
 
 
-def _file(name: str, content: bytes | Pipe | Link) -> Files:
-    return {name: content}
-
-
-def _tables(sound: Callable[[], Files]) -> Hostile:
+def _tables(sound: Callable[[], Sound]) -> Hostile:
     """Return what harms a reader of several tables: in each of them, and each of them missing."""
     found: dict[str, Callable[[], Files]] = {}
     for name in sound():
@@ -145,7 +124,7 @@ def _tables(sound: Callable[[], Files]) -> Hostile:
             "empty": b"", "a line": line, "a pipe": Pipe(), "all alike": (line + b"\n") * 200,
             "an endless device": Link("/dev/zero"), "gzip of 600 MB": _bomb(line + b"\n", 600),
         }  # fmt: skip
-        found |= {f"{name}: {what}": partial(_file, name, content) for what, content in contents.items()}
+        found |= {f"{name}: {what}": one(name, content) for what, content in contents.items()}
     return found
 
 

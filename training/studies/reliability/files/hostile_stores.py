@@ -5,41 +5,32 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
 from typing import Any
 
 from training.studies.reliability.files import results, samples
-from training.studies.reliability.files.samples import Files, Link, Pipe
+from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, Sound, one
 
 __all__ = ["LANDMARKS", "ROWS", "RUN_FILES", "STORES"]
-
-Hostile = Mapping[str, Callable[[], Files]]
 
 _ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
 
 
-def _sql(name: str, sound: Callable[[], Files], script: str) -> Callable[[], Files]:
+def _sql(name: str, sound: Callable[[], Sound], script: str) -> Callable[[], Files]:
     """Return a database on which a script was run."""
 
     def made() -> Files:
-        content = sound()[name]
-        assert isinstance(content, bytes)
         with closing(sqlite3.connect(":memory:", isolation_level=None)) as database:
-            database.deserialize(content)
+            database.deserialize(sound()[name])
             database.executescript("PRAGMA ignore_check_constraints = ON; PRAGMA writable_schema = OFF;" + script)
             return {name: database.serialize()}
 
     return made
 
 
-def _bytes(name: str, sound: Callable[[], Files], change: Callable[[bytes], bytes]) -> Callable[[], Files]:
-    def made() -> Files:
-        content = sound()[name]
-        assert isinstance(content, bytes)
-        return {name: change(content)}
-
-    return made
+def _bytes(name: str, sound: Callable[[], Sound], change: Callable[[bytes], bytes]) -> Callable[[], Files]:
+    return lambda: {name: change(sound()[name])}
 
 
 def _empty(script: str) -> bytes:
@@ -52,7 +43,7 @@ def _put(data: bytes, at: int, what: bytes) -> bytes:
     return data[:at] + what + data[at + len(what) :]
 
 
-def _any(name: str, sound: Callable[[], Files]) -> dict[str, Callable[[], Files]]:
+def _any(name: str, sound: Callable[[], Sound]) -> dict[str, Callable[[], Files]]:
     """Return what harms any reader of a database."""
     return {
         "empty": lambda: {name: b""},
@@ -202,12 +193,7 @@ STORES: Hostile = {
 
 
 def _rows(text: bytes) -> Callable[[], Files]:
-    def made() -> Files:
-        content = results.rows()["rows.jsonl"]
-        assert isinstance(content, bytes)
-        return {"rows.jsonl": text + b"\n" + content}
-
-    return made
+    return lambda: {"rows.jsonl": text + b"\n" + results.rows()["rows.jsonl"]}
 
 
 ROWS: Hostile = {
@@ -226,10 +212,6 @@ ROWS: Hostile = {
 }  # fmt: skip
 
 
-def _file(name: str, data: bytes | Pipe | Link) -> Callable[[], Files]:
-    return lambda: {name: data}
-
-
 _CONTENTS: dict[str, bytes | Pipe | Link] = {
     "empty": b"", "deep": b"[" * 100_000, "deep mappings": b'{"a":' * 100_000, "digits": b"9" * 5000,
     "a list": b"[]", "null": b"null", "a number": b"1", "no text": b"\xff", "a pipe": Pipe(),
@@ -238,7 +220,7 @@ _CONTENTS: dict[str, bytes | Pipe | Link] = {
 }  # fmt: skip
 
 RUN_FILES: Hostile = {
-    f"{name}: {what}": _file(name, data)
+    f"{name}: {what}": one(name, data)
     for name in ("settings.json", "summary.json", "page.md")
     for what, data in (_CONTENTS | {"a link to itself": Link(name)}).items()
 }

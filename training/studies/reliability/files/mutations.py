@@ -45,23 +45,9 @@ def _insert(data: bytearray, rng: Rng) -> None:
 
 def _words(data: bytearray, rng: Rng) -> None:
     words = (
-        b"\n",
-        b"\r\n",
-        b" ",
-        b"\0",
-        b'"',
-        b"'",
-        b"[",
-        b"]",
-        b"{",
-        b"}",
-        b":",
-        b"=",
-        b"#",
-        b",",
-        b"\xff\xfe",
+        b"\n", b"\r\n", b" ", b"\0", b'"', b"'", b"[", b"]", b"{", b"}", b":", b"=", b"#", b",", b"\xff\xfe",
         b"\t",
-    )
+    )  # fmt: skip
     at = int(rng.integers(len(data) + 1))
     data[at:at] = words[int(rng.integers(len(words)))] * int(rng.integers(1, 4))
 
@@ -86,9 +72,7 @@ def _lines(data: bytearray, rng: Rng) -> None:
 
 
 def _number(data: bytearray, rng: Rng) -> None:
-    near = int(
-        rng.integers(len(data))
-    )  # the next number from somewhere on: all of a large file's take long to find
+    near = int(rng.integers(len(data)))  # the next from there on: all of a large file's take long to find
     if found := _NUMBER.search(data, near) or _NUMBER.search(data):
         data[found.start() : found.end()] = NUMBERS[int(rng.integers(len(NUMBERS)))]
 

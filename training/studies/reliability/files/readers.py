@@ -6,7 +6,7 @@ import gzip
 import importlib.util
 import tempfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -29,7 +29,7 @@ from training.studies.reliability.files import (
 )
 from training.studies.reliability.files.forked import load_command, run_forked
 from training.studies.reliability.files.mutations import mutated, mutated_cells
-from training.studies.reliability.files.samples import Files, put
+from training.studies.reliability.files.samples import Files, Hostile, Sound, put
 
 __all__ = ["READERS", "Case", "Reader"]
 
@@ -60,10 +60,10 @@ class Reader:
     """One that is handed files."""
 
     about: str
-    sound: Callable[[], Files]
+    sound: Callable[[], Sound]
     variants: tuple[Variant, ...]
     use: Callable[[Path], None]
-    hostile: Mapping[str, Callable[[], Files]] = field(default_factory=dict)
+    hostile: Hostile = field(default_factory=dict)
     command: Callable[[Path, Path], Sequence[str]] | None = None  # of the path, and a folder for results
     every: int = 100  # file is read by the command
     named: bool = True  # every error names the file; of a configuration it may name the setting instead
@@ -84,17 +84,15 @@ class Reader:
         if index < len(self.hostile):
             name = list(self.hostile)[index]
             entry, names = self.variants[0]
-            files = self.hostile[name]()
+            given = self.hostile[name]()
             # One with a name of its own is the one to be read.
-            entry = entry if entry == "." else next((n for n in files if not n.startswith(names)), entry)
-            return Case(name, {n: self.sound()[n] for n in names} | dict(files), entry.rstrip("/"))
+            entry = entry if entry == "." else next((n for n in given if not n.startswith(names)), entry)
+            return Case(name, {n: self.sound()[n] for n in names} | dict(given), entry.rstrip("/"))
         rng = np.random.default_rng([seed, zlib.crc32(self.about.encode()), index])
         entry, names = self.variants[int(rng.integers(len(self.variants)))]
         files = {name: self.sound()[name] for name in names}
         name = str(rng.choice(names))
-        content = files.pop(name)
-        assert isinstance(content, bytes)
-        name, damaged, what = _damaged(name, content, rng)
+        name, damaged, what = _damaged(name, files.pop(name), rng)
         entry = f"{entry}.gz" if entry != "." and name == f"{entry}.gz" else entry
         return Case(f"{name}: {', '.join(what)}", files | {name: damaged}, entry)
 

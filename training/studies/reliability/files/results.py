@@ -20,7 +20,7 @@ from training.benchmark.run import BenchmarkPlan
 from training.benchmark.store import Store
 from training.runs.campaign import keep_settings
 from training.runs.rows import resume
-from training.studies.reliability.files.samples import Files
+from training.studies.reliability.files.samples import Sound
 
 __all__ = [
     "benchmark", "leaderboard", "metrics_of", "row_of", "rows", "run_files", "store", "use_rows", "use_run_files",
@@ -31,7 +31,7 @@ _ASKED = {"suite": "rooms", "agents": "random", "slam": "odometry", "seeds": "0:
 _NUMBERS = (
     "coverage", "time_to_50_s", "time_to_90_s", "time_to_95_s", "time_to_99_s", "time_s", "path_length_m",
     "collisions", "map_iou", "corner_mean_m", "ate_rmse_m", "ate_aligned_rmse_m", "final_position_error_m",
-    "final_heading_error_rad",     "anees", "decision_ms_median", "decision_ms_p95", "limit_s",
+    "final_heading_error_rad", "anees", "decision_ms_median", "decision_ms_p95", "limit_s",
 )  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def row_of(job: EpisodeJob) -> EpisodeRow:
 
 
 @cache
-def store() -> Files:
+def store() -> Sound:
     """Return the folder of a benchmark that is done."""
     plan, made_by = _plan()
     with tempfile.TemporaryDirectory() as folder:
@@ -102,7 +102,7 @@ def _work(job: tuple[str, int]) -> dict[str, Any]:
 
 
 @cache
-def rows() -> Files:
+def rows() -> Sound:
     """Return the rows of a study that is done."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "rows.jsonl"
@@ -127,7 +127,7 @@ _SETTINGS = {"version": "1", "seed": 0, "agents": ["a", "b"], "limit": {"least":
 
 
 @cache
-def run_files() -> Files:
+def run_files() -> Sound:
     """Return settings, a benchmark's summary, and a page that its figures are put into."""
     plan, _ = _plan()
     pairs = [(job.key, row_of(job)) for job in plan.jobs]

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -21,8 +21,8 @@ from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from slam.landmarks.database import write_landmark_map
 
 __all__ = [
-    "Files", "Link", "Pipe", "as_json", "carmen", "configs", "dpslam", "images", "landmarks", "park", "policies",
-    "put", "ros_map", "utias",
+    "Files", "Hostile", "Link", "Pipe", "Sound", "as_json", "carmen", "configs", "dpslam", "images", "landmarks",
+    "one", "park", "policies", "put", "ros_map", "utias",
 ]  # fmt: skip
 
 
@@ -40,6 +40,18 @@ class Pipe:
 
 Files = Mapping[str, bytes | Link | Pipe]
 """Name within a folder → what is there; a name that ends with a slash is a folder."""
+
+Sound = Mapping[str, bytes]
+"""As :data:`Files`, but nothing that only harms."""
+
+Hostile = Mapping[str, Callable[[], Files]]
+"""What is wrong with them → files, made when they are wanted: some are large."""
+
+
+def one(name: str, content: str | bytes | Link | Pipe) -> Callable[[], Files]:
+    """Return what makes a single file."""
+    data = content.encode() if isinstance(content, str) else content
+    return lambda: {name: data}
 
 
 def put(folder: Path, files: Files) -> None:
@@ -62,7 +74,7 @@ def _written(folder: Path) -> dict[str, bytes]:
 
 
 @cache
-def ros_map() -> Files:
+def ros_map() -> Sound:
     """Return a ROS map of a room."""
     classes = np.full((60, 80), UNKNOWN, np.int8)
     classes[5:-5, 5:-5], classes[10:-10, 10:-10] = OCCUPIED, FREE
@@ -72,7 +84,7 @@ def ros_map() -> Files:
 
 
 @cache
-def images() -> Files:
+def images() -> Sound:
     """Return the picture of a room in every format that is read."""
     picture = np.zeros((60, 80), np.uint8)
     picture[5:-5, 5:-5] = 255
@@ -101,7 +113,7 @@ def _ranges(k: int) -> NDArray[np.float64]:
 
 
 @cache
-def carmen() -> Files:
+def carmen() -> Sound:
     """Return a CARMEN log."""
     lines = ["# message formats", "PARAM robot_frontlaser_offset 0.0 nohost 0"]
     for k, pose in enumerate(_circle(12)):
@@ -113,7 +125,7 @@ def carmen() -> Files:
 
 
 @cache
-def dpslam() -> Files:
+def dpslam() -> Sound:
     """Return a DP-SLAM log."""
     pairs = [
         (f"Odometry {_line(*pose)}", f"Laser 181 {_line(*_ranges(k), 3.0)}") for k, pose in enumerate(_circle(12))
@@ -126,7 +138,7 @@ def _text(lines: list[str]) -> bytes:
 
 
 @cache
-def utias() -> Files:
+def utias() -> Sound:
     """Return the five files of a UTIAS log."""
     n, clock = 120, 1.2e9
     poses = _circle(n)
@@ -143,7 +155,7 @@ def utias() -> Files:
 
 
 @cache
-def park() -> Files:
+def park() -> Sound:
     """Return the files of Victoria Park's log."""
     n, frames = 100, 12
     trees = np.zeros((frames, 18))
@@ -165,14 +177,14 @@ def park() -> Files:
 
 
 @cache
-def configs() -> Files:
+def configs() -> Sound:
     """Return an environment's configuration, with the [run] table of an episode."""
     run = '\n[run]\nagent = "random"\nseed = 3\nmax_steps = 2\nstart = [2.0, 2.0, 0.0]\n'
     return {"config.toml": (to_toml(EnvConfig(rooms="rectangular")) + run).encode()}
 
 
 @cache
-def policies() -> Files:
+def policies() -> Sound:
     """Return the policies of the package."""
     import agents
 
@@ -180,7 +192,7 @@ def policies() -> Files:
 
 
 @cache
-def landmarks() -> Files:
+def landmarks() -> Sound:
     """Return a cartographic database."""
     xy = _circle(9)[:, :2] * 4.0
     cov = np.tile(0.01 * np.eye(2), (9, 1, 1))

@@ -82,7 +82,5 @@ def inputs() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="kills-in-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     (folder / "train.toml").write_text(_TRAIN, "utf-8")
-    content = carmen()["log.clf"]
-    assert isinstance(content, bytes)
-    (folder / "log.clf").write_bytes(content)
+    (folder / "log.clf").write_bytes(carmen()["log.clf"])
     return folder

@@ -15,7 +15,7 @@ from training.runs.signals import TERMINATED
 from training.studies.reliability.kills.alone import argv_of, undisturbed
 from training.studies.reliability.kills.commands import COMMANDS, installed
 from training.studies.reliability.kills.killing import Moment, Run, run
-from training.studies.reliability.kills.results import damaged, differences, kept, results
+from training.studies.reliability.kills.results import damaged, differences, kept, results, tidy
 from training.studies.reliability.parts import Job, Part, Row, Summary, Table
 
 __all__ = ["KILLS"]
@@ -56,10 +56,7 @@ def _work(job: Job) -> Row:
             row["seconds"] += done.seconds
             row["wrong"] += [f"at last: {line}" for line in _judged(done, None)]
         row["rows_kept"] = len(before)
-        stale = [path for path in (place / "out").iterdir() if path.name.startswith(".")]
-        row["stale"] = len(stale)
-        for path in stale:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        row["stale"] = tidy(place / "out")
         row["wrong"] += [f"at last {line}" for line in differences(results(place / "out"), whole)]
     row["seconds"] = round(row["seconds"], 1)
     return row

@@ -8,6 +8,7 @@ import hashlib
 import io
 import json
 import re
+import shutil
 import sqlite3
 import tomllib
 import zipfile
@@ -15,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["damaged", "differences", "kept", "results"]
+__all__ = ["damaged", "differences", "kept", "results", "tidy"]
 
 _CLOCK = re.compile(r"wall(_time)?_s$|(^|_)ms(_|$)|realtime|took|command|^identity$")  # an identity is drawn
 _TOLD = (".html", ".md", ".png", ".v2", ".0")  # pictures and pages, with times in them: whether they are there
@@ -56,6 +57,14 @@ def kept(folder: Path) -> set[str]:
     lines = [line for path in folder.glob("episodes.jsonl") for line in _lines(path)]
     names = [json.loads(path.read_text("utf-8"))["identity"] for path in folder.glob("progress.json")]
     return {*stores, *map(str, lines), *names}
+
+
+def tidy(folder: Path) -> int:
+    """Take away the temporary files that a command left in a folder; return how many there were."""
+    stale = [path for path in folder.iterdir() if path.name.startswith(".")]
+    for path in stale:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return len(stale)
 
 
 def differences(one: Any, other: Any, at: str = "") -> list[str]:

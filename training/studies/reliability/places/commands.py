@@ -17,7 +17,7 @@ from pathlib import Path
 from training.benchmark.store import FILE
 from training.runs.processes import ONE_THREAD
 from training.studies.reliability.kills.alone import argv_of, undisturbed
-from training.studies.reliability.kills.results import damaged, differences, results
+from training.studies.reliability.kills.results import damaged, differences, results, tidy
 
 __all__ = ["PLACES", "Skipped"]
 
@@ -68,9 +68,7 @@ def _whole(name: str, out: Path) -> list[str]:
     code, said = _end(_start(argv_of(name, out)))
     if code:
         return [f"{name} ends with {code} once nothing is in the way: {said[-300:]}"]
-    for path in out.iterdir():
-        if path.name.startswith("."):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    tidy(out)
     return [f"{name}, then: {line}" for line in differences(results(out), undisturbed(name)[0])]
 
 

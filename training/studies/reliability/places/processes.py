@@ -12,9 +12,9 @@ import gymnasium
 import numpy as np
 
 from mecanum_env.vector.vector_env import ExploreVectorEnv
-from training.runs.processes import one_thread_each
+from training.runs.processes import memory_mb, one_thread_each
 from training.studies.reliability.steps.items import Item, items
-from training.studies.reliability.steps.runs import handles, memory_mb, run
+from training.studies.reliability.steps.runs import handles, run
 
 __all__ = ["PROCESSES"]
 

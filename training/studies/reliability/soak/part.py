@@ -18,8 +18,9 @@ from scipy import stats
 import agents
 from mecanum_env import rooms
 from mecanum_env.rooms import FloorPlanError
+from training.runs.processes import memory_mb
 from training.studies.reliability.parts import Job, Part, Row, Summary, Table
-from training.studies.reliability.steps.runs import handles, memory_mb
+from training.studies.reliability.steps.runs import handles
 
 __all__ = ["SOAK", "slope"]
 

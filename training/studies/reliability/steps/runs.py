@@ -17,6 +17,7 @@ import numpy as np
 
 import agents
 from training.runs.errors import one_line
+from training.runs.processes import memory_mb
 from training.studies.reliability.parts import Row
 from training.studies.reliability.steps import batch, team
 from training.studies.reliability.steps.actions import policy
@@ -24,7 +25,7 @@ from training.studies.reliability.steps.items import Item, settings
 from training.studies.reliability.steps.nonsense import NONSENSE_EVERY, no_actions, no_choices, refuse
 from training.studies.reliability.steps.watch import Findings, Watch, check_belief, check_metrics
 
-__all__ = ["handles", "memory_mb", "run", "work"]
+__all__ = ["handles", "run", "work"]
 
 
 def work(item: Item) -> Row:
@@ -123,12 +124,6 @@ def _frontier(item: Item, given: dict[str, Any], found: Findings, nonsense: bool
             check_metrics(info, found)
         found.collisions += env.base.truth.world.collisions
     env.close()
-
-
-def memory_mb() -> float:
-    """Return the memory that this process has resident; 0 where the system does not tell."""
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20 if statm.exists() else 0.0
 
 
 def handles() -> int:

@@ -51,7 +51,7 @@ def run(item: Item, given: dict[str, Any], found: Findings, nonsense: bool) -> N
                 actions[k] = _act(explorers, policies, team, k, observations[k])
             if nonsense and found.steps // robots % NONSENSE_EVERY == 0:
                 act_badly = partial(_act_badly, team, actions)
-                refuse(act_badly, no_actions(3), found.steps // robots, found)
+                refuse(act_badly, no_actions(3), found.steps // robots // NONSENSE_EVERY, found)
             for k, outcome in team.step(actions).items():
                 observations[k] = outcome.observation
                 watches[k].step(outcome.observation, outcome.reward, outcome.info)
