@@ -85,6 +85,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             check_name("render_mode", render_mode, self.metadata["render_modes"])
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.config.step_s)}
         self.render_mode = render_mode
         targets = WheelTargets(self.config.robot)
         self._to_wheels = targets.of_wheels if action == "wheels" else targets.of_twist

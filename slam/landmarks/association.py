@@ -205,7 +205,7 @@ def nearest_neighbour(
     Parameters
     ----------
     z : Array
-        ``(m, 10)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame, which
+        ``(m, 12)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame, which
         end; of a LINE distance and bearing of its foot, in columns 8 and 9 from where to where it was seen [m].
     marks : Array
         ``(n, ≥ 8)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7
