@@ -1,6 +1,6 @@
 """Compressed EKF-SLAM: an ordinary filter over the landmarks near by; the rest of the map is updated later.
 
-After Guivant and Nebot 2001, in another form than the design's invariant-ekf.md has. While the robot stays in one
+After Guivant and Nebot 2001, in a form of its own (docs/reference/compressed.md). While the robot stays in one
 region only the state's part *a*, robot and landmarks near by, is filtered. What that does to the rest *b* goes by
 way of their covariance, whose rank is low (:mod:`slam.gaussian.low_rank`): P_ab = U V. So a few numbers y, whose
 covariance with a is U, stand for all of b, as states beside the map that no scan shows

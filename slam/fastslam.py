@@ -1,4 +1,4 @@
-"""FastSLAM (theory.md B, point 6): particles of the path, each with independent filters of its landmarks.
+"""FastSLAM (docs/reference/fastslam.md): particles of the path, each with independent filters of its landmarks.
 
 FastSLAM 1.0 draws a particle's pose from the motion model; 2.0 from the motion model given what is seen now,
 which leaves the weights more even. Both are one computation: a particle has a Gaussian of its pose since the last
@@ -96,7 +96,7 @@ class FastSlam(LandmarkBackend):
     # ---- the filter ----------------------------------------------------------------------------------------
 
     def predict(self, odometry: Odometry) -> None:
-        """Move every particle on by what the wheels measured (theory.md A, predict)."""
+        """Move every particle on by what the wheels measured (docs/reference/fastslam.md, Proposal)."""
         (vx, vy, omega), var_v, var_w = self._measured(odometry, self.config.odometry)
         twist = np.array([vx, vy, omega])
         self._inherited.predict(self._mean, twist, odometry.dt, var_v, var_w)

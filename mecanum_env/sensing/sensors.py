@@ -67,7 +67,7 @@ def _noisy_sweep(
 
 
 class Lidar:
-    """A planar lidar at A, ``offset_m`` ahead of the robot's centre (theory.md A).
+    """A planar lidar at A, ``offset_m`` ahead of the robot's centre (docs/reference/sensors.md).
 
     Parameters
     ----------

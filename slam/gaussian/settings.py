@@ -32,7 +32,7 @@ class EkfConfig(BackendConfig):
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = (
         math.inf
     )  # old landmarks expected no better than to this count only together
-    lines: bool = False  # take straight walls for landmarks, too (theory.md A)
+    lines: bool = False  # take straight walls for landmarks, too
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 

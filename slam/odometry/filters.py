@@ -1,4 +1,4 @@
-"""Filters between the wheels and a backend: paper C's on-board use (theory.md C), of a robot that accelerates.
+"""Filters between the wheels and a backend: paper C's on-board use, of a robot that accelerates.
 
 The wheels' twists are summed up to coordinates x, y, θ, each of which a Kalman-Bucy filter takes for measurements;
 the twist that leads from one filtered pose to the next is what the backend is given. What it brings, and what it

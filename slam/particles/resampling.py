@@ -1,4 +1,4 @@
-"""Weights of particles: what they sum up to, when and how they are resampled (theory.md B, point 6, step 3)."""
+"""Weights of particles: what they sum up to, when and how they are resampled (docs/reference/fastslam.md)."""
 
 from __future__ import annotations
 
