@@ -16,8 +16,6 @@ from slam.types import Array
 
 __all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
 
-_WHEN = ("every_step", "every_k", "n_eff")
-
 
 @dataclass(frozen=True, kw_only=True)
 class ResamplingPolicy(Config):
