@@ -143,10 +143,8 @@ class NoiseConfig(Config):
     base_error: Annotated[float, Within("[0, 1)")] = 0.01
     slip: Annotated[float, Within("[0, 1)")] = 0.0  # mean share of the commanded motion that is lost at random
     friction: Annotated[float, Within("[0.01, 2]")] = 0.6  # μ of the floor
-    patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (
-        0.15,
-        0.3,
-    )  # μ of the slippery patches, drawn per patch
+    # μ of the slippery patches, drawn per patch.
+    patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (0.15, 0.3)
     patch_share: Annotated[float, Within("[0, 1)")] = 0.0  # share of the floor that slippery patches cover
 
 

@@ -44,9 +44,8 @@ class CompressedEkfConfig(EkfConfig):
     crowd: Annotated[int, Within("[0, 10000]")] = 100  # landmarks: a region of more is smaller, and sooner left
     crowd_share: Annotated[float, Within("[0.001, 10]")] = 0.5  # ``leave_share`` of such a region, at least
     margin_m: Gap = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
-    whole_up_to: Annotated[int, Within("[0, 1000000000]")] = (
-        0  # landmarks: so many are one region, wherever they are
-    )
+    # Landmarks: so many are one region, wherever they are.
+    whole_up_to: Annotated[int, Within("[0, 1000000000]")] = 0
     # What is left out of all correlations with what is far: root of the squares' sum.
     rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-10
 

@@ -52,9 +52,8 @@ class FastSlamConfig(BackendConfig):
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     gate: Positive = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     max_turn_deg: Annotated[float, Within("[0, 180]")] = 35.0  # difference in a corner's direction
-    known_gate: Annotated[float, Within("(0, inf]")] = (
-        math.inf
-    )  # the same for observations with ids: a finite one refuses misread labels
+    # The gate of observations with ids: a finite one refuses misread labels.
+    known_gate: Annotated[float, Within("(0, inf]")] = math.inf
     # An observation that no landmark of a particle explains weighs as one at this squared distance from a
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
     unexplained: NotNegative = 11.83

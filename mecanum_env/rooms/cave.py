@@ -49,10 +49,8 @@ class CaveConfig(Config):
 
     area_m2: Annotated[tuple[float, float], Span("[30, 300]")] = (60.0, 150.0)  # free floor
     chamber_m: Annotated[tuple[float, float], Span("[1, 4]")] = (1.2, 2.3)  # radius of a chamber
-    passage_m: Annotated[tuple[float, float], Span("[1.3, 4]")] = (
-        1.4,
-        2.2,
-    )  # width of a passage, before the noise
+    # Width of a passage, before the noise.
+    passage_m: Annotated[tuple[float, float], Span("[1.3, 4]")] = (1.4, 2.2)
     loops: Share = 0.6  # probability of a passage beyond those that join every chamber
     roughness: Share = 0.5  # 0 smooth ovals and tubes, 1 as ragged as can be
     pillars: Annotated[tuple[int, int], Span("[0, 10]")] = (0, 3)

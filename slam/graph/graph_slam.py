@@ -173,10 +173,8 @@ class GraphSlam(SurfaceBackend):
             (before, turned), (way, turn) = self._blind, self._claimed
             share = (0.5 * lasting.radius_sigma) ** 2  # four wheels average
             rolled = 2.0 * math.hypot(before, lever * turned) * math.hypot(way, lever * turn)
-            linear, angular = (
-                share * rolled,
-                share * rolled / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn,
-            )
+            linear = share * rolled
+            angular = linear / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn
             cov += np.diag([linear, linear, angular])
         return cov
 

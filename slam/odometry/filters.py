@@ -40,11 +40,8 @@ class OdometryFilterConfig(Config):
     # Q of x and y: m²/s³, of wiener_acceleration m²/s⁵
     process_linear: Annotated[float, Within("[1e-12, 1e6]")] = 0.03
     process_turn: Annotated[float, Within("[1e-12, 1e6]")] = 0.3  # Q of θ: rad²/s³, of wiener_acceleration rad²/s⁵
-    start_sigmas: Annotated[tuple[float, float, float], Within("[0, 1e6]")] = (
-        1e-4,
-        0.1,
-        1.0,
-    )  # of a start: m, m/s, m/s²; of θ in rad
+    # Of a start: m, m/s, m/s²; of θ in rad.
+    start_sigmas: Annotated[tuple[float, float, float], Within("[0, 1e6]")] = (1e-4, 0.1, 1.0)
     rest_speed_m_s: NotNegative = 0.002
     rest_turn_rate_rad_s: NotNegative = 0.005
 
