@@ -29,6 +29,7 @@ class Account:
     stamp: float  # [s] when it was so
     pose: Array  # (3,) x [m], y [m], θ [rad]
     points: Array  # (n, 2) corners [m]
+    point_ids: NDArray[np.int64]  # (n,) as the backend numbers them
     kinds: NDArray[np.int8]  # (n,) CONVEX, CONCAVE or 0 where not known
     directions: Array  # (n,) of the bisector into free space [rad], nan where not known
     times_seen: NDArray[np.int64]  # (n,)
@@ -39,7 +40,7 @@ class Account:
     def __post_init__(self) -> None:
         n, k = len(self.points), len(self.walls)
         shapes = {
-            "pose": (3,), "points": (n, 2), "kinds": (n,), "directions": (n,),
+            "pose": (3,), "points": (n, 2), "point_ids": (n,), "kinds": (n,), "directions": (n,),
             "times_seen": (n,), "walls": (k, 2), "wall_ends": (k, 4), "cov": (3 + 2 * n + 2 * k,) * 2,
         }  # fmt: skip
         for name, shape in shapes.items():
@@ -83,7 +84,7 @@ class Account:
         kinds = belief.landmark_kinds if len(belief.landmark_kinds) else np.zeros(len(points), np.int8)
         walls = belief.lines if belief.whole_cov is not None else np.zeros((0, 2))
         return cls(
-            robot=robot, stamp=float(stamp), pose=belief.pose, points=points,
+            robot=robot, stamp=float(stamp), pose=belief.pose, points=points, point_ids=belief.landmark_ids,
             kinds=kinds, directions=directions, times_seen=times_seen, walls=walls,
             wall_ends=belief.line_ends[: len(walls)], cov=cov,
         )  # fmt: skip

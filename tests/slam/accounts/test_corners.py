@@ -21,7 +21,7 @@ DIRECTIONS = np.radians([45.0, -45.0, 45.0])
 
 def account(cov: Array, kinds: tuple[int, ...] = (CONVEX,) * 3) -> Account:
     return Account(
-        robot=0, stamp=0.0, pose=np.zeros(3), points=np.array([CROSSING, JAMB, ALONE]),
+        robot=0, stamp=0.0, pose=np.zeros(3), points=np.array([CROSSING, JAMB, ALONE]), point_ids=np.arange(3),
         kinds=np.array(kinds, np.int8), directions=DIRECTIONS, times_seen=np.full(3, 9), walls=WALLS,
         wall_ends=ENDS, cov=cov,
     )  # fmt: skip
@@ -75,7 +75,7 @@ def test_a_covariance_stays_one_and_no_larger(seed: int, sigma: float) -> None:
 
 def test_an_account_without_corners_is_itself() -> None:
     none = replace(
-        account(some_cov(0)), points=np.zeros((0, 2)), kinds=np.zeros(0, np.int8),
+        account(some_cov(0)), points=np.zeros((0, 2)), point_ids=np.zeros(0, np.int64), kinds=np.zeros(0, np.int8),
         directions=np.zeros(0), times_seen=np.zeros(0, np.int64), cov=np.eye(7),
     )  # fmt: skip
     assert settled(none) is none

@@ -89,6 +89,7 @@ def test_what_two_saw_is_known_better_and_told_by_whom() -> None:
 
 def moved(account: Account, by: Array) -> Account:
     """Return the same account, told in a frame in which its own lies at ``by``."""
+    n = len(account.points)
     pose, by_pose, _ = pose_into(by, account.pose)
     points, by_points, _ = points_into(by, account.points)
     walls, by_walls, _ = walls_into(by, account.walls)
@@ -96,7 +97,7 @@ def moved(account: Account, by: Array) -> Account:
     return Account(**{
         **account.__dict__, "pose": pose, "points": points, "walls": walls,
         "wall_ends": ends_into(by, account.wall_ends), "directions": wrap(account.directions + by[2]),
-        "cov": jacobian @ account.cov @ jacobian.T,
+        "cov": jacobian @ account.cov @ jacobian.T, "point_ids": np.arange(n),
     })  # fmt: skip
 
 

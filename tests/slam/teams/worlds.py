@@ -49,7 +49,7 @@ class World:
         state = state + factor @ rng.normal(size=factor.shape[1])
         return Account(
             robot=robot, stamp=1.0, pose=np.array([state[0], state[1], float(wrap(state[2]))]),
-            points=state[3 : 3 + 2 * n].reshape(-1, 2), kinds=self.kinds[rows],
+            points=state[3 : 3 + 2 * n].reshape(-1, 2), point_ids=np.arange(n), kinds=self.kinds[rows],
             directions=wrap(self.directions[rows] - frame[2]), times_seen=np.ones(n, np.int64),
             walls=state[3 + 2 * n :].reshape(-1, 2), wall_ends=ends, cov=factor @ factor.T,
         )  # fmt: skip
