@@ -1,4 +1,4 @@
-"""Explore, then drive back to the start (Newman's experiment; theory.md B, 7).
+"""Explore, then drive back to the start (Newman's experiment).
 
 The robot has nothing but its own belief to find the start with: how far from the true one it stops is what its
 whole journey has cost it in certainty.

@@ -123,7 +123,7 @@ class ExploreFrontierEnv(ChoiceEnv):
         Of the reward, per control step of the environment beneath: a step here adds up Σ discountⁿ rₙ, and
         ``info["duration_s"]`` says how long it took, so that what follows it can be discounted alike.
     render_mode, **kwargs
-        As for ``mecanum_env/Explore-v0``; ``"human"`` shows every 0.1 s of the drive.
+        As for ``mecanum_env/Explore-v0``; ``"human"`` shows every control step of the drive.
 
     Attributes
     ----------

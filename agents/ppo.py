@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
+from agents.driving.safety import scan_shares
 from agents.learned.drive_memory import Plan, PlanSettings
 from agents.learned.drive_network import BEAMS, RANGE_M, DriveNetwork
 from agents.learned.policy_files import read_policy
@@ -117,17 +118,13 @@ class Ppo(Agent):
             "pose_cov": np.asarray(belief.pose_cov)[np.triu_indices(3)].astype(np.float32), "twist": self._sent,
             "progress": np.zeros(2, np.float32),
         }  # fmt: skip
-        if "scan" in given:
-            given["scan"] = self._scan(np.asarray(given["scan"], np.float32))
+        scan = scan_shares(given, self._lidar)
+        if scan is not None:
+            given["scan"] = self._scan(scan.astype(np.float32))
         return seen | given
 
     def _scan(self, scan: NDArray[np.float32]) -> NDArray[np.float32]:
         lidar = self._lidar
-        if scan.shape != (lidar.beams,):
-            raise ValueError(
-                f"the scan has shape {scan.shape}, the agent's lidar {lidar.beams} beams: "
-                "give agents.make the environment's lidar"
-            )
         if lidar.beams == BEAMS and lidar.field_of_view_deg == 360.0 and lidar.range_max_m == RANGE_M:
             return scan
         angles = -math.pi + np.arange(BEAMS) * (2.0 * math.pi / BEAMS)

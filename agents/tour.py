@@ -26,8 +26,6 @@ from slam.types import Array, Cells
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 
-_FAR = 1e6  # [m] farther than anything is
-
 
 @dataclass(frozen=True, kw_only=True)
 class TourConfig(ExplorerConfig):
@@ -58,23 +56,11 @@ class Outlook:
     def losses_m(self, order: Cells) -> Array:
         """Return how much later [m] all is seen, on average, if a tour begins with each place ``(n,)``.
 
-        ``order`` is the best tour. By the weights, as in :meth:`delay_m`, but with the same places: 0 where it
-        begins, or less where a better one is found on the way.
+        ``order`` is the best tour. By the weights, with the same places: 0 where it begins, or less
+        where a better one is found on the way.
         """
         costs = tours_begun_with(self.sight, self.distance, self.weight, order)[1:]
         return np.asarray((costs - costs[order[1] - 1]) / (1.0 + float(self.weight.sum())))
-
-    def delay_m(self, place: int, tries: int) -> float:
-        """Return how far off what is left to see is [m], by the best tour found to begin with a place (1 … n).
-
-        What that tour costs, divided by the weights of all places and one for its end.
-        """
-        others = np.arange(len(self.sight)) != place
-        distance = self.distance.copy()
-        distance[0, others] += _FAR
-        sight = np.column_stack([self.sight, ~others])  # what only this place sees, so that it must be on the tour
-        _, cost = best_tour(sight, distance, self.weight, draw_luck(tries, len(sight)))
-        return cost / (1.0 + float(self.weight.sum()))
 
 
 class Tour(StationAgent, Explorer):
@@ -107,7 +93,6 @@ class Tour(StationAgent, Explorer):
         open_ = np.flatnonzero(np.isfinite(found.costs))
         if not len(open_):
             return found
-        self._index = int(open_[np.argmin(found.costs[open_])])
         self._index = self._by_views(found, open_)
         return found
 

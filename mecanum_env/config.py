@@ -54,7 +54,7 @@ Steps = Annotated[int, Within("[1, 1000000000]")]
 
 @dataclass(frozen=True, kw_only=True)
 class RobotConfig(Config):
-    """Body, wheels and motors of a mecanum robot with X rollers (theory.md, "The robot itself").
+    """Body, wheels and motors of a mecanum robot with X rollers (docs/reference/robot.md).
 
     The motor constants are those of a geared servo drive: a speed loop with a first-order lag, a torque limit
     at the wheel, and the rotor's inertia as the wheel feels it through the gear.
@@ -109,7 +109,7 @@ class LidarConfig(Config):
     field_of_view_deg: Annotated[float, Within("[1, 360]")] = 360.0
     range_min_m: Annotated[float, Within("[0, 100]")] = 0.02
     range_max_m: Annotated[float, Within("[0.01, 100]")] = 8.0
-    offset_m: Annotated[float, Within("[-10, 10]")] = 0.2  # L, theory.md A
+    offset_m: Annotated[float, Within("[-10, 10]")] = 0.2  # L of docs/reference/ekf.md
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -143,10 +143,8 @@ class NoiseConfig(Config):
     base_error: Annotated[float, Within("[0, 1)")] = 0.01
     slip: Annotated[float, Within("[0, 1)")] = 0.0  # mean share of the commanded motion that is lost at random
     friction: Annotated[float, Within("[0.01, 2]")] = 0.6  # μ of the floor
-    patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (
-        0.15,
-        0.3,
-    )  # μ of the slippery patches, drawn per patch
+    # μ of the slippery patches, drawn per patch.
+    patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (0.15, 0.3)
     patch_share: Annotated[float, Within("[0, 1)")] = 0.0  # share of the floor that slippery patches cover
 
 
@@ -214,7 +212,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-# Paper D's robot (theory.md D) is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and
+# Paper D's robot is 24 × 16 cm, at most 0.5 m/s and 90 °/s, and sees 120°; wheels, mass and
 # motors are the youBot's, scaled to that body.
 ROBOT_PRESETS: dict[str, RobotConfig] = {
     "youbot": RobotConfig(),

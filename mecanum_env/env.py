@@ -85,6 +85,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             check_name("render_mode", render_mode, self.metadata["render_modes"])
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
         self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.config.step_s)}
         self.render_mode = render_mode
         targets = WheelTargets(self.config.robot)
         self._to_wheels = targets.of_wheels if action == "wheels" else targets.of_twist
@@ -116,7 +117,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )  # fmt: skip
         self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
         self._set_up(plan, episode_seed)
-        info = self._first_look()
+        info = self.first_look()
         self._viewer.show(self)
         return self.observe(), info
 
@@ -149,7 +150,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Have the backend start over at its start pose ``(3,)``, in its own frame."""
         self.backend.reset(start, seed=seed)
 
-    def _first_look(self) -> dict[str, Any]:
+    def first_look(self) -> dict[str, Any]:
         """Take the first scan, and return the first info."""
         backend, truth = self.backend, self.truth
         true_pose = truth.ground.in_start_frame(np.array(truth.world.plan.start))
@@ -172,7 +173,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         config, world = self.config, self.truth.world
         collisions = world.collisions
         world.step(self._to_wheels(action), config.step_s, config.physics_step_s)
-        info = self._perceive(collisions)
+        info = self.perceive(collisions)
         success = info["coverage"] >= config.coverage_target
         terminated = success or (config.terminate_on_collision and world.collisions > 0)
         if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
@@ -181,7 +182,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._viewer.show(self)
         return self.observe(), float(sum(info["reward_terms"].values())), bool(terminated), False, info
 
-    def _perceive(self, collisions: int) -> dict[str, Any]:
+    def perceive(self, collisions: int) -> dict[str, Any]:
         """Sense what a step brought, believe it, and return its info; there were so many collisions before."""
         config, truth, backend = self.config, self.truth, self.backend
         world = truth.world

@@ -1,4 +1,4 @@
-"""One episode: what is really so, what happened, and what it amounts to (contract.md, "Command line")."""
+"""One episode: what is really so, what happened, and what it amounts to."""
 
 from __future__ import annotations
 

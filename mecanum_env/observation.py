@@ -1,4 +1,4 @@
-"""Observations: pure functions of the belief (contract.md, "Observation"). Every call returns fresh arrays."""
+"""Observations: pure functions of the belief, in new arrays unless ``out`` gives those to be filled."""
 
 from __future__ import annotations
 

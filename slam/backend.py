@@ -30,7 +30,7 @@ __all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
 class BackendConfig(Config):
     """What every backend needs to know of the robot, and of the map it shall draw."""
 
-    # L: how far ahead of the body's centre the sensor sits (theory.md A)
+    # L: how far ahead of the body's centre the sensor sits
     lidar_offset_m: Annotated[float, Within("[-10, 10]")] = 0.2
     body_radius_m: Annotated[float, Within("[0.01, 10]")] = 0.25  # of the disc that is marked as visited
     # Of the body, its middle at the pose: whether it touches something. 0: not known, and not asked.

@@ -27,7 +27,6 @@ class Teammate(NamedTuple):
     pose: Array  # (3,) in the belief's frame
     age_s: float  # since it was there
     goal: Array | None = None  # (2,) where it said to go [m], in the belief's frame
-    radius_m: float = 0.35  # of the circle around its body
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

@@ -1,6 +1,6 @@
 """Compressed EKF-SLAM: an ordinary filter over the landmarks near by; the rest of the map is updated later.
 
-After Guivant and Nebot 2001, in another form than the design's invariant-ekf.md has. While the robot stays in one
+After Guivant and Nebot 2001, in a form of its own (docs/reference/compressed.md). While the robot stays in one
 region only the state's part *a*, robot and landmarks near by, is filtered. What that does to the rest *b* goes by
 way of their covariance, whose rank is low (:mod:`slam.gaussian.low_rank`): P_ab = U V. So a few numbers y, whose
 covariance with a is U, stand for all of b, as states beside the map that no scan shows
@@ -44,9 +44,8 @@ class CompressedEkfConfig(EkfConfig):
     crowd: Annotated[int, Within("[0, 10000]")] = 100  # landmarks: a region of more is smaller, and sooner left
     crowd_share: Annotated[float, Within("[0.001, 10]")] = 0.5  # ``leave_share`` of such a region, at least
     margin_m: Gap = 1.0  # beyond what the sensor can reach before that: landmarks so near are filtered, too
-    whole_up_to: Annotated[int, Within("[0, 1000000000]")] = (
-        0  # landmarks: so many are one region, wherever they are
-    )
+    # Landmarks: so many are one region, wherever they are.
+    whole_up_to: Annotated[int, Within("[0, 1000000000]")] = 0
     # What is left out of all correlations with what is far: root of the squares' sum.
     rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-10
 

@@ -1,4 +1,4 @@
-"""DP-SLAM: particles over occupancy grids without landmarks, backend ``dp-slam`` (theory.md B and D).
+"""DP-SLAM: particles over occupancy grids without landmarks, backend ``dp-slam`` (docs/reference/dp_slam.md).
 
 Eliazar and Parr's shared grid and ancestry tree (2003, 2004) hold the maps, so that memory and time do not
 multiply by the particles. Each particle's pose is drawn around where the scan fits its own map (Grisetti,

@@ -1,4 +1,4 @@
-"""EKF-SLAM over corner points (theory.md A): one joint Gaussian of the robot and every landmark.
+"""EKF-SLAM over corner points (docs/reference/ekf.md): one joint Gaussian of the robot and every landmark.
 
 The covariance is kept as its upper triangle. All observations of a scan make one stacked update, a rank-2m
 downdate of the triangle; a scan's own cost is linear in the landmarks but for that.
@@ -77,7 +77,7 @@ class EkfSlam(GaussianBackend):
         return Companions(len(self._match), len(self._x))
 
     def predict(self, odometry: Odometry) -> None:
-        """Move on by what the wheels measured (theory.md A, predict)."""
+        """Move on by what the wheels measured (docs/reference/ekf.md, Predict)."""
         self._settle_beliefs()
         self._move(odometry.dt, *self._measured(odometry, self._noise))
 

@@ -1,4 +1,4 @@
-"""FastSLAM (theory.md B, point 6): particles of the path, each with independent filters of its landmarks.
+"""FastSLAM (docs/reference/fastslam.md): particles of the path, each with independent filters of its landmarks.
 
 FastSLAM 1.0 draws a particle's pose from the motion model; 2.0 from the motion model given what is seen now,
 which leaves the weights more even. Both are one computation: a particle has a Gaussian of its pose since the last
@@ -52,9 +52,8 @@ class FastSlamConfig(BackendConfig):
     resampling: ResamplingPolicy = field(default_factory=ResamplingPolicy)
     gate: Positive = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
     max_turn_deg: Annotated[float, Within("[0, 180]")] = 35.0  # difference in a corner's direction
-    known_gate: Annotated[float, Within("(0, inf]")] = (
-        math.inf
-    )  # the same for observations with ids: a finite one refuses misread labels
+    # The gate of observations with ids: a finite one refuses misread labels.
+    known_gate: Annotated[float, Within("(0, inf]")] = math.inf
     # An observation that no landmark of a particle explains weighs as one at this squared distance from a
     # landmark that is known exactly: as the gate, so that to leave it unexplained never pays.
     unexplained: NotNegative = 11.83
@@ -96,7 +95,7 @@ class FastSlam(LandmarkBackend):
     # ---- the filter ----------------------------------------------------------------------------------------
 
     def predict(self, odometry: Odometry) -> None:
-        """Move every particle on by what the wheels measured (theory.md A, predict)."""
+        """Move every particle on by what the wheels measured (docs/reference/fastslam.md, Proposal)."""
         (vx, vy, omega), var_v, var_w = self._measured(odometry, self.config.odometry)
         twist = np.array([vx, vy, omega])
         self._inherited.predict(self._mean, twist, odometry.dt, var_v, var_w)

@@ -22,6 +22,7 @@ __all__ = [
     "log",
     "relative",
     "rotation",
+    "symmetric",
     "transform_points",
     "wrap",
     "wrap_scalar",
@@ -100,6 +101,11 @@ def transform_points(pose_a_b: Array, points_b: Array) -> Array:
     c, s, px, py = math.cos(theta), math.sin(theta), points[..., 0], points[..., 1]
     # No product of matrices: BLAS wakes its threads for many points, and they spin for tens of milliseconds after.
     return np.stack([c * px - s * py + x, s * px + c * py + y], axis=-1)
+
+
+def symmetric(upper: Array) -> Array:
+    """Return the symmetric matrix ``(n, n)`` that has this upper triangle; what is below it does not count."""
+    return np.asarray(np.triu(upper) + np.triu(upper, 1).T, np.float64)
 
 
 def about_z(turn: float) -> Array:

@@ -1,6 +1,6 @@
 """Right-invariant EKF-SLAM: the standard filter with another error, so that it never grows sure of a heading.
 
-After Barrau and Bonnabel, and Zhang et al. 2017, as worked out in the design's invariant-ekf.md. The covariance
+After Barrau and Bonnabel, and Zhang et al. 2017, as worked out in docs/reference/invariant.md. The covariance
 stays in ordinary coordinates, where the two filters predict, observe and add landmarks alike. What differs is how
 a correction is applied: along the exponential of SE(2), by which the whole map turns about the origin with the
 robot's heading, and with a change of the covariance's coordinates to the new estimate (the *reset*).
@@ -146,7 +146,7 @@ def invariant_update(
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 
     The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
-    + V Aᵀ (invariant-ekf.md, Retract and Reset) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
+    + V Aᵀ (docs/reference/invariant.md) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
     x and y, A's column and −V's; what of it is by a wall's own α follows. ``marks`` tells walls from points;
     ``delta`` ``(≥ n,)`` holds after it, where a wall's r stands in the state, what it changes by that α, else 0;
     ``limits`` are the standard filter's.

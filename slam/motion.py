@@ -1,4 +1,4 @@
-"""The motion of the robot between two scans: twist model, Jacobians and odometry noise (theory.md A, predict)."""
+"""Motion between two scans: twist model, Jacobians and odometry noise (docs/reference/motion.md)."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class OdometryNoise(Config):
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:
-    """Return the pose ``(3,)`` after a body twist ``(3,)`` held for ``dt`` [s]: f(X, u) of theory.md A.
+    """Return the pose ``(3,)`` after a body twist ``(3,)`` held for ``dt`` [s]: f(X, u) of docs/reference/ekf.md.
 
     The heading half way through the step is used, which agrees with the exact SE(2) exponential to third
     order in ω dt, where the paper's own formula agrees to first.
@@ -166,7 +166,7 @@ def predict_robot(
 ) -> None:
     """Move the robot part of a joint Gaussian: x[:3], and the first three rows of p's upper triangle.
 
-    P_rr ← Fx P_rr Fxᵀ + Fu V Fuᵀ, P_rm ← Fx P_rm (theory.md A, predict); ``n`` is the size of the state.
+    P_rr ← Fx P_rr Fxᵀ + Fu V Fuᵀ, P_rm ← Fx P_rm (docs/reference/ekf.md, Predict); ``n`` is the size of the state.
     """
     middle = x[2] + 0.5 * omega * dt
     c, s = math.cos(middle), math.sin(middle)

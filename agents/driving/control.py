@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
-from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points
+from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points, scan_shares
 from agents.driving.sides import parting_lines
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -156,15 +157,12 @@ class PathFollower:
             self._robot.circumscribed_radius_m + gap,
             self._pace,
         )
-        sides = self._sides(belief, near)
-        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar), sides)
+        return self._send(velocity, turn, observation, belief, near, gap)
 
     def drive(self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the twist ``(3,)`` nearest to a velocity ``(2,)`` in the belief's frame that is safe."""
-        pose = np.asarray(belief.pose, dtype=np.float64)
         near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
-        sides = self._sides(belief, near)
-        return self._send(velocity, turn, pose, near, gap, scan_points(observation, self._lidar), sides)
+        return self._send(velocity, turn, observation, belief, near, gap)
 
     def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
@@ -172,16 +170,19 @@ class PathFollower:
         For a robot that does not know where on the map it is; where it came from, the map shows most. Where no
         beam returns, from too wide a hall or a blind lidar, it goes back over what it has crept, and then stands.
         """
-        hits, pose = scan_points(observation, self._lidar), np.asarray(belief.pose, dtype=np.float64)
-        if observation is None:
+        lidar, pose = self._lidar, np.asarray(belief.pose, dtype=np.float64)
+        scan = scan_shares(observation, lidar)
+        if scan is None:
             return np.zeros(3)
-        share, lidar = np.asarray(observation["scan"], np.float64), self._lidar
+        share = scan.astype(np.float64)
         if share.min() >= 1.0:
-            return self._creep_back(pose, belief)
+            return self._creep_back(pose, observation, belief)
         if not self._crept or math.dist(self._crept[-1], pose[:2]) >= _CREPT_M:
             self._crept.append((float(pose[0]), float(pose[1])))
-        width = max(round(_CREEP_HALF_RAD / lidar.angle_increment), 1)
-        room = np.min([np.roll(share, k) for k in range(-width, width + 1)], axis=0) * lidar.range_max_m
+        width = min(max(round(_CREEP_HALF_RAD / lidar.angle_increment), 1), (lidar.beams - 1) // 2)
+        # Beside a view that is not all round nothing is known to be free.
+        beyond = np.pad(share, width, mode="wrap") if lidar.field_of_view_deg >= 360.0 else np.pad(share, width)
+        room = sliding_window_view(beyond, 2 * width + 1).min(axis=1) * lidar.range_max_m
         angles = pose[2] + lidar.angle_min + lidar.angle_increment * np.arange(lidar.beams)
         if self._creeping is None:
             back = self._path[0] - pose[:2]
@@ -189,10 +190,9 @@ class PathFollower:
         worth = np.minimum(room, _CREEP_ROOM_M) * (2.0 + np.cos(angles - self._creeping))
         self._creeping = angle = float(angles[int(np.argmax(worth))])
         velocity = _CREEP_M_S * np.array([math.cos(angle), math.sin(angle)])
-        near = local_map(belief, WINDOW_M)
-        return self._send(velocity, 0.0, pose, near, -math.inf, hits, self._sides(belief, near))
+        return self._send(velocity, 0.0, observation, belief, local_map(belief, WINDOW_M), -math.inf)
 
-    def _creep_back(self, pose: Array, belief: Belief) -> Array:
+    def _creep_back(self, pose: Array, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return the twist ``(3,)`` that creeps to the last place that it crept over, and from there on back."""
         if self._crept and math.dist(self._crept[-1], pose[:2]) < 0.5 * _CREPT_M:
             self._crept.pop()
@@ -201,17 +201,11 @@ class PathFollower:
         way = np.array(self._crept[-1]) - pose[:2]
         self._creeping = math.atan2(way[1], way[0])
         velocity = _CREEP_M_S * way / math.hypot(*way)
-        near = local_map(belief, WINDOW_M)
-        return self._send(velocity, 0.0, pose, near, -math.inf, np.zeros((0, 2)), self._sides(belief, near))
+        return self._send(velocity, 0.0, observation, belief, local_map(belief, WINDOW_M), -math.inf)
 
     def room(self, belief: Belief, points: Array) -> Array:
         """Return the clearance [m] at points ``(n, 2)`` near the robot, in the belief's frame."""
         return local_map(belief, WINDOW_M).at(points)
-
-    def _sides(self, belief: Belief, near: LocalMap) -> Array:
-        """Return the lines ``(k, 3)`` that part the robot from others nearby, in the body frame."""
-        gap = self.config.robot_gap_m
-        return parting_lines(belief, near, self._half, gap_m=gap, speed_m_s=self._robot.max_speed_m_s)
 
     def _map_gap(self, belief: Belief) -> float:
         """Return what the body keeps from the map [m]: the more, the less sure the position is."""
@@ -219,11 +213,16 @@ class PathFollower:
         return self.config.map_gap_m + min(2.0 * sigma, self.config.max_sigma_gap_m)
 
     def _send(
-        self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, hits: Array, sides: Array
-    ) -> Array:
+        self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief, near: LocalMap,
+        gap: float,
+    ) -> Array:  # fmt: skip
         """Smooth, bound and check a wanted velocity (belief frame) and turn rate; remember what goes out."""
-        sent, self._velocity, self.blocked = send(
-            velocity, turn, self._velocity, self._turn, pose, near, gap, hits, sides, self._motors, self._guard
+        sides = parting_lines(
+            belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s
         )
+        sent, self._velocity, self.blocked = send(
+            velocity, turn, self._velocity, self._turn, np.asarray(belief.pose, dtype=np.float64), near, gap,
+            scan_points(observation, self._lidar), sides, self._motors, self._guard,
+        )  # fmt: skip
         self._turn = float(sent[2])
         return np.asarray(sent)

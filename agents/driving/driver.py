@@ -194,15 +194,19 @@ class Driver(Agent):
             self._anchor, self._anchored_at = (x, y, heading), now
         stuck = now - self._anchored_at > patience.stuck_s
         if (stuck or now > self._deadline) and now >= self._recover_until:
-            trouble = self._troubles.note(self._target)
-            trouble.avoid_until_s = now + patience.avoid_s * 2.0**trouble.failures
-            if self._giving_way.nearest(belief, self.config.giving_way.near_m) is None:
-                trouble.failures += 1  # else it was another robot that stood in the way
+            self._put_off(self._target, belief)
             self._anchored_at = now
             self._deadline = math.inf
             self._target = None
             self._recover_until = now + patience.recover_s if stuck else -math.inf
             self._chosen_at = -math.inf
+
+    def _put_off(self, target: Array, belief: Belief) -> None:
+        """Put last for a while what could not be driven to: the longer, the oftener."""
+        trouble = self._troubles.note(target)
+        trouble.avoid_until_s = self._time + self.config.patience.avoid_s * 2.0**trouble.failures
+        if self._giving_way.nearest(belief, self.config.giving_way.near_m) is None:
+            trouble.failures += 1  # else it was another robot that stood in the way
 
     def _back_off(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Move to where there is more room, turning a little: what stood in the way is then seen anew."""

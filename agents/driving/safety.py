@@ -20,7 +20,10 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
 from slam.types import Array
 
-__all__ = ["Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points"]
+__all__ = [
+    "Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points",
+    "scan_shares",
+]  # fmt: skip
 
 _SCAN_WITHIN_M = 2.0
 _POSES = 8  # of a predicted motion, the present one included
@@ -79,8 +82,8 @@ def footprint(robot: RobotConfig, spacing_m: float = 0.05) -> Array:
     return np.ascontiguousarray(np.vstack(sides + ends))
 
 
-def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig) -> Array:
-    """Return what the scan in an observation hit within 2 m ``(n, 2)`` [m], in the body frame; empty without one.
+def scan_shares(observation: Mapping[str, Any] | None, lidar: LidarConfig) -> NDArray[Any] | None:
+    """Return the scan in an observation ``(beams,)``, ranges as shares of the greatest; None without one.
 
     Raises
     ------
@@ -88,13 +91,22 @@ def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig) -> Ar
         If the scan has another number of beams than the lidar.
     """
     if not isinstance(observation, Mapping) or "scan" not in observation:
-        return np.zeros((0, 2))
-    share = np.asarray(observation["scan"], dtype=np.float64)
+        return None
+    share = np.asarray(observation["scan"])
     if share.shape != (lidar.beams,):
         raise ValueError(
             f"the scan has shape {share.shape}, the agent's lidar {lidar.beams} beams: "
             "give agents.make the environment's lidar"
         )
+    return share
+
+
+def scan_points(observation: Mapping[str, Any] | None, lidar: LidarConfig) -> Array:
+    """Return what the scan in an observation hit within 2 m ``(n, 2)`` [m], in the body frame, if there is one."""
+    share = scan_shares(observation, lidar)
+    if share is None:
+        return np.zeros((0, 2))
+    share = share.astype(np.float64)
     return _hits(share, _directions(lidar), lidar.offset_m, lidar.range_min_m, lidar.range_max_m)
 
 

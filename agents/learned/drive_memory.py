@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.learned.drive_plan import descend, distances, node_prices
+from agents.ways.boxes import Box, carried
 from slam.belief import Belief
 from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Array, Floats
@@ -142,8 +143,9 @@ class MapMemory:
         frame = (*grid.lattice_origin, *shape)
         whole = grid is not self._grid or frame != self._frame
         if whole:
-            corner = (self._frame[0] - frame[0]) // block, (self._frame[1] - frame[1]) // block
-            self._stalled = _moved(self._stalled, corner, shape)
+            row, col = (self._frame[0] - frame[0]) // block, (self._frame[1] - frame[1]) // block
+            old, new = Box(0, 0, *self._stalled.shape).moved(row, col), Box(0, 0, *shape)
+            self._stalled = carried(self._stalled, old, new, old.within(new), 0.0)
             self._log_price, self._goal_m = np.zeros((2, *shape), np.float32)
         box = (n // block for n in grid.drawn_since(self._drawing))
         self._grid, self._frame, self._drawing = grid, frame, grid.drawings
@@ -240,24 +242,9 @@ def _draw(log_odds: NDArray[np.int8], visited: Bytes, block: int, out: Bytes) ->
 
 def _used(known: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Return the rows and columns in which anything is known, and a margin."""
-    rows, cols = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-    if not len(rows):
-        return slice(0, known.shape[0]), slice(0, known.shape[1])
-    return (
-        slice(max(int(rows[0]) - MARGIN, 0), int(rows[-1]) + MARGIN + 1),
-        slice(max(int(cols[0]) - MARGIN, 0), int(cols[-1]) + MARGIN + 1),
-    )
-
-
-def _moved(values: Floats, corner: tuple[int, int], shape: tuple[int, int]) -> Floats:
-    """Return a map of this shape with the values' first pixel at ``corner``; what lies beyond it is dropped."""
-    out = np.zeros(shape, np.float32)
-    (r, c), (rows, cols) = corner, values.shape
-    r0, c0 = max(r, 0), max(c, 0)
-    r1, c1 = min(r + rows, shape[0]), min(c + cols, shape[1])
-    if r1 > r0 and c1 > c0:
-        out[r0:r1, c0:c1] = values[r0 - r : r1 - r, c0 - c : c1 - c]
-    return out
+    whole = Box(0, 0, *known.shape)
+    used = Box.of(known).grown(MARGIN).within(whole)
+    return (whole if used.empty else used).slices
 
 
 def _smooth(path: Array) -> Array:

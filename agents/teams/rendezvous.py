@@ -104,5 +104,12 @@ class Rendezvous(TeamTour):
 
     def _watch(self, belief: Belief) -> None:
         """Take no note of what it sees from the meeting place, nor of standing there."""
-        if not self._meeting:
+        # The others may stand on the very place.
+        if self._meeting and self._follower.remaining_m <= self.config.giving_way.near_m:
+            self._anchored_at, self._arrived_for = self._time, 0.0
+        else:
             super()._watch(belief)
+
+    def _put_off(self, target: Array, belief: Belief) -> None:
+        if not self._meeting:  # an appointment is kept, as often as it does not get there
+            super()._put_off(target, belief)

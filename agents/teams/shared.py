@@ -9,14 +9,12 @@ from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer
 from agents.teams.crew import Crew, muster
-from agents.teams.sharing import share_tours
+from agents.teams.sharing import FAR_M, share_tours
 from agents.ways.travel import between
 from slam.belief import Belief
 from slam.settings import Config, Duration, Few, NotNegative
 
 __all__ = ["Shared", "SharingConfig"]
-
-_FAR = 1e6  # [m] farther than anything is
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +42,8 @@ class Shared(Explorer):
         """Return the crew's columns that fall to this robot: the tour that does when all are shared out."""
         config = self._sharing()
         near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]
-        starts, cells = np.minimum(crew.held(config.hold_m)[:, near], _FAR), crew.cells[near]
-        distance = np.nan_to_num(between(found.cost_map, crew.travel, cells, searched=0), nan=_FAR, posinf=_FAR)
+        starts, cells = np.minimum(crew.held(config.hold_m)[:, near], FAR_M), crew.cells[near]
+        distance = np.nan_to_num(between(found.cost_map, crew.travel, cells, searched=0), nan=FAR_M, posinf=FAR_M)
         owner = share_tours(starts, distance)
         return np.asarray(near[owner == crew.own])
 

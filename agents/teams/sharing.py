@@ -8,11 +8,12 @@ from scipy.optimize import linear_sum_assignment
 
 from slam.types import Array, Indices
 
-__all__ = ["assign", "share_tours", "tour_length"]
+__all__ = ["FAR_M", "assign", "share_tours", "tour_length"]
 
 _MOST_ROUNDS = 50
 _LEAST = 1e-7
-_FAR = 1e6  # [m] farther than anything is
+FAR_M = 1e6
+"""Farther [m] than anything is."""
 _POWER = 3.0  # of the tours' lengths, summed up: the higher, the more the longest one counts
 
 
@@ -23,7 +24,7 @@ def assign(costs: Array) -> Indices:
     """
     owned = np.full(len(costs), -1, dtype=np.int64)
     if costs.size:
-        rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, _FAR))
+        rows, columns = linear_sum_assignment(np.where(np.isfinite(costs), costs, FAR_M))
         reached = np.isfinite(costs[rows, columns])
         owned[rows[reached]] = columns[reached]
     return owned

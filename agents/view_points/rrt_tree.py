@@ -18,6 +18,8 @@ from slam.types import Array
 
 __all__ = ["Tree", "mean_shift"]
 
+_SHIFTS = 20  # at most, before a point counts as resting
+
 
 class Tree:
     """Nodes in the belief's frame, each with an edge through free cells to its parent, an earlier node.
@@ -77,14 +79,14 @@ class Tree:
         return np.asarray(hits[:found] * resolution + origin)
 
 
-def mean_shift(points: Array, bandwidth: float, iterations: int = 20) -> NDArray[np.int64]:
+def mean_shift(points: Array, bandwidth: float) -> NDArray[np.int64]:
     """Return the indices ``(k,)`` of one of ``points`` ``(n, 2)`` per cluster: the one nearest to its mode.
 
     A flat kernel (Comaniciu and Meer, 2002): each point moves to the mean of the points within ``bandwidth`` until
     it rests; what comes to rest together is a cluster.
     """
     chosen = np.empty(len(points), dtype=np.int64)
-    count = _shift(np.ascontiguousarray(points), bandwidth, iterations, np.empty((len(points), 2)), chosen)
+    count = _shift(np.ascontiguousarray(points), bandwidth, np.empty((len(points), 2)), chosen)
     return np.unique(chosen[:count])
 
 
@@ -176,13 +178,13 @@ def _prune(classes: NDArray[np.int8], cells: Array, parents: NDArray[np.int64], 
 
 
 @njit(cache=True, nogil=True)
-def _shift(points: Array, bandwidth: float, iterations: int, modes: Array, chosen: NDArray[np.int64]) -> int:
+def _shift(points: Array, bandwidth: float, modes: Array, chosen: NDArray[np.int64]) -> int:
     """Fill ``modes`` with one mode per cluster and ``chosen`` with the point nearest to it; return how many."""
     count = 0
     for i in range(points.shape[0]):
         mx, my = points[i, 0], points[i, 1]
         nearest = i
-        for _ in range(iterations):
+        for _ in range(_SHIFTS):
             x = y = 0.0
             near, least = 0, np.inf
             for j in range(points.shape[0]):

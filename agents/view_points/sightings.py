@@ -20,10 +20,7 @@ from slam.grids.occupancy import FREE
 from slam.settings import Config, Length, Positive, Sigma
 from slam.types import LINE, Array
 
-__all__ = ["BEAM", "SensorModel", "expected_sightings"]
-
-BEAM = 10
-"""Columns of an observation row, as :meth:`slam.features.extraction.FeatureExtractor.extract` has them."""
+__all__ = ["SensorModel", "expected_sightings"]
 
 _NEAR = 0.05  # m: nearer than this nothing is seen
 _STEP = 0.7  # cells: less than one, so that no wall is stepped over, diagonal ones included

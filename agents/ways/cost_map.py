@@ -172,13 +172,15 @@ class CostMaps:
         self, belief: Belief, corner: tuple[float, float], resolution: float, weight: NDArray[np.float32]
     ) -> list[Box]:
         """Make ways dearer where they lead through other robots; return the boxes of cells in which they do."""
-        config, boxes = self._config, []
+        config, robot = self._config, self._robot
+        boxes = []
         for mate in belief.teammates:
             x, y = (float(v) for v in mate.pose[:2])
             away = math.hypot(x - float(belief.pose[0]), y - float(belief.pose[1]))
             if away > config.robots_within_m or mate.age_s > _OLD_S:
                 continue
-            reach = (self._robot.inscribed_radius_m + mate.radius_m + config.robot_margin_m) / resolution
+            bodies_m = robot.inscribed_radius_m + robot.circumscribed_radius_m  # a team's robots are alike
+            reach = (bodies_m + config.robot_margin_m) / resolution
             at = (y - corner[1]) / resolution, (x - corner[0]) / resolution
             row, col = math.floor(at[0]), math.floor(at[1])
             box = Box(row, col, row + 1, col + 1).grown(math.ceil(reach)).within(Box(0, 0, *weight.shape))

@@ -94,7 +94,7 @@ class GivingWay:
 
         Where the other's goal is not known, beside the other.
         """
-        reach = (self._radius_m + mate.radius_m + self.config.beside_m) / cost_map.resolution
+        reach = (2.0 * self._radius_m + self.config.beside_m) / cost_map.resolution  # a team's robots are alike
         open_ = np.ones(cost_map.weight.shape, np.uint8)
         open_[tuple(_way(cost_map, mate).T)] = 0
         beside = cv2.distanceTransform(open_, cv2.DIST_L2, cv2.DIST_MASK_5) >= reach

@@ -1,6 +1,6 @@
 """The mecanum robot: exact kinematics, and its wheels' dynamics as one Numba kernel.
 
-Equations and signs are those of theory.md, "The robot itself". Wheels are always in the order front left,
+Equations and signs are those of docs/reference/robot.md. Wheels are always in the order front left,
 front right, rear left, rear right (FL, FR, RL, RR); the body frame has x forward, y left, θ counter-clockwise.
 """
 
@@ -170,7 +170,7 @@ def _matrices(robot: RobotConfig) -> tuple[Array, Array]:
     lever = robot.lever_m
     columns = [np.ones(4), np.array(ROLLER_SIGN), lever * np.array(LEVER_SIGN)]
     inverse = np.column_stack(columns) / robot.wheel_radius_m
-    # The columns are orthogonal, so the pseudo-inverse is the scaled transpose (theory.md).
+    # The columns are orthogonal, so the pseudo-inverse is the scaled transpose.
     forward = np.vstack([columns[0], columns[1], columns[2] / lever**2]) * (robot.wheel_radius_m / 4.0)
     return inverse, forward
 
@@ -266,7 +266,7 @@ def turn_wheels(
     state: Array, targets: Array, radii: Array, friction: Array, constants: Array, m: Array, h: float,
     substeps: int, motion: Array,
 ) -> None:  # fmt: skip
-    """Integrate wheels, motors, traction and body velocity over substeps; theory.md, "The robot itself".
+    """Integrate wheels, motors, traction and body velocity over substeps (docs/reference/robot.md).
 
     Each substep splits into motors, traction and drift. Traction is semi-implicit: with k_i = μ N/√(s_i² + s₀²)
     frozen at the slip s_i at its start, the forces −k_i s_i are taken at its end, which costs a 3 × 3 solve

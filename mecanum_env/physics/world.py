@@ -111,7 +111,7 @@ class World:
         floor: Floor | None = None,
         shortcut: bool = True,
     ) -> None:
-        self.plan, self.robot, self.noise = plan, robot, noise
+        self.plan, self.robot = plan, robot
         self.floor = build_floor(plan, noise, rng) if floor is None else floor
         self._rng = rng
         self._slips, self._slips_left = np.empty((_AHEAD, 4)), 0

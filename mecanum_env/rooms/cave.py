@@ -15,7 +15,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
-from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise
+from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise, signed_area
 from slam.settings import Config, Share, Span, require
 from slam.types import Array
 
@@ -49,10 +49,8 @@ class CaveConfig(Config):
 
     area_m2: Annotated[tuple[float, float], Span("[30, 300]")] = (60.0, 150.0)  # free floor
     chamber_m: Annotated[tuple[float, float], Span("[1, 4]")] = (1.2, 2.3)  # radius of a chamber
-    passage_m: Annotated[tuple[float, float], Span("[1.3, 4]")] = (
-        1.4,
-        2.2,
-    )  # width of a passage, before the noise
+    # Width of a passage, before the noise.
+    passage_m: Annotated[tuple[float, float], Span("[1.3, 4]")] = (1.4, 2.2)
     loops: Share = 0.6  # probability of a passage beyond those that join every chamber
     roughness: Share = 0.5  # 0 smooth ovals and tubes, 1 as ragged as can be
     pillars: Annotated[tuple[int, int], Span("[0, 10]")] = (0, 3)
@@ -225,7 +223,7 @@ def _distance(mask: Mask | NDArray[np.uint8]) -> Field:
 def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
     """Return walls ``(n, 4)`` [m] where a field is zero, and columns and rows of the raster around them."""
     lines = level_loops(field, CELL_M, smooth_m=_SMOOTH_M)
-    loops = [facets(line) for line in lines if abs(_area(line)) >= _LEAST_ROCK_M2]
+    loops = [facets(line) for line in lines if abs(signed_area(line)) >= _LEAST_ROCK_M2]
     points = np.vstack(loops)
     # By whole cells: the field's lattice becomes the plan's.
     shift = np.floor((points.min(axis=0) - _MARGIN_M) / CELL_M) * CELL_M
@@ -233,12 +231,6 @@ def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
     loops = [np.round(loop - shift, 6) for loop in loops]
     walls = np.vstack([np.hstack([loop, np.roll(loop, -1, axis=0)]) for loop in loops])
     return walls, (int(size[0]), int(size[1]))
-
-
-def _area(line: Array) -> float:
-    """Return the area [m²] within a closed line of points ``(k, 2)``, negative where it runs clockwise."""
-    x, y = line.T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _pillars(free: Mask, config: CaveConfig, rng: np.random.Generator) -> Array:

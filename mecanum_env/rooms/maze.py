@@ -26,10 +26,8 @@ class MazeConfig(Config):
 
     columns: Annotated[tuple[int, int], Span("[2, 24]")] = (6, 8)
     rows: Annotated[tuple[int, int], Span("[2, 24]")] = (6, 8)
-    corridor_m: Annotated[tuple[float, float], Span("[1.1, 4]")] = (
-        1.2,
-        1.6,
-    )  # width, drawn for each column and each row
+    # Width, drawn for each column and each row.
+    corridor_m: Annotated[tuple[float, float], Span("[1.1, 4]")] = (1.2, 1.6)
     wall_m: Annotated[tuple[float, float], Span("[0.05, 1]")] = (0.1, 0.2)  # thickness, one for the maze
     loops: Share = 0.15  # share of the perfect maze's inner walls that are taken out
 

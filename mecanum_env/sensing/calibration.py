@@ -26,7 +26,7 @@ _LEAST_RANGE_SIGMA_M = 0.0001  # of a lidar that has no noise: no filter divides
 
 
 def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
-    """Return V for a robot and its declared noise (theory.md A: "found by experiment", here from its parts).
+    """Return V for a robot and its declared noise (docs/reference/motion.md), from its parts.
 
     Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
     within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with

@@ -1,4 +1,4 @@
-"""Odometry calibration: V of the simulated robot, found by experiment (theory.md A, predict).
+"""Odometry calibration: V of the simulated robot, found by experiment (docs/reference/motion.md).
 
 The robot is driven over an open floor, and what its wheels say is held against where it truly went. A wheel's
 radius stays wrong for a whole episode, so there are two answers: the *white* one, of single steps, and the

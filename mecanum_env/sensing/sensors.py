@@ -67,7 +67,7 @@ def _noisy_sweep(
 
 
 class Lidar:
-    """A planar lidar at A, ``offset_m`` ahead of the robot's centre (theory.md A).
+    """A planar lidar at A, ``offset_m`` ahead of the robot's centre (docs/reference/sensors.md).
 
     Parameters
     ----------
@@ -79,7 +79,6 @@ class Lidar:
 
     def __init__(self, config: LidarConfig, noise: NoiseConfig) -> None:
         self.config = config
-        self.noise = noise
         self._angle_min, self._angle_increment = config.angle_min, config.angle_increment
         self._directions = beam_directions(config.beams, self._angle_min, self._angle_increment)
         # One array, since each argument of a call takes time to unpack.
@@ -158,8 +157,6 @@ class WheelEncoders:
     """
 
     def __init__(self, robot: RobotConfig, noise: NoiseConfig, rng: np.random.Generator) -> None:
-        self.robot = robot
-        self.noise = noise
         self._fixed = np.concatenate([
             [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m, expected_share(noise)], creep(robot, noise),
             traction_constants(robot, noise), forward_matrix(robot).ravel(),

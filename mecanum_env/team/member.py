@@ -109,17 +109,9 @@ class Member(ExploreEnv):
         self._others = [k for k in range(self._team.robots) if k != self.number]
         self.knowledge = Knowledge(self.number, self.backend, self._team)
 
-    def first_look(self) -> dict[str, Any]:
-        """Take the first scan; return the first info."""
-        return self._first_look()
-
     def wheel_targets(self, action: NDArray[np.float32]) -> Array:
         """Return the wheels' speeds ``(4,)`` [rad/s] that an action asks for."""
         return np.asarray(self._to_wheels(action), np.float64)
-
-    def perceive(self, collisions: int) -> dict[str, Any]:
-        """Sense what a step brought; return its info. There were so many collisions before."""
-        return self._perceive(collisions)
 
     def observe(self) -> Observation:
         """Return the observation of what is sensed, believed and known of the team now."""

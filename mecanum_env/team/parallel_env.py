@@ -51,6 +51,7 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
             check_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
         self.team = Team(**settings)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.team.config.step_s)}
         self.possible_agents = [f"robot_{k}" for k in range(len(self.team.members))]
         self.agents: list[str] = []
         self._numbers = {name: k for k, name in enumerate(self.possible_agents)}

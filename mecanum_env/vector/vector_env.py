@@ -38,8 +38,8 @@ Environments = Annotated[int, Within("[1, 4096]")]
 class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
     """Many exploration environments, stepped by the caller and its worker processes over shared memory.
 
-    Each is what ``gym.make`` makes, and with the same seeds everything is as in Gymnasium's ``SyncVectorEnv``, bit
-    for bit, however many workers there are::
+    Each is what ``gym.make`` makes, and with the same seeds all that ``reset`` and ``step`` return is as from
+    Gymnasium's ``SyncVectorEnv``, bit for bit, however many workers there are::
 
         envs = gym.make_vec("mecanum_env/Explore-v0", num_envs=8, vectorization_mode="vector_entry_point")
 
@@ -51,7 +51,8 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         Processes, each with its share of them, the caller's own among them; if left out, one a core.
     autoreset_mode : AutoresetMode or str
         As in Gymnasium: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``. With the first, other
-        processes begin the next episode while the caller is still busy with the end of the last.
+        processes begin the next episode while the caller is still busy with the end of the last: what ``render``,
+        ``call`` and ``get_attr`` show between the two is of either, by which process it is in.
     copy : bool
         Whether ``reset`` and ``step`` return copies of the observations; else views, until the next step.
     max_episode_steps : int, optional

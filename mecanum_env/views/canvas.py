@@ -109,10 +109,10 @@ class Canvas:
         if len(points):
             cv2.polylines(self.image, [self.view.pixels(points)], closed, colour, px, cv2.LINE_AA, shift=_SHIFT)
 
-    def segments(self, ends: Array, colour: Colour, *, px: int = 1) -> None:
+    def segments(self, ends: Array, colour: Colour) -> None:
         """Draw many segments ``(n, 4)``: x1, y1, x2, y2."""
         pairs = list(self.view.pixels(ends.reshape(-1, 2)).reshape(-1, 2, 2))
-        cv2.polylines(self.image, pairs, False, colour, px, cv2.LINE_AA, shift=_SHIFT)
+        cv2.polylines(self.image, pairs, False, colour, 1, cv2.LINE_AA, shift=_SHIFT)
 
     def dots(self, points: Array, colour: Colour, *, px: float) -> None:
         """Draw a disc of a radius in pixels at each point ``(n, 2)``."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms.floor_plan import FloorPlan
+from mecanum_env.rooms.outlines.smooth_outline import signed_area
 from mecanum_env.views.canvas import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, Canvas, Colour, View
 from slam.belief import Belief
 from slam.geometry import transform_points
@@ -56,7 +57,7 @@ def paint_plan(canvas: Canvas, plan: FloorPlan, frame: Array, *, ground: Colour 
     else:
         # Free space lies on the left of every wall: a loop that runs clockwise goes around something solid.
         for loop in loops:
-            if _signed_area(loop) < 0:
+            if signed_area(loop) < 0:
                 canvas.fill([seen(loop)], WALL)
         canvas.fill([seen(loop) for loop in loops], FLOOR)
     angles = np.linspace(0.0, 2.0 * math.pi, 64, endpoint=False)
@@ -90,11 +91,6 @@ def _loops(walls: Array) -> list[Array] | None:
         if chain:
             loops.append(walls[chain, :2])
     return loops or None
-
-
-def _signed_area(loop: Array) -> float:
-    x, y = loop.T
-    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
 def paint_landmarks(canvas: Canvas, belief: Belief, *, dot_px: float) -> None:

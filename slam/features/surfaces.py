@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from slam.types import Array
 
 MAX_LINES = 128
-_GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
+GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _OUTLIER = 4.0  # σ along the beam by which a point may be off the line that it is fitted to
-_HIDDEN = 0.25  # 1σ of that shift; see :func:`add_hidden`
+HIDDEN = 0.25  # 1σ of that shift; see :func:`add_hidden`
 _STEPS = 2  # of Gauss-Newton: the second takes its points by the line of the first
 MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
 
@@ -217,7 +217,7 @@ def add_hidden(line: Array, near: float, times: float) -> None:
     it is as long as it is high, it shifts the line the more, the shorter that is.
     """
     length = line[T1] - line[T0]
-    hidden = _HIDDEN * near * near / length
+    hidden = HIDDEN * near * near / length
     line[VAR_OFFSET] += times * hidden * hidden
     line[VAR_SLOPE] += times * 12.0 * hidden * hidden / (length * length)
 
@@ -242,7 +242,7 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
         d = nx * x + ny * y
         t = r * (nx * y - ny * x) / d - mt  # where the beam meets the line
         square = x * x + y * y
-        weight = square / (d * d + _GRAZING * square)
+        weight = square / (d * d + GRAZING * square)
         e = d - r
         if d <= 0.5 * r or e * e * weight > gate:
             continue

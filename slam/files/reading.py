@@ -128,9 +128,9 @@ def parse_toml(text: bytes, *, what: str) -> dict[str, Any]:
     return found
 
 
-def read_toml(path: Path, *, what: str = "config") -> dict[str, Any]:
-    """Return what a file of TOML says; ``ValueError`` in one line as of :func:`parse_toml`, with its name."""
-    return parse_toml(read_bytes(path, what=what, limit=_MOST_TOML), what=f"{what} {shown_path(path)}")
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return what a config of TOML says; else a ``ValueError`` as of :func:`parse_toml`, with the file's name."""
+    return parse_toml(read_bytes(path, what="config", limit=_MOST_TOML), what=f"config {shown_path(path)}")
 
 
 def parse_yaml(text: bytes, *, what: str) -> Any:

@@ -6,7 +6,7 @@ covariance and C their cross-covariance with the state, which stand beside x and
     predict   C_r ← C_r Fxᵀ
     update    W_e = L⁻¹ H Cᵀ,   e += W_eᵀ L⁻¹ ν,   C −= W_eᵀ W,   E −= W_eᵀ W_e
 
-(theory.md A with the state enlarged; W and L are :mod:`slam.gaussian.stacked_update`'s).
+(docs/reference/ekf.md with the state enlarged; W and L are :mod:`slam.gaussian.stacked_update`'s).
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _correct(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _reset(cross: Array, n: int, a: Array) -> None:
-    """C ← C (I + A S)ᵀ, S taking θ, x and y, and ``a`` A's columns by these (invariant-ekf.md, Reset)."""
+    """C ← C (I + A S)ᵀ, S taking θ, x and y, and ``a`` A's columns by these (docs/reference/invariant.md)."""
     for i in range(cross.shape[0]):
         theta, x, y = cross[i, 2], cross[i, 0], cross[i, 1]
         for j in range(n):

@@ -40,7 +40,7 @@ ANYWHERE_COV = np.diag([10.0**2, 10.0**2, math.pi**2])
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_landmark(x: Array, p: Array, n: int, z: Array, offset: float) -> None:
-    """Append a landmark seen at (ρ, φ) = z[:2] with covariance z[2:5] (theory.md A, add a landmark)."""
+    """Append a landmark seen at (ρ, φ) = z[:2] with covariance z[2:5] (docs/reference/ekf.md)."""
     if z[5] == LINE:
         _add_line(x, p, n, z, offset)
         return

@@ -25,14 +25,12 @@ class EkfConfig(BackendConfig):
 
     association: Association = "nearest"  # or "individual", "joint": see ASSOCIATIONS
     gate: Positive = 11.83  # squared Mahalanobis: 99.7 % of chi-square with two degrees of freedom
-    known_gate: Annotated[float, Within("(0, inf]")] = (
-        math.inf
-    )  # the same for observations with ids: a finite one refuses misread labels
+    # The same for observations with ids: a finite one refuses misread labels.
+    known_gate: Annotated[float, Within("(0, inf]")] = math.inf
     max_turn_deg: Annotated[float, Within("[0, 180]")] = 35.0  # difference in a corner's direction
-    loop_sigma_m: Annotated[float, Within("(0, inf]")] = (
-        math.inf
-    )  # old landmarks expected no better than to this count only together
-    lines: bool = False  # take straight walls for landmarks, too (theory.md A)
+    # Old landmarks expected no better than to this count only together.
+    loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
+    lines: bool = False  # take straight walls for landmarks, too
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 

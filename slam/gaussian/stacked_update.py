@@ -2,7 +2,7 @@
 
     S = H P Hᵀ + R = L Lᵀ,  W = L⁻¹ H P,  x += Wᵀ L⁻¹ ν,  P ← P − Wᵀ W
 
-(theory.md A, observe; the same as P − K S Kᵀ). From fifty landmarks on most of the time goes into the last
+(docs/reference/ekf.md; the same as P − K S Kᵀ). From fifty landmarks on most of the time goes into the last
 product, which is :mod:`slam.gaussian.tiles`'.
 """
 

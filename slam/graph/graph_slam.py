@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import SurfaceBackend
-from slam.geometry import about_z, compose, relative, wrap
+from slam.geometry import about_z, compose, relative, symmetric, wrap
 from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, links
 from slam.graph.settings import GraphSlamConfig
@@ -142,7 +142,7 @@ class GraphSlam(SurfaceBackend):
 
     def _step_cov(self) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the last scan, in the frame of then."""
-        return _full(self._step_upper) + self.mount.motion_cov(float(self._step[2]))
+        return symmetric(self._step_upper) + self.mount.motion_cov(float(self._step[2]))
 
     def _spun(self) -> Array:
         """Return what wheels that may have spun add to a motion's covariance ``(3, 3)``: all that they claim."""
@@ -167,16 +167,14 @@ class GraphSlam(SurfaceBackend):
         Where nothing but the wheels has told the motion for a way L, their lasting errors add up along all of it:
         after d more, (L + d)² - L² = 2 L d + d² times their variance. The noise that is taken for white has d².
         """
-        cov = _full(self._upper) + _EXACT * np.eye(3) + self.mount.motion_cov(float(self._motion[2]))
+        cov = symmetric(self._upper) + _EXACT * np.eye(3) + self.mount.motion_cov(float(self._motion[2]))
         lasting, lever = self.config.odometry.lasting, self.config.odometry.lever_m
         if lasting is not None:
             (before, turned), (way, turn) = self._blind, self._claimed
             share = (0.5 * lasting.radius_sigma) ** 2  # four wheels average
             rolled = 2.0 * math.hypot(before, lever * turned) * math.hypot(way, lever * turn)
-            linear, angular = (
-                share * rolled,
-                share * rolled / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn,
-            )
+            linear = share * rolled
+            angular = linear / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn
             cov += np.diag([linear, linear, angular])
         return cov
 
@@ -283,7 +281,3 @@ class GraphSlam(SurfaceBackend):
         x = keys[:, 0] + c * seen[:, 0] - s * seen[:, 1]
         y = keys[:, 1] + s * seen[:, 0] + c * seen[:, 1]
         return np.column_stack([x, y, wrap(keys[:, 2] + seen[:, 2])])
-
-
-def _full(upper: Array) -> Array:
-    return np.asarray(np.triu(upper) + np.triu(upper, 1).T, np.float64)

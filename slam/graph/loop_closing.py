@@ -17,7 +17,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.geometry import compose, inverse, wrap
+from slam.geometry import about_z, compose, inverse, wrap
 from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
 from slam.graph.surfaces import BeamEnds
 from slam.grids.match_kernels import field_sum
@@ -78,8 +78,7 @@ def find_candidate(
     seen = links(surfaces, ends, found, frames, common_var)
     info = np.zeros((3, 3))
     for k, p in enumerate(seen.patches.tolist()):
-        c, s = math.cos(frames[p, 2]), math.sin(frames[p, 2])
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = about_z(-frames[p, 2])
         info += turn.T @ seen.info[k] @ turn
     if float(np.linalg.eigvalsh(np.linalg.inv(info + 1e-3 * np.eye(3))[:2, :2])[-1]) > config.determined_m**2:
         return None

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.features.surfaces import MAX_LINES
+from slam.features.surfaces import HIDDEN, MAX_LINES
 from slam.graph.surfaces import BeamEnds
 from slam.types import Array
 
@@ -21,7 +21,6 @@ __all__ = ["ModelError", "Patch", "extended", "new_patches"]
 
 _SAMPLES_M = 0.1  # between the points that stand for a straight surface
 _FEWEST = 3  # beams that make a patch
-_HIDDEN = 0.25  # 1σ of a line's shift by a ledge, in units of its height² over the length: surfaces.fit's own
 _BENT_M = 0.003  # by which a wall may be off its line where it goes on
 _LONGEST_M = 20.0  # stretch of wall that is taken for straight
 _PRIOR_SIGMA = 0.02  # [m, rad] of a patch where the scan says nothing, as along a wall: nothing is held against it
@@ -55,7 +54,7 @@ class ModelError:
 
     def straight_var(self, length_m: float) -> float:
         """Return the variance [m²] of a straight surface: a ledge shifts it the more, the shorter it is."""
-        hidden = _HIDDEN * self.ledge_m**2 / max(length_m, self.ledge_m)
+        hidden = HIDDEN * self.ledge_m**2 / max(length_m, self.ledge_m)
         return self.straight_m**2 + hidden * hidden
 
 

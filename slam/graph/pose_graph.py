@@ -35,15 +35,17 @@ def relative_jacobians(first: Array, second: Array) -> tuple[Array, Array, Array
     return d, by_first, by_second
 
 
+_PHI = 9.0  # of a closing's chi-square, from which it counts less and less
+
+
 class PoseGraph:
     """Nodes, links and their solution. Node 0 has a prior; link k says ½(d-z)ᵀH(d-z) + gᵀ(d-z), d = i⁻¹ ∘ j."""
 
-    def __init__(self, pose: Array, pose_cov: Array, *, phi: float = 9.0) -> None:
+    def __init__(self, pose: Array, pose_cov: Array) -> None:
         self._poses = np.zeros((64, 3))
         self._poses[0] = pose
         self.size = 1
         self._prior, self._prior_info = np.array(pose, np.float64), np.linalg.inv(pose_cov)
-        self._phi = phi  # of a closing's chi-square, from which it counts less and less
         self._ends = np.zeros((256, 2), np.int64)
         self._z, self._g, self._h = np.zeros((256, 3)), np.zeros((256, 3)), np.zeros((256, 3, 3))
         self._closing = np.full(256, -1, np.int64)
@@ -128,7 +130,7 @@ class PoseGraph:
         if len(rows):
             excess = np.maximum(self._loss(rows, off[rows]), 0.0)
             chi2 = np.bincount(closing[rows], excess)
-            scale = np.minimum(1.0, 2.0 * self._phi / (self._phi + np.maximum(chi2, 1e-12)))
+            scale = np.minimum(1.0, 2.0 * _PHI / (_PHI + np.maximum(chi2, 1e-12)))
             weight[rows] = scale[closing[rows]] ** 2
         return weight
 

@@ -15,14 +15,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureExtractor
-from slam.features.surfaces import FIRST, LAST, MAX_LINES, NX, NY, R
+from slam.features.surfaces import FIRST, GRAZING, LAST, MAX_LINES, NX, NY, R
 from slam.types import Array, Scan
 
 __all__ = ["BeamEnds", "beam_ends"]
 
 Ints = NDArray[np.int64]
 
-_GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _FLATTEST = 0.15  # cosine of incidence below which a rough contour's normal means nothing
 _BENT = 1.3  # variance across, in units of what noise makes, beyond which five points go around a corner
 _PIECE_BEAMS, _PIECE_M, _PIECE_COS = 10, 0.6, 0.825  # largest piece of contour that is one surface
@@ -100,7 +99,7 @@ def _describe(
                 continue
             row[2], row[3] = -nx, -ny
             row[4], row[5] = x[i] - e * nx + offset, y[i] - e * ny
-            row[6] = sigma * sigma * max(c * c, _GRAZING)
+            row[6] = sigma * sigma * max(c * c, GRAZING)
             labels[count] = k
         else:
             spread = _contour_normal(ranges, x, y, surface, i, increment, range_min, reach, normal)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from slam.geometry import transform_points
+from slam.geometry import symmetric, transform_points
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
 from slam.settings import Config, Count, Few, Gap, NotNegative, Positive, Share
@@ -61,7 +61,7 @@ class ScanOdometry:
     @property
     def cov(self) -> Array:
         """Covariance ``(3, 3)`` of the motion since :meth:`settle`."""
-        return np.triu(self._upper) + np.triu(self._upper, 1).T
+        return symmetric(self._upper)
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""

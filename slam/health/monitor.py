@@ -92,7 +92,6 @@ class HealthMonitor:
         self.config = config
         self._against = _log_ratios(config.against_lost, config.against_fine)
         self._sharp = _log_ratios(config.sharp_lost, config.sharp_fine)
-        self._prior_odds = config.lost_per_scan
         self.restart(1.0)
 
     def restart(self, fine: float) -> None:
@@ -121,7 +120,7 @@ class HealthMonitor:
     def take(self, seen: Agreement, variance: float) -> None:
         """Take in what a scan says, the ends of its beams being known to ``variance`` [m²]."""
         c = self.config
-        odds = self._odds + self._prior_odds
+        odds = self._odds + c.lost_per_scan
         if seen.beams >= c.fewest_beams:
             ratio = self._against[_bin(seen.against, c.against_edges)]
             if seen.sharp + seen.blurred:

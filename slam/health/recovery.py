@@ -183,8 +183,6 @@ class Recovery:
     @staticmethod
     def _moved(now: Array, before: Array) -> bool:
         """Tell whether the view from one pose ``(3,)`` is another than from the other."""
-        away, turned = (
-            math.hypot(now[0] - before[0], now[1] - before[1]),
-            abs(wrap_scalar(float(now[2] - before[2]))),
-        )
+        away = math.hypot(now[0] - before[0], now[1] - before[1])
+        turned = abs(wrap_scalar(float(now[2] - before[2])))
         return away > _ANOTHER_VIEW[0] or turned > _ANOTHER_VIEW[1]

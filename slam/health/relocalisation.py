@@ -54,20 +54,12 @@ class RelocalisationConfig(Config):
     far_margin: Share = 0.35
     beside_m: Gap = 0.25  # how far off that is beside, …
     mostly: Share = 0.5  # … and the quality from which on it says that the robot is no longer lost
-    radii_m: Annotated[tuple[float, ...], Within("(0, inf]")] = (
-        1.5,
-        4.0,
-        math.inf,
-    )  # around the last known pose, one after the other …
-    scans_each: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (
-        5,
-        15,
-    )  # … for so many scans, the last one until it is found
-    every: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (
-        1,
-        2,
-        10,
-    )  # scans between two searches of each radius: they take long
+    # Around the last known pose, one after the other, …
+    radii_m: Annotated[tuple[float, ...], Within("(0, inf]")] = (1.5, 4.0, math.inf)
+    # … for so many scans, the last one until it is found.
+    scans_each: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (5, 15)
+    # Scans between two searches of each radius: they take long.
+    every: Annotated[tuple[int, ...], Within("[1, 1000000]")] = (1, 2, 10)
     # Places of the lattice that take so long; of twice as many, half as often.
     places_each: Annotated[int, Within("[1, 1000000]")] = 60_000
     # Times as many scans between two searches of all of the map, where the robot has not moved.
@@ -238,10 +230,8 @@ def _score(
     for t in range(turns):
         c, s = math.cos(2.0 * math.pi * t / turns), math.sin(2.0 * math.pi * t / turns)
         for k in range(n):
-            du[k], dv[k] = (
-                (c * points[k, 0] - s * points[k, 1]) / cell,
-                (s * points[k, 0] + c * points[k, 1]) / cell,
-            )
+            du[k] = (c * points[k, 0] - s * points[k, 1]) / cell
+            dv[k] = (s * points[k, 0] + c * points[k, 1]) / cell
         for i in range(positions.shape[0]):
             u0, v0 = (positions[i, 0] - x0) / cell + 0.5, (positions[i, 1] - y0) / cell + 0.5
             total = 0.0

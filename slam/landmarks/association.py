@@ -36,7 +36,7 @@ UNMATCHED, IGNORED = -1, -2
 def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array) -> tuple[float, float]:
     """Write H of landmark ``i`` ``(2, 5)``: by x, y, θ, xi, yi; return the predicted range and bearing.
 
-    theory.md A, observe; ``offset`` is L, ``c`` and ``s`` are the heading's cosine and sine.
+    As in docs/reference/ekf.md, Observe; ``offset`` is L, ``c`` and ``s`` are the heading's cosine and sine.
     """
     dx = x[0] + offset * c - x[3 + 2 * i]
     dy = x[1] + offset * s - x[4 + 2 * i]
@@ -55,7 +55,7 @@ def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array)
 def line_blocks(x: Array, i: int, offset: float, h: Array) -> tuple[float, float]:
     """Write H of line ``i`` (α, r) ``(2, 5)``: by x, y, θ, α, r; return its predicted distance and bearing.
 
-    invariant-ekf.md, Line, with the distance first, so that a line's row looks like a point's range and bearing.
+    The distance comes first, so that a line's row looks like a point's range and bearing.
     """
     alpha = x[3 + 2 * i]
     return _line_blocks(x, i, offset, math.cos(x[2]), math.sin(x[2]), math.cos(alpha), math.sin(alpha), h)
@@ -205,7 +205,7 @@ def nearest_neighbour(
     Parameters
     ----------
     z : Array
-        ``(m, 10)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame, which
+        ``(m, 12)`` rows: range, bearing, covariance (3 distinct terms), kind, direction in the sensor frame, which
         end; of a LINE distance and bearing of its foot, in columns 8 and 9 from where to where it was seen [m].
     marks : Array
         ``(n, ≥ 8)`` of each landmark: kind, direction in the belief's frame [rad]; of a LINE in columns 6 and 7

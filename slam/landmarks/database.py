@@ -1,6 +1,6 @@
-"""The cartographic database: landmarks, what distinguishes them and how they relate (theory.md, paper D).
+"""The cartographic database: landmarks, what distinguishes them and how they relate.
 
-An SQLite file, readable with any SQLite tool, of these tables:
+An SQLite file (docs/reference/landmark_map.md), readable with any SQLite tool, of these tables:
 
 ``landmarks(id, kind, x, y, var_x, var_y, cov_xy, angle, times_seen)``
     One row a landmark: position [m] and covariance [m²] in the map's frame; ``kind`` is ``convex``,
@@ -8,7 +8,7 @@ An SQLite file, readable with any SQLite tool, of these tables:
     not known).
 ``relations(a, b, distance, distance_sigma, correlation)``
     One row a pair a < b of near neighbours; see :func:`relate`. Relative positions are known far better than
-    absolute ones (theory.md, paper B, 2): here that can be read off.
+    absolute ones: here that can be read off.
 ``sightings(landmark, robot)``
     Which robots have a landmark in their maps; empty where one robot alone made the map.
 ``meta(key, value)``

@@ -29,7 +29,7 @@ class Innovation(NamedTuple):
 def innovations(
     x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64], ids: NDArray[np.int64]
 ) -> list[Innovation]:
-    """Return the innovations of the observations that were matched, each on its own (theory.md A, observe).
+    """Return the innovations of the observations that were matched, each on its own (docs/reference/ekf.md).
 
     Parameters
     ----------

@@ -39,7 +39,7 @@ _DRIFT = 0.05  # of odometry over the way between two sightings, and of the turn
 
 class _Sighting(NamedTuple):
     landmark: int
-    row: Array  # (10,) the observation: see slam.landmark_backend.observation_rows
+    row: Array  # (12,) the observation: see slam.landmark_backend.observation_rows
     pose: Array  # (3,) believed then
     held: bool  # whether the gate let it through
     believed: int  # how often the gate had let the landmark through before
@@ -50,7 +50,7 @@ class Elsewhere(NamedTuple):
 
     pose: Array  # (3,)
     ids: list[int]
-    rows: Array  # (m, 10) their observations as they would be made now
+    rows: Array  # (m, 12) their observations as they would be made now
 
 
 class KnownIds:
@@ -64,7 +64,7 @@ class KnownIds:
         self._refused: dict[int, list[tuple[Array, float]]] = {}
 
     def note(self, ids: Sequence[int], z: Array, match: NDArray[np.int64], pose: Array) -> None:
-        """Take note of observations ``(m, 10)`` from a pose ``(3,)``, and of those that were refused."""
+        """Take note of observations ``(m, 12)`` from a pose ``(3,)``, and of those that were refused."""
         for k, landmark in enumerate(ids):
             if match[k] == UNMATCHED:
                 continue  # new: not believed before it is seen again

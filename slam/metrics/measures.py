@@ -201,7 +201,7 @@ class MapScore(NamedTuple):
 def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
     """Return paper D's r: the distance of each mapped corner ``(n, 2)`` from the nearest true one ``(m, 2)``.
 
-    No alignment: the start pose is the origin of both frames (theory.md, paper D). nan where either is empty.
+    No alignment: the start pose is the origin of both frames. nan where either is empty.
     """
     points = np.asarray(estimated, np.float64).reshape(-1, 2)
     targets = np.asarray(true, np.float64).reshape(-1, 2)

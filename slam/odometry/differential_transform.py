@@ -1,7 +1,7 @@
 """Taylor spectra of the differential (Pukhov) transform, and the motion models that are written in them.
 
 The spectrum of x about t₀ with scale h is X(k) = hᵏ/k! x⁽ᵏ⁾(t₀), an array ``(order + 1,)`` in the units of x; the
-original is x(t₀ + θ h) = Σ X(k) θᵏ, or a Padé fraction that agrees with it (theory.md C, differential transform).
+original is x(t₀ + θ h) = Σ X(k) θᵏ, or a Padé fraction that agrees with it.
 The filter that these serve is in :mod:`slam.odometry.riccati`.
 Equations: ``docs/reference/differential_transform.md``.
 """
@@ -62,7 +62,7 @@ def fill_model(powers: Array, matrices: Array, t0: float, h: float, column: Arra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fit_pade(c: Array, system: Array, below: Array) -> bool:
-    """Write n₁ … n_m ``(m,)`` of the denominator, from Σ_j n_j c(m + i - j) = -c(m + i), i = 1 … m (theory.md C).
+    """Write n₁ … n_m ``(m,)`` of the denominator, from Σ_j n_j c(m + i - j) = -c(m + i), i = 1 … m.
 
     ``c`` holds at least 2m + 1 discretes, ``system`` ``(m, m + 1)`` is room to work in. False: singular.
     """

@@ -1,4 +1,4 @@
-"""Filters between the wheels and a backend: paper C's on-board use (theory.md C), of a robot that accelerates.
+"""Filters between the wheels and a backend: paper C's on-board use, of a robot that accelerates.
 
 The wheels' twists are summed up to coordinates x, y, θ, each of which a Kalman-Bucy filter takes for measurements;
 the twist that leads from one filtered pose to the next is what the backend is given. What it brings, and what it
@@ -40,11 +40,8 @@ class OdometryFilterConfig(Config):
     # Q of x and y: m²/s³, of wiener_acceleration m²/s⁵
     process_linear: Annotated[float, Within("[1e-12, 1e6]")] = 0.03
     process_turn: Annotated[float, Within("[1e-12, 1e6]")] = 0.3  # Q of θ: rad²/s³, of wiener_acceleration rad²/s⁵
-    start_sigmas: Annotated[tuple[float, float, float], Within("[0, 1e6]")] = (
-        1e-4,
-        0.1,
-        1.0,
-    )  # of a start: m, m/s, m/s²; of θ in rad
+    # Of a start: m, m/s, m/s²; of θ in rad.
+    start_sigmas: Annotated[tuple[float, float, float], Within("[0, 1e6]")] = (1e-4, 0.1, 1.0)
     rest_speed_m_s: NotNegative = 0.002
     rest_turn_rate_rad_s: NotNegative = 0.005
 

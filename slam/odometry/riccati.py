@@ -1,4 +1,4 @@
-"""The Riccati equation of paper C's filter as a recurrence on spectra, re-expanded where need be (theory.md C).
+"""The Riccati equation of paper C's filter as a recurrence on spectra, re-expanded where need be.
 
     η' = F η + η Fᵀ - η Hᵀ H η / R + G Q Gᵀ,    x̂' = F x̂ + K (z - H x̂),    K = η Hᵀ / R,    H = [1, 0, …]
 
@@ -84,7 +84,7 @@ class Workspace(NamedTuple):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def covariance_spectrum(f: Array, noise: Array, inverse_r: float, h: float, eta: Array) -> None:
-    """Fill η(1) … from η(0), spectra ``(K, n, n)``: the Riccati equation as a recurrence (theory.md C).
+    """Fill η(1) … from η(0), spectra ``(K, n, n)``: the Riccati equation as a recurrence.
 
     (k + 1)/h η(k + 1) = Σ_l F(l) η(k - l) + η(k - l) F(l)ᵀ - η(l) Hᵀ H η(k - l) / R, and G Q Gᵀ in k = 0.
     """

@@ -1,4 +1,4 @@
-"""The Kalman-Bucy filter of one coordinate, solved by differential transforms (theory.md C).
+"""The Kalman-Bucy filter of one coordinate, solved by differential transforms.
 
 The mathematics is in :mod:`slam.odometry.riccati`, the models are in :mod:`slam.odometry.differential_transform`.
 ::

@@ -1,4 +1,4 @@
-"""FastSLAM's particles as Numba kernels: predict, narrow by matched landmarks, draw (theory.md B, point 6)."""
+"""FastSLAM's particles as kernels: predict, narrow by matched landmarks, draw (docs/reference/fastslam.md)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def narrow(
 ) -> float:  # fmt: skip
     """Update the Gaussian of a particle's pose by all its matches, in turn; return the log likelihood of ``z``.
 
-    S = H_x P H_xᵀ + H_m P_m H_mᵀ + R (theory.md B); ``p`` is an upper triangle.
+    S = H_x P H_xᵀ + H_m P_m H_mᵀ + R (docs/reference/fastslam.md, Weights); ``p`` is an upper triangle.
     """
     total = 0.0
     spread = p[0, 0] + p[1, 1] + p[2, 2] > 0.0

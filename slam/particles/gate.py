@@ -21,7 +21,7 @@ def refuse_unlikely(
 
     All particles refuse an observation or none: a particle that refused what others explain would be weighed
     against them by something else than they are. What is expected is the mixture of what particles expect, by its
-    mean and covariance: Σ w (S + ν νᵀ) − ν̄ ν̄ᵀ with each one's S = H_x P_x H_xᵀ + H_m P_m H_mᵀ + R (theory.md B).
+    mean and covariance: Σ w (S + ν νᵀ) − ν̄ ν̄ᵀ with each one's S = H_x P_x H_xᵀ + H_m P_m H_mᵀ + R.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def refuse_unlikely(
         dx, dy = poses[:, 0] + offset * c - mean_x, poses[:, 1] + offset * s - mean_y
         rho = np.maximum(np.hypot(dx, dy), 1e-6)
         nx, ny = dx / rho, dy / rho
-        h = np.empty((len(poses), 2, 3))  # theory.md A, observe
+        h = np.empty((len(poses), 2, 3))  # docs/reference/ekf.md, Observe
         h[:, 0] = np.column_stack([nx, ny, offset * (ny * c - nx * s)])
         h[:, 1] = np.column_stack([-ny / rho, nx / rho, offset * (nx * c + ny * s) / rho - 1.0])
         innovation = np.column_stack([z[k, 0] - rho, wrap(z[k, 1] - np.arctan2(-dy, -dx) + poses[:, 2])])

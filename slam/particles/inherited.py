@@ -41,7 +41,7 @@ class InheritedError:
         return self._p[: self._size, : self._size]
 
     def predict(self, pose: Array, twist: Array, dt: float, var_v: float, var_w: float) -> None:
-        """Move on from ``pose`` ``(3,)`` by a measured twist of these variances (theory.md A, predict)."""
+        """Move on from ``pose`` ``(3,)`` by a measured twist of these variances (docs/reference/ekf.md)."""
         _predict(self._p, self._size, self.motion, pose, twist, dt, var_v, var_w)
 
     def widen(self, cov: Array) -> None:
@@ -251,7 +251,7 @@ def _map(p: Array, size: int, rows: Indices, map_of: Array, r: Array, match: Ind
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add(p: Array, size: int, pose: Array, z: Array, offset: float) -> None:
-    """theory.md A, add a landmark: its error is that of the pose, with the lever of the heading, and that of z."""
+    """Add a landmark: its error is that of the pose, with the lever of the heading, and that of z."""
     theta = pose[2]
     c, s = math.cos(theta + z[1]), math.sin(theta + z[1])
     lever_x, lever_y = -offset * math.sin(theta) - z[0] * s, offset * math.cos(theta) + z[0] * c

@@ -130,7 +130,7 @@ def _add(
     poses: Array, z: Array, offset: float, row: int, table: Indices, records: Array, references: Indices,
     free: Indices, free_count: Indices,
 ) -> None:  # fmt: skip
-    """theory.md A, add a landmark; given the particle's path the pose is known, so P_new,new = Gz R Gzᵀ."""
+    """Add landmarks; given the particle's path the pose is known, so P_new,new = Gz R Gzᵀ."""
     for i in range(poses.shape[0]):
         free_count[0] -= 1
         record = free[free_count[0]]
@@ -191,8 +191,8 @@ def innovation(
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Return ν (range, bearing) and H by the pose, row by row: (νρ, νφ, h00, h01, h02, h10, h11, h12).
 
-    theory.md A, observe; ``c`` and ``s`` are cos θ and sin θ, ``offset`` is L, the landmark is at ``mx``, ``my``.
-    H by the landmark is minus the first two columns.
+    ``c`` and ``s`` are cos θ and sin θ, ``offset`` is L, the landmark is at ``mx``, ``my``. H by the landmark is
+    minus the first two columns (docs/reference/ekf.md).
     """
     dx, dy = pose[0] + offset * c - mx, pose[1] + offset * s - my
     rho2 = max(dx * dx + dy * dy, 1e-12)  # a landmark on the sensor itself has no bearing, but must do no harm

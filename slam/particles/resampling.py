@@ -1,4 +1,4 @@
-"""Weights of particles: what they sum up to, when and how they are resampled (theory.md B, point 6, step 3)."""
+"""Weights of particles: what they sum up to, when and how they are resampled (docs/reference/fastslam.md)."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from slam.settings import Config, Count, OneOf, PositiveShare
 from slam.types import Array
 
 __all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
-
-_WHEN = ("every_step", "every_k", "n_eff")
 
 
 @dataclass(frozen=True, kw_only=True)

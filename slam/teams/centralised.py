@@ -24,7 +24,7 @@ from slam.gaussian.companions import Companions
 from slam.gaussian.settings import EkfConfig, EkfLinesConfig
 from slam.geometry import wrap
 from slam.grids.occupancy import OccupancyGrid
-from slam.landmarks.book import LandmarkBook, LandmarkPolicy
+from slam.landmarks.book import LAST_SEEN, LandmarkBook, LandmarkPolicy
 from slam.metrics.measures import nees_pose
 from slam.settings import require
 from slam.teams.apart import EXACT_COV, Apart, Start
@@ -35,7 +35,6 @@ __all__ = ["JointEkf", "JointMember"]
 
 _KNOWN = (0.05, 0.05, 0.01)  # [m, m, rad] 1σ of a start; a robot that knows less of it maps alone at first
 _SHARED = ("_x", "_p", "_n", "_h", "_w", "_s", "_beside")  # what a turn hands on: of EkfSlam's attributes these
-_LAST_SEEN = 5  # column of marks
 
 
 class JointEkf:
@@ -373,9 +372,9 @@ class _TeamBook(LandmarkBook):
         """Go on with the landmarks of another robot's book, which is put away."""
         ids, size = other.ids, len(other.row_of_id)
         other._seen = np.full(size, -np.inf)
-        other._seen[ids] = other.marks[:, _LAST_SEEN]
+        other._seen[ids] = other.marks[:, LAST_SEEN]
         self.count, self._next_id, self.row_of_id = other.count, other._next_id, other.row_of_id
         self._ids, self._marks = other._ids, other._marks
         seen = np.full(size, -np.inf)
         seen[: len(self._seen)] = self._seen
-        self.marks[:, _LAST_SEEN] = seen[ids]
+        self.marks[:, LAST_SEEN] = seen[ids]

@@ -37,12 +37,8 @@ class ConstellationConfig(Config):
     near_m: Length = 0.25  # of corners that count for a candidate
     places: Count = 200  # different ones by the corners alone, the best …
     count: Count = 15  # … and of these, by walls too, candidates that are looked at more closely
-    tolerances_m: Annotated[tuple[float, ...], Within("[0.001, 1000]")] = (
-        0.25,
-        0.15,
-        0.12,
-        0.12,
-    )  # of matches, as the fit gets closer
+    # Of matches, as the fit gets closer.
+    tolerances_m: Annotated[tuple[float, ...], Within("[0.001, 1000]")] = (0.25, 0.15, 0.12, 0.12)
     wall_turn_rad: Angle = 0.06  # between two walls that are the same
     overlap_m: Length = 0.2  # by which they must overlap
 

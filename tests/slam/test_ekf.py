@@ -28,7 +28,7 @@ states = st.integers(0, 10_000)
 
 
 def predicted(state: np.ndarray, i: int = 0) -> np.ndarray:
-    """h of theory.md A, written down once more from the geometry."""
+    """h of docs/reference/ekf.md, written down once more from the geometry."""
     x, y, theta = state[:3]
     d = state[3 + 2 * i : 5 + 2 * i] - np.array([x + OFFSET * math.cos(theta), y + OFFSET * math.sin(theta)])
     return np.array([np.hypot(*d), float(wrap(math.atan2(d[1], d[0]) - theta))])

@@ -34,7 +34,7 @@ def v_of(t: float) -> np.ndarray:
 
 
 def coordinates(x: np.ndarray) -> np.ndarray:
-    """T(x) of invariant-ekf.md: invariant error coordinates to ordinary ones."""
+    """T(x) of the invariant filter: invariant error coordinates to ordinary ones."""
     out = np.eye(len(x))
     out[:2, 2] = J @ x[:2]
     for i in range(3, len(x), 2):

@@ -183,7 +183,7 @@ def state_with_lines(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.
 
 
 def transform(x: np.ndarray, seen_from: np.ndarray) -> np.ndarray:
-    """T(x) of invariant-ekf.md with a point and two lines: invariant error coordinates to ordinary ones.
+    """T(x) of the invariant filter with a point and two lines: invariant error coordinates to ordinary ones.
 
     Of a line the direction, and the distance from where the robot is, which was ``seen_from`` by the estimate.
     """
@@ -251,7 +251,7 @@ def test_a_ledge_beside_a_wall_does_not_turn_the_robot() -> None:
 
 
 def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
-    """The trap that invariant-ekf.md names: otherwise a line drifts by −½ t² nᵀ p each time."""
+    """What docs/reference/invariant.md warns of: otherwise a line drifts by −½ t² nᵀ p each time."""
     x = np.array([30.0, -20.0, 0.1, 5.0, 5.0, 0.3, 25.0])
     p = np.diag([1e-12, 1e-12, 0.04, 1e-12, 1e-12, 1e-12, 1e-12])
     marks = np.zeros((2, 8))

@@ -50,7 +50,7 @@ def test_the_ekf_is_consistent_while_the_heading_is_known_to_a_degree() -> None:
 
 
 def test_the_ekf_grows_too_sure_once_the_heading_is_not() -> None:
-    """The known inconsistency of the standard EKF (theory.md B, claim 5); NIS does not show it."""
+    """The known inconsistency of the standard EKF; NIS does not show it."""
     values, nis = circle_runs(math.radians(3.0))
     assert 0.9 < nis.mean() < 1.1
     assert values.mean() / 3 > 2.0

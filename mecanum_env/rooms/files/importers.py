@@ -58,7 +58,9 @@ def load(
     suffix = path.suffix.lower()
     if suffix in IMAGE_SUFFIXES:
         what = f"image {shown_path(path)}"
-        raster = _read_image(path, 0.05 if resolution is None else resolution, what)
+        # Bright pixels are free, the lower-left one is at the origin.
+        resolution = _resolution(0.05 if resolution is None else resolution, what)
+        raster = read_grey(path)[::-1] > 127, resolution, (0.0, 0.0)
     elif suffix not in (".yaml", ".yml"):
         valid = ", ".join((".yaml", ".yml", *IMAGE_SUFFIXES))
         raise FloorPlanError(f"floor plan {shown_path(path)} has the unknown suffix {suffix!r}; valid: {valid}")
@@ -71,12 +73,6 @@ def load(
         raster = _read_ros_map(path, what)
     free, cell_m, origin = raster
     return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)
-
-
-def _read_image(path: Path, resolution: float, what: str) -> Raster:
-    """Read a picture of a plan: bright pixels (above 127) are free, the lower-left one is at the origin."""
-    resolution = _resolution(resolution, what)
-    return read_grey(path)[::-1] > 127, resolution, (0.0, 0.0)
 
 
 def _read_ros_map(path: Path, what: str) -> Raster:

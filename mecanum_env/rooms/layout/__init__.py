@@ -1,5 +1,4 @@
 """Where walls, doors and furniture go: what the generators of rooms share.
 
-``apartment_layout`` and ``corridor_layout`` place walls, ``furniture`` pieces; ``assembly`` makes a checked plan
-within the ``limits``.
+``apartment_layout`` and ``corridor_layout`` place walls, ``furniture`` pieces; ``assembly`` makes a checked plan.
 """

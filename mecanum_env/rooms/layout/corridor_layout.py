@@ -24,11 +24,10 @@ __all__ = ["PAPER_D", "Corridor", "CorridorsConfig", "Sizes", "draw_layout", "si
 PAPER_D: Mapping[int, tuple[float, float]] = MappingProxyType(
     {1: (19.46, 3.67), 2: (31.11, 1.80), 3: (33.83, 2.61)}
 )
-"""Total and longest corridor length [m] of the three maps in theory.md D."""
+"""Total and longest corridor length [m] of the three maps of paper D."""
 
-_PAPER_D_WIDTH_M = (
-    0.6  # the paper gives none: its robot, 0.29 m across the corners, turns in it with room to spare
-)
+# The paper gives none: its robot, 0.29 m across the corners, turns in it with room to spare.
+_PAPER_D_WIDTH_M = 0.6
 _DEFAULT_LENGTHS_M, _DEFAULT_WIDTH_M = (60.0, 12.0), 1.4  # for the youBot, 0.69 m across the corners
 _FINE_M = 0.01  # paper D's maps have pixels of 1 cm
 

@@ -20,6 +20,8 @@ CELL_M = 0.05
 GAP = 19
 """Least open gap between pieces, and between a piece and a wall [cells]: 0.95 m."""
 
+_TRIES = 14  # random places for a piece
+
 Box = tuple[int, int, int, int]
 """x_min, y_min, x_max, y_max [cells]."""
 
@@ -65,8 +67,7 @@ class Furnisher:
     room: Box  # the floor [cells]
     rng: np.random.Generator
     keep_clear: list[Box] = field(default_factory=list)  # before doors
-    pieces: list[Piece] = field(default_factory=list)
-    tries: int = 14
+    pieces: list[Piece] = field(default_factory=list, init=False)
 
     @property
     def covered(self) -> float:
@@ -139,7 +140,7 @@ class Furnisher:
         """Place pieces of a shape, given by their boxes about any origin, away from the walls."""
         left, below = min(b[0] for b in group), min(b[1] for b in group)
         right, above = max(b[2] for b in group), max(b[3] for b in group)
-        for _ in range(self.tries):
+        for _ in range(_TRIES):
             place = self._free_place(right - left, above - below)
             if place is None:
                 return False
@@ -171,7 +172,7 @@ class Furnisher:
         width = cells(width_m)
         x0, y0, x1, y1 = self.room
         lengths = (x1 - x0, y1 - y0)
-        for _ in range(self.tries):
+        for _ in range(_TRIES):
             side = int(self.rng.integers(4))
             length = lengths[side % 2]
             if length < width:

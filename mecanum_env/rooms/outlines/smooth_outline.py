@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mecanum_env.rooms.outlines.outline import trace
 from slam.types import Array
 
-__all__ = ["MOST_TURN_DEG", "bends_deg", "facets", "level_loops", "rasterise"]
+__all__ = ["MOST_TURN_DEG", "bends_deg", "facets", "level_loops", "rasterise", "signed_area"]
 
 MOST_TURN_DEG = 4.8
 """Largest bend [°] from one piece to the next: a plan's list of corners begins at 5°."""
@@ -113,6 +113,12 @@ def _cut(points: Array) -> NDArray[np.int64]:
             keep.append(cut)
             low, high = min(headings[cut], heading), max(headings[cut], heading)
     return np.unique(np.array(keep, np.int64))
+
+
+def signed_area(line: Array) -> float:
+    """Return the area within a closed line of points ``(k, 2)``, negative where it runs clockwise."""
+    x, y = line.T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def rasterise(walls: Array, size: tuple[int, int], cell_m: float) -> NDArray[np.bool_]:

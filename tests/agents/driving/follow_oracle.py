@@ -48,8 +48,7 @@ class PlainFollower(PathFollower):
             speed = 0.0
         most = min(config.turn_rate_rad_s, self._robot.max_turn_rate_rad_s)
         turn = float(np.clip(config.turn_gain * error, -most, most))
-        seen = hits(observation, self._lidar)
-        return self._send(speed * direction, turn, pose, near, gap, seen, np.zeros((0, 3)))
+        return self._send(speed * direction, turn, observation, belief, near, gap)
 
     def _locate(self, position: Array) -> float:
         end = int(np.searchsorted(self._arc, self._arc[self._index] + 1.0)) + 1
@@ -142,9 +141,10 @@ class PlainFollower(PathFollower):
         return best
 
     def _send(
-        self, velocity: Array, turn: float, pose: Array, near: LocalMap, gap: float, seen: Array, sides: Array
-    ) -> Array:
-        config = self.config
+        self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief, near: LocalMap,
+        gap: float,
+    ) -> Array:  # fmt: skip
+        config, pose, seen = self.config, belief.pose, hits(observation, self._lidar)
         change = velocity - self._velocity
         step = float(np.hypot(*change))
         limit = config.acceleration_m_s2 * self._step_s

@@ -171,3 +171,17 @@ def test_lost_in_the_open_it_creeps_back_and_turns_where_it_loses_sight():
         pose = drive(pose, creep(1.0) / np.array([0.8, 0.8, 1.5]), ROBOT)
     assert pose[0] == pytest.approx(8.0, abs=0.3)  # over what it has crept, and no farther
     assert not creep(1.0).any()
+
+
+def test_without_a_scan_it_does_not_creep():
+    control, belief = follower(), belief_of(room(6.0, 6.0), (3.0, 3.0, 0.0))
+    assert not control.creep({}, belief).any() and not control.creep(None, belief).any()
+
+
+def test_it_creeps_to_nothing_at_the_edge_of_its_view():
+    """Half of the way there would be out of sight; first and last beam are not neighbours."""
+    lidar = LIDAR_PRESETS["cavity"]
+    angles = np.degrees(lidar.angle_min + lidar.angle_increment * np.arange(lidar.beams))
+    scan = np.where(np.abs(angles) > 30.0, 0.9, 0.1).astype(np.float32)
+    twist = follower(lidar=lidar).creep({"scan": scan}, belief_of(room(20.0, 20.0), (10.0, 10.0, 0.0)))
+    assert twist.any() and abs(math.degrees(math.atan2(twist[1], twist[0]))) < 41.0

@@ -12,7 +12,7 @@ from agents.explorer import Candidates, Explorer
 from agents.ways.cost_map import CostMaps, PlannerConfig, build
 from agents.ways.giving_way import GivingWay, GivingWayConfig, costs_from
 from agents.ways.planning import travel_costs
-from mecanum_env.config import RobotConfig
+from mecanum_env.config import ROBOT_PRESETS, RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.team.team import Team
 from slam.belief import Belief, Teammate
@@ -74,6 +74,19 @@ def test_ways_lead_round_another_and_are_as_before_when_it_has_gone():
     row, col = (int(v) for v in cost_map.to_cells(np.array([[2.5, 3.0]]))[0])
     assert cost_map.weight[row, col] == before[row, col] + 6.0
     np.testing.assert_array_equal(maps.of(alone).weight, before)
+
+
+@pytest.mark.parametrize("robot", [ROBOT_PRESETS["cavity"], ROBOT, RobotConfig(length_m=1.2, width_m=0.9)])
+def test_another_is_as_large_as_the_robot_itself(robot):
+    alone = belief_of(room(8.0, 8.0), (1.0, 4.0, 0.0))
+    among = replace(alone, teammates=(Teammate(1, np.array([3.5, 4.0, 0.0]), 0.0),))
+    config, maps = PlannerConfig(), CostMaps(PlannerConfig(), robot)
+    before = maps.of(alone).weight.copy()
+    cost_map = maps.of(among)
+    dearer = np.argwhere(cost_map.weight > before)
+    away = np.hypot(*(cost_map.to_points(dearer) - (3.5, 4.0)).T).max()
+    beside = robot.inscribed_radius_m + robot.circumscribed_radius_m + config.robot_margin_m
+    assert beside - 1.5 * cost_map.resolution < away <= beside + 1e-9
 
 
 def test_costs_from_elsewhere_are_those_that_a_robot_there_would_have():

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 PRESETS = list(ROBOT_PRESETS.values())
 G = 9.80665
-ROLLERS = np.array([[1, -1], [1, 1], [1, 1], [1, -1]]) / math.sqrt(2.0)  # a_i, theory.md
+ROLLERS = np.array([[1, -1], [1, 1], [1, 1], [1, -1]]) / math.sqrt(2.0)  # a_i, docs/reference/robot.md
 
 
 def speeds(limit: float) -> st.SearchStrategy[float]:
@@ -222,7 +222,7 @@ def test_coasting_ends_at_rest() -> None:
 
 
 def reference_path(robot: RobotConfig, state: Array, targets: Array, duration: float, mu: float) -> Array:
-    """Integrate theory.md's equations with a stiff solver, in the world frame, from pose to wheel speeds."""
+    """Integrate docs/reference/robot.md with a stiff solver, in the world frame, from pose to wheel speeds."""
     corners = wheel_positions(robot)
     load = robot.mass_kg * G / 4.0
 

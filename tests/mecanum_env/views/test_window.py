@@ -55,6 +55,11 @@ def test_reset_and_step_show_the_frame_and_render_returns_none(env_id: str, pyga
     env.close()
 
 
+def test_frames_a_second_are_steps_a_second() -> None:
+    env = gym.make("mecanum_env:mecanum_env/Explore-v0", config={"step_s": 0.04})
+    assert env.metadata["render_fps"] == 25 and type(env.unwrapped).metadata["render_fps"] == 10
+
+
 def test_the_pace_is_that_of_the_metadata(pygame: Any) -> None:
     env = gym.make("mecanum_env:mecanum_env/Explore-v0", rooms="rectangular", render_mode="human")
     assert env.metadata["render_fps"] == 10

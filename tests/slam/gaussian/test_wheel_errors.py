@@ -77,7 +77,7 @@ def test_twist_by_errors_is_that_of_the_wheels() -> None:
 
 
 def test_equals_one_dense_filter_of_everything() -> None:
-    """State: pose, landmarks, errors. Jacobians by differences, the reset as invariant-ekf.md has it."""
+    """State: pose, landmarks, errors. Jacobians by differences, the reset as in docs/reference/invariant.md."""
     rng = np.random.default_rng(4)
     points = np.array([[2.0, 1.0], [-1.5, 2.0], [0.5, -2.5], [3.0, -1.0]])
     filter_ = backend()

@@ -16,7 +16,7 @@ OFFSET = 0.2
 
 
 def seen(x: np.ndarray) -> np.ndarray:
-    """Range and bearing of the only landmark of a state (theory.md A, observe)."""
+    """Range and bearing of the only landmark of a state (docs/reference/ekf.md)."""
     dx, dy = x[3] - x[0] - OFFSET * np.cos(x[2]), x[4] - x[1] - OFFSET * np.sin(x[2])
     return np.array([np.hypot(dx, dy), wrap_scalar(np.arctan2(dy, dx) - x[2])])
 

@@ -15,7 +15,7 @@ seeds = st.integers(0, 10_000)
 
 
 def predicted(state: np.ndarray) -> np.ndarray:
-    """h of theory.md A for x, y, θ, xi, yi, written down once more from the geometry."""
+    """h of docs/reference/ekf.md for x, y, θ, xi, yi, written down once more from the geometry."""
     x, y, theta = state[:3]
     d = state[3:5] - np.array([x + OFFSET * math.cos(theta), y + OFFSET * math.sin(theta)])
     return np.array([np.hypot(*d), float(wrap(math.atan2(d[1], d[0]) - theta))])
