@@ -13,14 +13,13 @@ tells: it is what is left where all else is known.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from scipy.linalg import inv
 from scipy.linalg.blas import dger
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array
 
 from slam.accounts.account import Account
 from slam.metrics.chi_square import chi2_quantile
@@ -28,6 +27,9 @@ from slam.settings import Angle, Config, Length, Share, Within
 from slam.types import CONVEX, Array
 
 __all__ = ["CornerConfig", "settled"]
+
+Blocks = dict[tuple[int, int], Array]
+"""Blocks ``(2, 2)`` of a Jacobian, by the corner whose row they are in, and the point or wall."""
 
 _NOTHING = 1e-12  # [m²] lets a covariance be inverted in which something is exactly known
 _FACING = 0.3  # cosine; a corner's bisector makes 45° with the free side of either wall
@@ -52,7 +54,11 @@ def settled(account: Account, config: CornerConfig | None = None) -> Account:
     config = config or CornerConfig()
     if not len(account.points):
         return account
-    return _on_walls(replace(account, cov=_with_lasting_ends(account, config)), config)
+    cov = _with_lasting_ends(account, config)
+    points, blocks = _on_walls(account, cov, config)
+    if blocks:
+        _go_over(cov, blocks)
+    return replace(account, points=points, cov=cov)
 
 
 def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
@@ -77,8 +83,8 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
     return cov
 
 
-def _on_walls(account: Account, config: CornerConfig) -> Account:
-    """Return the account with corners read off their walls, x' = f(x) with the covariance J P Jᵀ."""
+def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array, Blocks]:
+    """Return the points ``(n, 2)`` read off their walls, x' = f(x), and the rows of J that this changes."""
     n, (alpha, r) = len(account.points), account.walls.T
     normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
     tangents = np.column_stack([-normals[:, 1], normals[:, 0]])
@@ -88,9 +94,11 @@ def _on_walls(account: Account, config: CornerConfig) -> Account:
     likely = (np.abs(off) < config.off_m) & (bisectors @ normals.T < -_FACING)  # not so where it is not known
     likely &= np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1)) < config.beyond_m
     points, gate = account.points.copy(), chi2_quantile(config.gate, 1)
-    blocks = {(k, k): np.eye(2) for k in range(n + len(r))}  # of J, 2 × 2, but for the pose's
+    blocks: Blocks = {}
     for u in range(n):
-        walls = [j for j in np.flatnonzero(likely[u]).tolist() if off[u, j] ** 2 < gate * _variance(account, u, j)]
+        walls = [
+            j for j in np.flatnonzero(likely[u]).tolist() if off[u, j] ** 2 < gate * _variance(account, cov, u, j)
+        ]
         if not walls:
             continue
         walls.sort(key=lambda j: abs(off[u, j]))
@@ -108,30 +116,31 @@ def _on_walls(account: Account, config: CornerConfig) -> Account:
             blocks[u, n + j] = np.column_stack([-gain * (tangents[j] @ points[u]), gain])
         if not across:
             blocks[u, n + first][:, 0] -= tangents[first] * off[u, first]
-    jacobian = _with_pose(blocks, len(account.cov))
-    cov = jacobian @ (jacobian @ account.cov).T
-    cov += cov.T
-    cov *= 0.5
-    return replace(account, points=points, cov=cov)
+    return points, blocks
 
 
-def _with_pose(blocks: Mapping[tuple[int, int], Array], size: int) -> csr_array:
-    """Return J of all states ``(size, size)``, of its blocks of points and walls, and 1 for the pose."""
-    row, column = 3 + 2 * np.array(list(blocks)).T
-    rows = (row[:, None] + [0, 0, 1, 1]).ravel()
-    columns = (column[:, None] + [0, 1, 0, 1]).ravel()
-    values = np.array(list(blocks.values())).ravel()
-    pose = np.arange(3)
-    return coo_array(
-        (np.r_[np.ones(3), values], (np.r_[pose, rows], np.r_[pose, columns])), shape=(size, size)
+def _go_over(cov: Array, blocks: Blocks) -> None:
+    """Make the covariance J P Jᵀ, in place; the rows of J that no block is in are those of 1."""
+    corners = sorted({u for u, _ in blocks})
+    row = np.searchsorted(corners, [u for u, _ in blocks])
+    column = 3 + 2 * np.array([k for _, k in blocks])
+    rows, columns = (2 * row[:, None] + [0, 0, 1, 1]).ravel(), (column[:, None] + [0, 1, 0, 1]).ravel()
+    jacobian = coo_array(
+        (np.array(list(blocks.values())).ravel(), (rows, columns)), shape=(2 * len(corners), len(cov))
     ).tocsr()
+    at = (3 + 2 * np.array(corners)[:, None] + [0, 1]).ravel()
+    new = jacobian @ cov
+    among = jacobian @ new.T
+    new[:, at] = 0.5 * (among + among.T)
+    cov[at] = new
+    cov[:, at] = new.T
 
 
-def _variance(account: Account, u: int, j: int) -> float:
+def _variance(account: Account, cov: Array, u: int, j: int) -> float:
     """Return the variance of a corner's distance from a wall, nᵀx − r."""
     alpha, at, wall = account.walls[j, 0], 3 + 2 * u, 3 + 2 * (len(account.points) + j)
     c, s = math.cos(alpha), math.sin(alpha)
     x, y = account.points[u]
     rows = np.array([at, at + 1, wall, wall + 1])
     h = np.array([c, s, c * y - s * x, -1.0])
-    return float(h @ account.cov[np.ix_(rows, rows)] @ h)
+    return float(h @ cov[np.ix_(rows, rows)] @ h)
