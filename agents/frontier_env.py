@@ -133,8 +133,9 @@ class ExploreFrontierEnv(ChoiceEnv):
     Notes
     -----
     A step ends when a choice is due again: the goal is reached, what was to be seen from it is seen, the way is
-    blocked, or ``driver.patience.replan_s`` is over; and there is something to choose, of more than one. An action
-    that stands for no candidate (see :meth:`action_masks`) takes the first, the cheapest to reach.
+    blocked, or ``driver.patience.replan_s`` is over, on a large map ``driver.large_replan_s``; and there is
+    something to choose, of more than one. An action that stands for no candidate (see :meth:`action_masks`)
+    takes the first, the cheapest to reach.
 
     ``terminated``: as in the environment beneath, or the robot has found nothing left to choose for two seconds
     (``info["end"]`` says why). ``truncated``: after ``time_limit_s`` of the configuration.

@@ -161,11 +161,15 @@ class Driver(Agent):
         waited = self._time - self._chosen_at + 1e-9
         if self._chosen_at == -math.inf:
             return True
-        if waited >= patience.replan_s and (waited >= patience.stale_s or not self._as_chosen(belief)):
+        if waited >= self._lasts_s(belief) and (waited >= patience.stale_s or not self._as_chosen(belief)):
             return True
         if waited < patience.min_replan_s or self._goal is None:
             return False
         return self._follower.blocked or self._target is None or not self._is_frontier(belief, self._target)
+
+    def _lasts_s(self, belief: Belief) -> float:
+        """Return how long a choice lasts where nothing ends it sooner [s]."""
+        return self.config.patience.replan_s
 
     def _as_chosen(self, belief: Belief) -> bool:
         """Whether the robot is far from its goal yet, and the map shows what it showed when that was chosen."""

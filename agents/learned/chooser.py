@@ -15,9 +15,11 @@ from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
 from slam.belief import Belief
-from slam.settings import Config, PositiveShare, Rate, require
+from slam.settings import Config, Duration, NotNegative, PositiveShare, Rate, require
 
 __all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
+
+_MANY = 4  # times as many candidates as are shown: to so many the ways are searched for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,8 @@ class ChooserConfig(TourConfig):
 
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
     slip: SlipConfig = field(default_factory=SlipConfig)
+    large_m2: NotNegative = 400.0  # known: on a larger map ways are long, as is choosing, and a choice lasts …
+    large_replan_s: Duration = 2.0  # … so long
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,6 +86,11 @@ class Chooser(Tour):
     def _control(self) -> ControlConfig:
         """Return how to drive next."""
         return self.config.slip.eased(self.config.control, self._wheels.share)
+
+    def _lasts_s(self, belief: Belief) -> float:
+        usual = super()._lasts_s(belief)
+        large = belief.grid.known_cells * belief.grid.resolution**2 > self.config.large_m2
+        return max(usual, self.config.large_replan_s) if large else usual
 
     def due(self, belief: Belief) -> bool:
         """Whether the next :meth:`act` will ask for a choice."""
@@ -121,7 +130,8 @@ class Chooser(Tour):
         return self._taken
 
     def _costs_asked(self) -> int | None:
-        return None  # in how many places views may be had is among what is shown
+        # In how many places views may be had is among what is shown; so many are many.
+        return _MANY * self.config.choice.most
 
     def _candidates(self, belief: Belief) -> Candidates:
         # Those that were described: the choice was made among them.
