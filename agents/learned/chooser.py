@@ -90,7 +90,8 @@ class Chooser(Tour):
     def _lasts_s(self, belief: Belief) -> float:
         usual = super()._lasts_s(belief)
         large = belief.grid.known_cells * belief.grid.resolution**2 > self.config.large_m2
-        return max(usual, self.config.large_replan_s) if large else usual
+        # Who has nowhere to go looks again soon.
+        return max(usual, self.config.large_replan_s) if large and self._goal is not None else usual
 
     def due(self, belief: Belief) -> bool:
         """Whether the next :meth:`act` will ask for a choice."""

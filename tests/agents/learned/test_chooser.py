@@ -63,3 +63,15 @@ def test_a_choice_lasts_longer_on_a_large_map(side_m, lasts_s):
         agent.act(None, belief)
         waited += 1
     assert waited + 1 == pytest.approx(lasts_s / 0.1)
+
+
+def test_where_there_is_nothing_to_choose_it_is_soon_looked_at_again():
+    belief = belief_of(room(30.0, 30.0), (15.0, 15.0, 0.0))
+    agent = made(Chooser, patience={"replan_s": 0.3})
+    agent.reset(belief)
+    assert agent.survey(belief) is None
+    agent.act(None, belief)
+    assert agent.goal is None and not agent.due(belief)
+    for _ in range(2):
+        agent.act(None, belief)
+    assert agent.due(belief)
