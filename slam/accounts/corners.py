@@ -8,6 +8,9 @@ state, so the covariance goes over by their Jacobian and nothing is counted twic
 Where a surface is seen to end, a corner's error lasts along the surface. A filter cannot say that of white noise,
 and takes so much of it that the sum is no less. How much of the variance is the corner's own, its covariance
 tells: it is what is left where all else is known.
+
+A convex corner is seen together with its walls, so they reach it. Where one was seen to end before, the lines of
+two surfaces only cross there, behind a jamb perhaps, and the corner is off along the wall by as much.
 """
 
 from __future__ import annotations
@@ -43,6 +46,7 @@ class CornerConfig(Config):
     beyond_m: Length = 0.15  # … and past what was seen of it
     gate: Annotated[float, Within("(0, 1)")] = 0.997  # probability of χ² of the distance from the wall
     crossing_rad: Angle = 0.96  # least angle between two walls that make a corner
+    reach_m: Length = 0.06  # from a convex corner to what was seen of its walls; 5 of 6 farther off were false
     # The end of a surface lies between two beams: a uniform error, of a twelfth of the squared spacing. The filter
     # takes all of that, four times (FeatureConfig.edge_sigma and wall_lasting_scans) …
     end_share: Share = 1.0 / (12.0 * 4.0)
@@ -55,9 +59,12 @@ def settled(account: Account, config: CornerConfig | None = None) -> Account:
     if not len(account.points):
         return account
     cov = _with_lasting_ends(account, config)
-    points, blocks = _on_walls(account, cov, config)
+    points, blocks, apart = _on_walls(account, cov, config)
     if blocks:
         _go_over(cov, blocks)
+    for u, gap in apart:
+        at = slice(3 + 2 * u, 5 + 2 * u)
+        cov[at, at] += np.outer(gap, gap)
     return replace(account, points=points, cov=cov)
 
 
@@ -83,8 +90,11 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
     return cov
 
 
-def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array, Blocks]:
-    """Return the points ``(n, 2)`` read off their walls, x' = f(x), and the rows of J that this changes."""
+def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array, Blocks, list[tuple[int, Array]]]:
+    """Return points ``(n, 2)`` read off their walls, x' = f(x), rows of J that this changes, and where walls end.
+
+    That is, corners that no wall reaches, each with the gap ``(2,)`` [m] along the wall.
+    """
     n, (alpha, r) = len(account.points), account.walls.T
     normals = np.column_stack([np.cos(alpha), np.sin(alpha)])
     tangents = np.column_stack([-normals[:, 1], normals[:, 0]])
@@ -95,6 +105,7 @@ def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array
     likely &= np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1)) < config.beyond_m
     points, gate = account.points.copy(), chi2_quantile(config.gate, 1)
     blocks: Blocks = {}
+    apart: list[tuple[int, Array]] = []
     for u in range(n):
         walls = [
             j for j in np.flatnonzero(likely[u]).tolist() if off[u, j] ** 2 < gate * _variance(account, cov, u, j)
@@ -116,7 +127,13 @@ def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array
             blocks[u, n + j] = np.column_stack([-gain * (tangents[j] @ points[u]), gain])
         if not across:
             blocks[u, n + first][:, 0] -= tangents[first] * off[u, first]
-    return points, blocks
+        if account.kinds[u] == CONVEX:
+            for j in made_by:
+                at = points[u] @ tangents[j]
+                gap = np.clip(at, *np.sort(ends[j])) - at
+                if abs(gap) > config.reach_m:
+                    apart.append((u, gap * tangents[j]))
+    return points, blocks, apart
 
 
 def _go_over(cov: Array, blocks: Blocks) -> None:

@@ -57,6 +57,16 @@ def test_a_corner_beside_a_wall_or_behind_it_is_left_alone(change: dict[str, Arr
     np.testing.assert_allclose(found.cov, told.cov, atol=1e-15)
 
 
+@pytest.mark.parametrize(("kind", "gap_m"), [(CONVEX, 0.1), (CONVEX, 0.03), (CONCAVE, 0.1)])
+def test_a_convex_corner_that_a_wall_does_not_reach_is_off_along_it(kind: int, gap_m: float) -> None:
+    told = account(some_cov(3), (kind, CONVEX, CONVEX))
+    short = replace(told, wall_ends=ENDS - np.array([[0.0, 0.0, 0.0, gap_m], [0.0] * 4]))
+    excess = settled(short, AS_TOLD).cov - settled(told, AS_TOLD).cov
+    wanted = np.zeros((13, 13))
+    wanted[4, 4] = gap_m**2 if kind == CONVEX and gap_m > AS_TOLD.reach_m else 0.0  # x = 4 ends in y
+    np.testing.assert_allclose(excess, wanted, atol=1e-12)
+
+
 def test_an_end_is_off_by_what_lasts_and_a_share_of_the_rest() -> None:
     cov = np.diag(np.r_[np.full(3, 1e-6), [0.04, 1e-6, 1e-6, 1e-8, 0.01, 1e-6], np.full(4, 1e-6)])
     config = CornerConfig(end_share=0.005, end_sigma_m=0.0075, gate=0.001)  # a gate that no wall passes
