@@ -57,7 +57,10 @@ explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and ma
 	@echo "  $(BIN)/mecanum explore --floor-plan office.yaml  a plan of your own: ROS map or image"
 	@echo "  $(BIN)/mecanum --help                            all else"
 
-test: lint types pytest other-gymnasium package ## everything CI checks (WORKERS)
+# Types are checked beside the tests, which compile their kernels meanwhile.
+test: lint ## everything CI checks (WORKERS)
+	$(MAKE) --no-print-directory -j2 types pytest
+	$(MAKE) --no-print-directory other-gymnasium package
 
 lint: $(VENV)/test.stamp ## ruff
 	$(BIN)/ruff check .
@@ -66,8 +69,9 @@ lint: $(VENV)/test.stamp ## ruff
 types: $(VENV)/test.stamp ## mypy
 	$(BIN)/mypy
 
+# Each worker begins elsewhere (worksteal): side by side all of them would compile the same kernels at once.
 pytest: $(VENV)/test.stamp ## the tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 # The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
 other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
