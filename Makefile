@@ -69,9 +69,8 @@ lint: $(VENV)/test.stamp ## ruff
 types: $(VENV)/test.stamp ## mypy
 	$(BIN)/mypy
 
-# Each worker begins elsewhere (worksteal): side by side all of them would compile the same kernels at once.
 pytest: $(VENV)/test.stamp ## the tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS)
 
 # The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
 other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
