@@ -30,7 +30,8 @@ _LABELS = {"time_s": "time [s]", "path_length_m": "way [m]"}
 _WIDTH, _HEIGHT = 480, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 24, 40  # margins
 _MOST = 1.6  # times the highest figure: what lies beyond is cut off
-_APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px]
+_APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px] …
+_SPREAD = 44.0  # … less, where there are many of them: so wide are all together [px]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,17 +133,18 @@ def _outline(b: Band, last: float) -> str:
 
 
 def scaling_charts(scalings: Sequence[Scaling]) -> str:
-    """Return two ``<svg>`` elements: the times with their intervals, and how many times as fast as one robot.
+    """Return ``<svg>`` elements: times with their intervals, and how many times as fast as one robot, if known.
 
-    Dashed is what there would be if so many robots were so many times as fast.
+    Thin and dashed is what there would be if so many robots were so many times as fast.
     """
     times: list[Line] = [(s.name, list(zip(s.robots, s.time, strict=True))) for s in scalings]
     gains: list[Line] = [
         (s.name, [(n, _gain(n, ratio)) for n, ratio in zip(s.robots, s.ratio, strict=True)]) for s in scalings
     ]
-    return _scaling_chart(times, "time to 95 % [s]", lambda first, n: first / n) + _scaling_chart(
-        gains, "times as fast as one robot", lambda _, n: float(n)
-    )
+    chart = _scaling_chart(times, "time to 95 % [s]", lambda first, n: first / n)
+    if any(math.isfinite(gain.value) for _, line in gains for _, gain in line):
+        chart += _scaling_chart(gains, "times as fast as one robot", lambda _, n: float(n))
+    return chart
 
 
 def _gain(robots: int, ratio: Interval) -> Interval:
@@ -161,10 +163,12 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
     ticks = np.asarray(MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, max(values, default=1.0)))
     top, right, bottom = float(ticks[-1]), _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
 
+    apart = min(_APART, _SPREAD / max(len(lines) - 1, 1))
+
     def at(robots: int, value: float, k: float) -> tuple[float, float]:
         x = _LEFT + 24 + (robots - 1) / max(counts[-1] - 1, 1) * (right - _LEFT - 48)
         y = bottom - min(value, top) / top * (bottom - _TOP)
-        return round(x + _APART * (k - 0.5 * (len(lines) - 1)), 1), round(y, 1)
+        return round(x + apart * (k - 0.5 * (len(lines) - 1)), 1), round(y, 1)
 
     def path(points: Sequence[tuple[float, float]]) -> str:
         return "M" + "L".join(f"{x} {y}" for x, y in points)
@@ -180,13 +184,15 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
         parts.append(f'<text class="tick" x="{x}" y="{bottom + 16}" text-anchor="middle">{n}</text>')
     for k, (name, line) in enumerate(known):
         kind = f"line c{k % COLOURS}"
+        dashed = " dashed" if k >= COLOURS else ""
         if line and line[0][0] == 1:
             shares = [(n, ideal(line[0][1].value, n)) for n in range(1, counts[-1] + 1)]
             points = [at(n, share, k) for n, share in shares if share <= top]
             parts.append(f'<path class="{kind} dashed ideal" d="{path(points)}"/>')
         if line:
             points = [at(n, f.value, k) for n, f in line]
-            parts.append(f'<path class="{kind}" d="{path(points)}"><title>{name_html(name, 400)}</title></path>')
+            title = f"<title>{name_html(name, 400)}</title>"
+            parts.append(f'<path class="{kind}{dashed}" d="{path(points)}">{title}</path>')
         for n, f in line:
             if math.isfinite(f.low) and math.isfinite(f.high):
                 limits = path([at(n, f.low, k), at(n, f.high, k)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import Report, as_json, markdown, table
 from training.benchmark.report import page
+from training.benchmark.report_charts import COLOURS, scaling_charts
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import teams_of
 from training.benchmark.team_episode import TeamJob, run_job
@@ -191,3 +193,12 @@ def test_tables_and_page_show_them() -> None:
     assert ratio["low"] <= ratio["value"] <= ratio["high"] < 0.6
     alone = Report.of(groups[:1], baseline=None, config=config)
     assert "teams" not in as_json(alone) and "Several robots" not in page(alone, config_text="")
+
+
+def test_charts_keep_many_lines_within_and_need_one_robot_for_gains() -> None:
+    (line,) = scaling_of([team_group(n, [200.0 / n + k for k in range(4)]) for n in (2, 3)], suite="rooms")
+    chart = scaling_charts([replace(line, name=f"team {k}") for k in range(40)])
+    assert chart.count("<svg") == 1 and "times as fast" not in chart
+    dots = [float(x) for x in re.findall(r'<circle[^>]* cx="([^"]*)"', chart)]
+    assert len(dots) == 80 and min(dots) > 44.0 and max(dots) < 468.0  # of the axes
+    assert chart.count('dashed" d=') == 40 - COLOURS
