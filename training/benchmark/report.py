@@ -150,8 +150,8 @@ def _teams(report: Report, suite: str) -> str:
     return (
         "<h3>Several robots</h3>"
         '<p class="soft">Time until the team has mapped 95 %, with its interval; thin and dashed, what there '
-        "would be if so many robots were so many times as fast. Against one robot: on the same episodes. A contact "
-        "of two robots counts for both. NEES / 3 is over all robots.</p>"
+        "would be if so many robots were so many times as fast. Against one robot: on the same episodes. A "
+        "contact of two robots counts for both. NEES / 3 is over all robots.</p>"
         f'<nav>{legend}</nav><div class="charts">{scaling_charts(scalings)}</div>'
         + tables.html(scaling_table(scalings))
     )
