@@ -17,9 +17,11 @@ export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Each of the processes that tests start would compile all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium package rllib online monte-carlo evaluate benchmark docs speed clean
+.PHONY: help install explore test kernels lint types pytest other-gymnasium package rllib online monte-carlo evaluate benchmark docs speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -57,10 +59,14 @@ explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and ma
 	@echo "  $(BIN)/mecanum explore --floor-plan office.yaml  a plan of your own: ROS map or image"
 	@echo "  $(BIN)/mecanum --help                            all else"
 
-# Types are checked beside the tests, which compile their kernels meanwhile.
-test: lint ## everything CI checks (WORKERS)
-	$(MAKE) --no-print-directory -j2 types pytest
+# Kernels compile while libraries are installed, types are checked beside the tests.
+test: ## everything CI checks (WORKERS)
+	$(MAKE) --no-print-directory -j2 kernels $(VENV)/test.stamp
+	$(MAKE) --no-print-directory -j2 lint types pytest
 	$(MAKE) --no-print-directory other-gymnasium package
+
+kernels: $(VENV)/core.stamp ## compiles what an episode runs
+	MECANUM_COMPILING=0 $(BIN)/mecanum explore --agent ppo-frontier --max-steps 40 --out out/kernels > /dev/null
 
 lint: $(VENV)/test.stamp ## ruff
 	$(BIN)/ruff check .

@@ -24,8 +24,12 @@ from slam.settings import (
 )
 
 __all__ = [
-    "EvaluationConfig", "PpoConfig", "RehearsalConfig", "RoomsConfig", "TrainConfig", "WorldConfig", "check_names",
+    "FIRST_VALIDATION_SEED", "EvaluationConfig", "PpoConfig", "RehearsalConfig", "RoomsConfig", "TrainConfig",
+    "WorldConfig", "check_names",
 ]  # fmt: skip
+
+FIRST_VALIDATION_SEED = 1000
+"""Seeds from here on are for choosing the best policy: neither for training nor for reporting."""
 
 
 def check_names(what: str, names: Iterable[str], valid: Collection[str]) -> None:

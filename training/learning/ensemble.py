@@ -18,7 +18,8 @@ from training.learning.config import TrainConfig
 from training.learning.folder import FolderRun, seed_of
 from training.learning.follow import Follow
 from training.learning.networks import read_zip
-from training.learning.ppo import Run, Weights, evaluate, trials_in_full
+from training.learning.ppo import Run
+from training.learning.trials import Weights, evaluate, trials_in_full
 from training.runs.campaign import Pool
 from training.runs.errors import BadInput
 

@@ -29,9 +29,8 @@ from training.learning.config import PpoConfig
 from training.learning.follow import Follow, Sink
 from training.runs.campaign import Pool, Workers, worker_pool
 
-__all__ = ["FIRST_VALIDATION_SEED", "FolderRun", "save_model", "seed_of", "words"]
+__all__ = ["FolderRun", "save_model", "seed_of", "words"]
 
-FIRST_VALIDATION_SEED = 1000
 NOBODY = Follow()
 
 

@@ -7,24 +7,20 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
-from agents.learned.choice_network import ChoiceEnsemble
 from training.learning.choice_world import Families, make_rehearsal, make_world, world_of_worker
-from training.learning.config import PpoConfig, TrainConfig, WorldConfig
-from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, save_model
+from training.learning.config import PpoConfig, TrainConfig
+from training.learning.folder import FolderRun, save_model
 from training.learning.networks import ChoicePolicy, read_zip
 from training.learning.semi_markov import Durations, SemiMarkovBuffer
+from training.learning.trials import Trial, evaluate, trials_in_full, trials_of
 from training.runs.campaign import Pool
 from training.runs.processes import one_thread_each
 
-__all__ = ["Run", "Trial", "evaluate", "make_model", "trials_in_full"]
-
-Weights = dict[str, NDArray[np.float32]]
+__all__ = ["Run", "make_model"]
 
 
 class Run(FolderRun):
@@ -83,16 +79,6 @@ def make_model(config: TrainConfig, env: VecEnv, ppo: PpoConfig, *, device: str 
 
 
 @dataclass(frozen=True)
-class Trial:
-    """An episode on a validation seed."""
-
-    family: str
-    make: Callable[[], Families]
-    options: dict[str, Any]
-    limit_s: float
-
-
-@dataclass(frozen=True)
 class _Stage:
     """A part of a run, in one kind of world."""
 
@@ -111,52 +97,8 @@ def _stages(config: TrainConfig) -> list[_Stage]:
         # Trials ask for the time alone.
         unshaped = partial(make_rehearsal, world, replace(rehearsal, shaping_s_m=0.0))
         makers = [partial(make_rehearsal, world, rehearsal)] * rehearsal.environments
-        trials = _trials(world, unshaped, rehearsal.episodes, {"anywhere": False})
+        trials = trials_of(world, unshaped, rehearsal.episodes, {"anywhere": False})
         stages.append(_Stage("rehearsal", rehearsal, 0, rehearsal.every, makers, trials))
     in_full = [partial(make_world, world, k) for k in range(ppo.environments)]
     every = config.evaluation.every
     return [*stages, _Stage("ppo", ppo, rehearsal.chunks, every, in_full, trials_in_full(config))]
-
-
-def trials_in_full(config: TrainConfig) -> list[Trial]:
-    """Return the trials in the whole environment: every family, with every noise."""
-    world = config.world
-    whole = [partial(make_world, replace(world, noises=(noise,))) for noise in world.noises]
-    return [trial for make in whole for trial in _trials(world, make, config.evaluation.episodes, {})]
-
-
-def _trials(
-    world: WorldConfig, make: Callable[[], Families], episodes: int, options: dict[str, Any]
-) -> list[Trial]:
-    return [
-        Trial(name, make, {"rooms": name, "room_seed": FIRST_VALIDATION_SEED + k} | options, world.time_limit_s)
-        for name in dict.fromkeys(world.rooms)
-        for k in range(episodes)
-    ]
-
-
-def evaluate(weights: Weights, heads: int, trials: Sequence[Trial], pool: Pool) -> dict[str, Any]:
-    """Return how long a policy, chance aside, takes to 95 % on validation seeds; unreached counts as the limit."""
-    ends = list(pool.map(_try, [(weights, heads, trial) for trial in trials]))
-    times: dict[str, list[float]] = {trial.family: [] for trial in trials}
-    for trial, (time_s, _) in zip(trials, ends, strict=True):
-        times[trial.family].append(time_s)
-    means = {name: float(np.mean(values)) for name, values in times.items()}
-    return {
-        "time_to_95_s": float(np.mean(list(means.values()))),
-        "collisions": sum(collisions for _, collisions in ends),
-        **means,
-    }
-
-
-def _try(job: tuple[Weights, int, Trial]) -> tuple[float, int]:
-    """Return the time to 95 % [s] and the collisions of one episode."""
-    weights, heads, trial = job
-    network = ChoiceEnsemble(weights, heads=heads)
-    env = trial.make()
-    env.reset(options=trial.options)
-    while True:
-        k = int(np.argmax(network.scores(env.env.agent.described[0]))) if env.action_masks().sum() > 1 else 0
-        *_, terminated, truncated, info = env.step(k)
-        if terminated or truncated:
-            return info["time_s"] if info["is_success"] else trial.limit_s, info["collisions"]

@@ -137,8 +137,9 @@ def test_two_that_are_sent_at_each_other_come_to_a_stand(model, height_m, turns,
     y = 0.5 * height_m
     starts = np.array([[0.6, y, headings[0]], [7.4, y + (0.0 if height_m == 1.0 else 0.2), headings[1]]])
     team = Team(
-        robots=2, floor_plan=hall(8.0, height_m, tuple(starts[0])), team={"communication": {"model": model}}
-    )
+        robots=2, floor_plan=hall(8.0, height_m, tuple(starts[0])), team={"communication": {"model": model}},
+        config={"coverage_target": 1.0},
+    )  # fmt: skip
     observed = team.reset(seed=1, options={"start_poses": starts})
     each = drivers(team)
 
@@ -159,7 +160,10 @@ def test_two_that_are_sent_at_each_other_come_to_a_stand(model, height_m, turns,
 @pytest.mark.parametrize(("seed", "model"), [(0, "unlimited"), (1, "none")])
 def test_five_that_drive_as_they_please_in_a_small_room_never_touch(seed, model):
     starts = np.array([[0.7, 0.7, 0.0], [3.3, 0.7, 1.5], [0.7, 3.3, -1.0], [3.3, 3.3, 3.0], [2.0, 2.0, 0.7]])
-    team = Team(robots=5, floor_plan=hall(4.0, 4.0, tuple(starts[0])), team={"communication": {"model": model}})
+    team = Team(
+        robots=5, floor_plan=hall(4.0, 4.0, tuple(starts[0])), team={"communication": {"model": model}},
+        config={"coverage_target": 1.0},
+    )  # fmt: skip
     observed = team.reset(seed=seed, options={"start_poses": starts})
     each, rng, wanted = drivers(team), np.random.default_rng(seed), np.zeros((5, 3))
 

@@ -138,7 +138,7 @@ def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed):
     free[:, round(left / 0.05) : round(right / 0.05)] = True
     starts = np.array([[0.8, 0.6, 0.0], [8.2, 0.6, 0.0]])[::order]
     plan = FloorPlan(name="bay", walls=np.array(walls), free=free, resolution=0.05, start=tuple(starts[0]))
-    team = Team(robots=2, floor_plan=plan)
+    team = Team(robots=2, floor_plan=plan, config={"coverage_target": 1.0})
     observed = team.reset(seed=seed, options={"start_poses": starts})
     crew = {}
     for member in team.members:

@@ -61,10 +61,10 @@ def curve(out: Path) -> list[dict]:
 
 
 def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
-    run(tmp_path / "whole")
+    run(tmp_path / "whole", workers=1)
     with pytest.raises(Killed):
         run(tmp_path / "parts", kill_after="ppo, chunk 2 ")
-    again = run(tmp_path / "parts")
+    again = run(tmp_path / "parts", workers=1)
     assert not any(text.startswith(("ppo, chunk 1 ", "ppo, chunk 2 ")) for text in again)
     one, other = (read_zip(tmp_path / name / "checkpoint.zip") for name in ("whole", "parts"))
     same_weights(one, other)
@@ -77,6 +77,7 @@ def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path):
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory):
+    """A run that was not killed, in several processes; those beside it are in one."""
     out = tmp_path_factory.mktemp("rehearsed") / "whole"
     return out, run(out, config=REHEARSED)
 
@@ -97,13 +98,13 @@ def test_a_rehearsal_comes_first(rehearsed):
 @pytest.mark.parametrize("kill_after", ["rehearsal, chunk 1 ", "rehearsal, chunk 2 "])
 def test_a_run_killed_in_a_rehearsal_is_the_one_that_was_not(tmp_path, rehearsed, kill_after):
     with pytest.raises(Killed):
-        run(tmp_path, kill_after=kill_after, config=REHEARSED)
+        run(tmp_path, kill_after=kill_after, config=REHEARSED, workers=1)
     # What the rehearsal has no use for weighs nothing until there is something to learn from.
     weights = read_zip(tmp_path / "checkpoint.zip")
     unused = [CANDIDATE.index(name) for name in ("corners", "walls", "sigma_left")]
     assert not weights["row.weight"][:, unused].any()
     assert not weights["state.weight"][:, [STATE.index(name) for name in ("sigma_m", "sigma_rad")]].any()
-    run(tmp_path, config=REHEARSED, workers=1)  # in one process, too
+    run(tmp_path, config=REHEARSED, workers=1)
     one, other = (read_zip(out / "checkpoint.zip") for out in (rehearsed[0], tmp_path))
     same_weights(one, other)
     assert one["row.weight"][:, unused].any()
@@ -226,7 +227,7 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
 
     config = SMALL | {
         "members": 2, "world": {"rooms": ["rectangular"]},
-        "rehearsal": REHEARSED["rehearsal"] | {"steps": 16}, "ppo": {"steps": 0},
+        "rehearsal": REHEARSED["rehearsal"] | {"steps": 16, "environments": 1, "n_steps": 16}, "ppo": {"steps": 0},
     }  # fmt: skip
     made = from_mapping(TrainConfig, config)
     out, mine = tmp_path / "run", tmp_path / "mine.safetensors"

@@ -20,12 +20,13 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from agents.learned.drive_network import DriveNetwork
 from slam.formats import atomic_write, replacing
+from training.learning.config import FIRST_VALIDATION_SEED
 from training.learning.end_to_end.config import DriveConfig
 from training.learning.end_to_end.imitation import learn_control, learn_maps
 from training.learning.end_to_end.networks import ControlNetwork, PlanNetwork
 from training.learning.end_to_end.ppo import DrivePolicy, DriveWorld, make_model
 from training.learning.end_to_end.rollouts import Episode, Outcome, give_lessons, guided_lessons, judge
-from training.learning.folder import FIRST_VALIDATION_SEED, FolderRun, words
+from training.learning.folder import FolderRun, words
 from training.learning.vec_env import ExploreVecEnv
 from training.runs.campaign import Pool
 from training.runs.processes import one_thread_each
