@@ -26,7 +26,7 @@ __all__ = ["Run", "make_model"]
 class Run(FolderRun):
     """A run of one network: chunks of rollouts, those of the rehearsal first; the folder gets ``best.zip``, too.
 
-    With one worker the rollouts are made in this process; with more, or on a cluster, each of their environments
+    With one worker the rollouts are made in this process; with more, or on a cluster, each of several environments
     has a process of its own on this machine: they step in turn with the network. What is learned is the same.
     """
 
@@ -38,7 +38,8 @@ class Run(FolderRun):
                 self._enact(stage, pool)
 
     def _enact(self, stage: _Stage, pool: Pool) -> None:
-        env = VecMonitor(self._environments(stage.makers))
+        # Where nothing is to be learned, the model only has to see what an environment is like.
+        env = VecMonitor(self._environments(stage.makers if stage.ppo.steps > 0 else stage.makers[:1]))
         try:
             model = make_model(self.config, env, stage.ppo, device=self._device)
             network = cast("ChoicePolicy", model.policy).network
@@ -53,7 +54,7 @@ class Run(FolderRun):
             env.close()
 
     def _environments(self, makers: Sequence[Callable[[], Families]]) -> VecEnv:
-        if self._workers == 1:
+        if self._workers == 1 or len(makers) == 1:
             return DummyVecEnv(list(makers))
         with one_thread_each():
             apart: Any = [partial(world_of_worker, maker) for maker in makers]

@@ -253,6 +253,7 @@ def test_a_run_writes_a_policy_that_the_agent_reads(run_folder, tmp_path, capsys
     # What has learned so little goes a long way round: it is followed seldom, and not to the end.
     monkeypatch.setattr(LearnedDriver, "asked", 0.05)
     monkeypatch.setattr("training.dungeons.walks.MOST_HOPS", 10)
+    monkeypatch.setattr("training.dungeons.lessons.MOST_HOPS", 40)
     out = tmp_path / "run"
     (out / "round-1").mkdir(parents=True)
     (out / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")

@@ -227,7 +227,7 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
 
     config = SMALL | {
         "members": 2, "world": {"rooms": ["rectangular"]},
-        "rehearsal": REHEARSED["rehearsal"] | {"steps": 16, "environments": 1, "n_steps": 16}, "ppo": {"steps": 0},
+        "rehearsal": REHEARSED["rehearsal"] | {"steps": 16}, "ppo": {"steps": 0},
     }  # fmt: skip
     made = from_mapping(TrainConfig, config)
     out, mine = tmp_path / "run", tmp_path / "mine.safetensors"
