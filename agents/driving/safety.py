@@ -187,20 +187,13 @@ def body_gaps(
         Gap to the map now, gap to the map ahead, gap to the scan now, gap to the scan ahead.
     """
     rim, half = guard.rim, guard.half
-    total = guard.lag_s + _braking_s(twist, guard)
+    way = _braking_way(twist, guard)
     map_now = map_ahead = scan_now = scan_ahead = np.inf
-    x, y, theta = 0.0, 0.0, 0.0  # of the predicted body in the present body frame
-    last = 0.0
     heading = pose[2]
     cos_b, sin_b = math.cos(heading), math.sin(heading)
     for k in range(_POSES):
-        held = _held_s(total * k / (_POSES - 1), twist, guard)
-        dt, last = held - last, held
-        middle = theta + 0.5 * dt * twist[2]
-        x += dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
-        y += dt * (math.sin(middle) * twist[0] + math.cos(middle) * twist[1])
-        theta += dt * twist[2]
-        c, s = math.cos(theta), math.sin(theta)
+        x, y = way[k, 0], way[k, 1]
+        c, s = math.cos(way[k, 2]), math.sin(way[k, 2])
         map_gap = np.inf
         for i in range(rim.shape[0]):
             bx, by = x + c * rim[i, 0] - s * rim[i, 1], y + s * rim[i, 0] + c * rim[i, 1]
@@ -237,19 +230,29 @@ def _held_s(t: float, twist: Array, guard: Guard) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
-    """Tell whether the body, braking from a twist, crosses no line; or, where it has, goes no farther."""
+def _braking_way(twist: Array, guard: Guard) -> Array:
+    """Return poses on the way to a stand ``(poses, 3)``, even in time, in the body frame now: the first is 0."""
     total = guard.lag_s + _braking_s(twist, guard)
-    now = np.empty(len(sides))
-    x, y, theta, last = 0.0, 0.0, 0.0, 0.0
-    for k in range(_POSES):
+    way = np.zeros((_POSES, 3))
+    last = 0.0
+    for k in range(1, _POSES):
         held = _held_s(total * k / (_POSES - 1), twist, guard)
         dt, last = held - last, held
-        middle = theta + 0.5 * dt * twist[2]
-        x += dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
-        y += dt * (math.sin(middle) * twist[0] + math.cos(middle) * twist[1])
-        theta += dt * twist[2]
-        c, s = math.cos(theta), math.sin(theta)
+        middle = way[k - 1, 2] + 0.5 * dt * twist[2]
+        way[k, 0] = way[k - 1, 0] + dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
+        way[k, 1] = way[k - 1, 1] + dt * (math.sin(middle) * twist[0] + math.cos(middle) * twist[1])
+        way[k, 2] = way[k - 1, 2] + dt * twist[2]
+    return way
+
+
+@njit(cache=True, nogil=True)
+def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
+    """Tell whether the body, braking from a twist, crosses no line; or, where it has, goes no farther."""
+    way = _braking_way(twist, guard)
+    now = np.empty(len(sides))
+    for k in range(_POSES):
+        x, y = way[k, 0], way[k, 1]
+        c, s = math.cos(way[k, 2]), math.sin(way[k, 2])
         for i in range(len(sides)):
             nx, ny, d = sides[i]
             # The body's corner that is farthest along the line's normal.
