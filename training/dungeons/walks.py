@@ -187,6 +187,8 @@ class LearnedDriver(TourDriver):
     """
 
     stream, asked = 9, 0.5
+    most_hops = MOST_HOPS
+    """Hops that a robot is driven to its end by, at most."""
 
     def __init__(self, network: StationNetwork) -> None:
         halved = copy.deepcopy(network).to(torch.bfloat16)
@@ -227,7 +229,7 @@ class LearnedDriver(TourDriver):
         while waiting or driven:
             while waiting and len(driven) < _TOGETHER:
                 driven.append(waiting.pop())
-            at = [(k, walks[k].stop()) for k in driven if hops[k] < MOST_HOPS]
+            at = [(k, walks[k].stop()) for k in driven if hops[k] < self.most_hops]
             left = [(k, stop) for k, stop in at if stop is not None]
             for (k, stop), choice in zip(left, self.choose([stop for _, stop in left]), strict=True):
                 walks[k].hop(stop.hop_cell(choice))
