@@ -51,8 +51,9 @@ def make_config(
 ) -> EnvConfig:
     """Put an environment's configuration together: ``config`` (a TOML file, a mapping), then each part over it.
 
-    A string names a preset, generator, backend or filter; a mapping configures it (``{"preset": "youbot", …}``,
-    ``{"name": "apartment", …}``). A robot's name stands for its lidar and noise too, where those are not given.
+    A string names a preset, generator, backend or filter; a mapping changes what ``config`` has of it, or what a
+    preset or name in it stands for (``{"preset": "youbot", …}``, ``{"name": "apartment", …}``). A robot's name
+    stands for its lidar and noise too, where those are not given.
     Unknown names, keys and arguments raise ``ValueError`` that lists the valid ones.
     """
     for name in unknown:
@@ -71,18 +72,19 @@ def make_config(
         if isinstance(given, Mapping):
             options = dict(given)
             changes[name] = options.pop("name", getattr(base, name))
-            changes[f"{name}_config"] = options
+            same = changes[name] == getattr(base, name)
+            changes[f"{name}_config"] = {**getattr(base, f"{name}_config"), **options} if same else options
         elif given is not None:
             require(isinstance(given, str), f"{name} must be a name or a mapping, got {quoted(given)}")
             changes[name] = given
             if given != getattr(base, name):
                 changes[f"{name}_config"] = {}
     if robot is not None:
-        changes["robot"] = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
+        changes["robot"] = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot", base=base.robot)
     if lidar is not None:
-        changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar")
+        changes["lidar"] = resolve(LidarConfig, lidar, LIDAR_PRESETS, "lidar", base=base.lidar)
     if noise is not None:
-        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset")
+        changes["noise"] = resolve(NoiseConfig, noise, NOISE_PRESETS, "noise preset", base=base.noise)
     if reward is not None:
         with argument("reward"):
             changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)

@@ -243,15 +243,17 @@ NOISE_PRESETS: dict[str, NoiseConfig] = {
 }
 
 
-def resolve(cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str) -> T:
-    """Return a config from a preset's name, a mapping (laid over its ``preset`` key's), or a config.
+def resolve(
+    cls: type[T], value: str | Mapping[str, Any] | T | None, presets: Mapping[str, T], what: str, *,
+    base: T | None = None,
+) -> T:  # fmt: skip
+    """Return a config from a preset's name, a config, or a mapping, laid over its ``preset`` key's or ``base``.
 
     ``what`` is the argument, and a word for its names perhaps, of which ``ValueError`` speaks.
     """
     if isinstance(value, str):
         check_name(what, value, presets)
         return presets[value]
-    base = None
     if isinstance(value, Mapping) and "preset" in value:
         base = resolve(cls, str(value["preset"]), presets, what)
         value = {key: inner for key, inner in value.items() if key != "preset"}

@@ -87,6 +87,11 @@ class Backend(abc.ABC):
         cov = np.array(pose_cov, dtype=np.float64)
         if cov.shape != (3, 3) or not np.all(np.isfinite(cov)):
             raise ValueError("a pose covariance is a finite (3, 3) matrix")
+        least = float(np.linalg.eigvalsh(cov)[0])
+        if not np.allclose(cov, cov.T) or least < -1e-9 * max(np.trace(cov), 0.0):
+            raise ValueError(f"a pose covariance is symmetric and has no negative eigenvalue, got {cov.tolist()}")
+        if least < _SURE:
+            cov += _SURE * np.eye(3)  # known exactly: but its inverse is asked for
         self.grid = OccupancyGrid(self.config.grid_resolution_m)
         self.key_scans = KeyScans(self.config.key_scans)
         self.recovery.reset()
@@ -310,6 +315,9 @@ class SurfaceBackend(Backend):
     def belief(self) -> Belief:
         """Pose and grid; landmarks are empty, and there is no joint covariance."""
         return Belief.without_landmarks(self.pose, self.pose_cov, self.grid, self.health)
+
+
+_SURE = 1e-12  # variance [m², rad²] of a start that is said to have none
 
 
 def found_cov() -> Array:

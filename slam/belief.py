@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -105,6 +105,11 @@ class Belief:
             for name in _POSTPONED:
                 getattr(self, name)
             object.__setattr__(self, "_read", None)
+
+    def __getstate__(self) -> list[Any]:
+        """Return all values, read: how to read them stays here."""
+        self.settle()
+        return [getattr(self, each.name) for each in fields(self)]
 
     def _repr_png_(self) -> bytes:
         """Return the picture that a notebook shows."""

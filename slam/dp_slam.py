@@ -134,7 +134,7 @@ class DpSlam(SurfaceBackend):
         self.extractor.extract(scan)  # the surfaces that the grid is drawn with
         if due:
             self._update_particles(points)
-            self._key.append((scan, self.extractor.surface.copy()))
+            self._key.append((scan.kept(), self.extractor.surface.copy()))
             self._redraw_if_moved()
             self._shown = np.vstack([self._shown, self.sensor_pose(self._poses[self._lead])])
         self._believed = None

@@ -149,6 +149,7 @@ class FastSlam(LandmarkBackend):
         match = self._match_buffer(len(z))
         match[:] = rows
         best = self._correct(z, match)
+        self._book.count_sightings(rows)
         for k in np.flatnonzero(rows == UNMATCHED):
             if self._book.row(ids[k]) < 0:  # not added by this very call
                 self._add(z[k], best, ids[k])

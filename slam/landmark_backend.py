@@ -10,13 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import Backend
+from slam.files import quoted
 from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
 from slam.landmarks.spinning_wheels import SpinningWheels, touches
 from slam.motion import OdometryNoise, Twist
 from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
-__all__ = ["LandmarkBackend", "observation_rows"]
+__all__ = ["LARGEST_ID", "LandmarkBackend", "observation_rows"]
+
+LARGEST_ID = 1_000_000
+"""Of a landmark, where whoever observes it says which it is."""
 
 
 class LandmarkBackend(Backend):
@@ -101,12 +105,21 @@ class LandmarkBackend(Backend):
 def observation_rows(observations: Observations) -> Array:
     """Return landmark observations as rows ``(m, 12)`` like the feature extractor's, of unknown kind.
 
-    Raises ``ValueError`` where they are not finite, or shapes disagree.
+    Raises ``ValueError``, before anything has changed, where they are none: see
+    :class:`slam.types.Observations`.
     """
     rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
     cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
     if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
         raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
+    if np.any(cov[:, 0, 0] <= 0.0) or np.any(cov[:, 0, 0] * cov[:, 1, 1] <= cov[:, 0, 1] ** 2):
+        raise ValueError("covariances of observations must be positive definite; what is not known is large")
+    if observations.ids is not None:
+        ids = np.asarray(observations.ids)
+        if ids.shape != (len(rb),) or (len(ids) and ids.dtype.kind not in "iu"):
+            raise ValueError(f"ids of {len(rb)} observations must be as many whole numbers, got {quoted(ids)}")
+        if len(ids) and not 0 <= ids.min() <= ids.max() <= LARGEST_ID:
+            raise ValueError(f"ids of observations must be in [0, {LARGEST_ID}], got {ids.min()} to {ids.max()}")
     z = np.zeros((len(rb), 12))
     z[:, :2], z[:, 2], z[:, 3], z[:, 4] = rb, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
     return z

@@ -75,6 +75,15 @@ class Scan(NamedTuple):
                 "a scan's angles are finite, and its range_max is what its lidar sees [m]; got angle_min "
                 f"{self.angle_min}, angle_increment {self.angle_increment}, range_max {self.range_max}"
             )
+        if self.angle_increment <= 0.0 and len(ranges) > 1:
+            raise ValueError(
+                f"a scan's beams go counter-clockwise, angle_increment > 0, got {self.angle_increment}; turn the "
+                "order of the ranges round, and begin at what was the last angle"
+            )
+
+    def kept(self) -> Scan:
+        """Return a scan with ranges of its own: those given may be a buffer that the next scan goes into."""
+        return Scan(self.ranges.copy(), self.angle_min, self.angle_increment, self.range_max, self.range_min)
 
 
 class Sighting(NamedTuple):
@@ -90,5 +99,5 @@ class Observations:
     """Landmarks seen at one instant, in the sensor frame."""
 
     range_bearing: Array  # (m, 2): range [m], bearing [rad]
-    cov: Array  # (m, 2, 2): their covariance [m², m·rad, rad²]
-    ids: NDArray[np.int64] | None = None  # (m,) where the association is known
+    cov: Array  # (m, 2, 2): their covariance [m², m·rad, rad²], positive definite
+    ids: NDArray[np.int64] | None = None  # (m,) where the association is known, from 0 to 10⁶

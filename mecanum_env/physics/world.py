@@ -43,6 +43,7 @@ from mecanum_env.physics.floor import Floor, build_floor
 from mecanum_env.physics.robot import (
     INCREMENTS,
     POSE,
+    REFERENCES,
     SUBSTEP_S,
     TWIST,
     WHEELS,
@@ -145,7 +146,8 @@ class World:
         Where it would touch something it stays where it is. For studies of what a belief makes of it.
         """
         before = self._work[STATE].copy()
-        self._work[POSE], self._work[TWIST], self._work[WHEELS] = np.asarray(pose, np.float64), 0.0, 0.0
+        work = self._work
+        work[POSE], work[TWIST], work[WHEELS], work[REFERENCES] = np.asarray(pose, np.float64), 0.0, 0.0, 0.0
         free = self._touches_nothing()
         if not free:
             self._work[STATE] = before

@@ -52,7 +52,8 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
     autoreset_mode : AutoresetMode or str
         As in Gymnasium: ``"NextStep"``, ``"SameStep"`` or ``"Disabled"``. With the first, other
         processes begin the next episode while the caller is still busy with the end of the last: what ``render``,
-        ``call`` and ``get_attr`` show between the two is of either, by which process it is in.
+        ``call`` and ``get_attr`` show between the two is of either, by which process it is in. What is set or
+        called then holds for that episode: it is begun again. Ctrl-C in the middle of a step closes them all.
     copy : bool
         Whether ``reset`` and ``step`` return copies of the observations; else views, until the next step.
     max_episode_steps : int, optional
@@ -209,15 +210,15 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
     def _ask(self, command: str, parts: Sequence[tuple[Any, ...]]) -> list[Any]:
         """Give every share its part of a command; return their results."""
         self._board.orders[0] = LISTEN
-        rest = iter(parts[1:])
-        return self._all(command, parts[0], lambda worker: worker.tell(command, *next(rest)), Worker.told)
+        rest = iter([Worker.order(command, *part) for part in parts[1:]])  # all, before any worker waits for one
+        return self._all(command, parts[0], lambda worker: worker.tell(next(rest)), Worker.told)
 
     def _all(
         self, command: str, part: tuple[Any, ...], begin: Callable[[Worker], None], end: Callable[[Worker], Answer]
     ) -> list[Any]:
         """Have the workers begin, do the caller's own part, and return all results, or raise what one raised."""
         if self._own is None:
-            raise gymnasium.error.ClosedEnvironmentError("the environments are closed")
+            raise gymnasium.error.ClosedEnvironmentError("the environments are closed; make them anew")
         try:
             for worker in self._workers:
                 begin(worker)
@@ -229,6 +230,9 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         except (EOFError, BrokenPipeError, ConnectionResetError) as error:
             self.close()
             raise RuntimeError("a worker process has ended; make the environments anew") from error
+        except BaseException:  # Ctrl-C: some have done it and some have not
+            self.close()
+            raise
         for raised, _ in answers:
             if raised is not None:
                 raise raised

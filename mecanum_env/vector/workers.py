@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
+import pickle
 import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
+from multiprocessing.reduction import ForkingPickler
 from multiprocessing.util import Finalize
 from typing import Any
 
@@ -101,7 +103,8 @@ class Share:
                         "steps"
                     )
                 place = seat.point_at(page)
-                observation, paid, terminated, truncated, info = seat.env.step(seat.action)
+                # A copy: a wrapper may keep it, and the board's row is the next step's as well.
+                observation, paid, terminated, truncated, info = seat.env.step(seat.action.copy())
                 reward = float(paid)
                 seat.ended = ended = terminated or truncated
                 if ended and self._mode is AutoresetMode.SAME_STEP:
@@ -122,10 +125,21 @@ class Share:
         for seat in self._seats:
             if seat.ended and seat.ready is None:
                 state = seat.env.unwrapped.np_random.bit_generator.state
-                last = seat.last_seen()
+                seat.seen = last = seat.last_seen()
                 seat.point_at(None)
-                observation, info = seat.env.reset()
-                seat.ready = _Ready(observation, info, last, state)
+                try:
+                    observation, info = seat.env.reset()
+                except Exception:  # it will be raised where the caller asks for it
+                    seat.env.unwrapped.np_random.bit_generator.state = state
+                else:
+                    seat.ready = _Ready(observation, info, last, state)
+
+    def _forget_ready(self) -> None:
+        """Take back the episodes that were begun ahead: what is about to be done may make them others."""
+        for seat in self._seats:
+            if seat.ready is not None:
+                seat.env.unwrapped.np_random.bit_generator.state = seat.ready.state
+                seat.ready = None
 
     def reset(self, page: int, seeds: dict[int, int | None], options: Info | None) -> dict[int, Info]:
         """Reset some environments; return of each what the page has no place for, where there is anything."""
@@ -159,10 +173,13 @@ class Share:
         for seat in self._seats:
             seat.point_at(None)  # whatever is called, it writes on no page
         found = [seat.env.get_wrapper_attr(name) for seat in self._seats]
+        if any(callable(value) for value in found):
+            self._forget_ready()
         return [value(*args, **kwargs) if callable(value) else value for value in found]
 
     def set(self, name: str, values: dict[int, Any]) -> None:
         """Set an attribute of every environment."""
+        self._forget_ready()
         for seat in self._seats:
             seat.env.set_wrapper_attr(name, values[seat.row])
 
@@ -208,10 +225,15 @@ class Worker:
                 raise EOFError
         return self.told() if self._board.orders[1 + self._number] else _NOTHING
 
-    def tell(self, *order: Any) -> None:
-        """Give it any other order; the board's orders must say that it is in the pipe."""
+    @staticmethod
+    def order(*parts: Any) -> bytes:
+        """Return any other order as it goes through the pipe."""
+        return bytes(ForkingPickler.dumps(parts))
+
+    def tell(self, order: bytes) -> None:
+        """Give it such an order; the board's orders must say that it is in the pipe."""
         self._due.release()
-        self._pipe.send(order)
+        self._pipe.send_bytes(order)
 
     def told(self) -> Answer:
         """Wait for the answer to that."""
@@ -222,7 +244,7 @@ class Worker:
         """Have it quit, or end it."""
         self._board.orders[0] = LISTEN
         with contextlib.suppress(OSError):
-            self.tell(_QUIT)
+            self.tell(self.order(_QUIT))
         self._pipe.close()
         self.process.join(_PATIENCE_S)
         if self.process.is_alive():
@@ -240,6 +262,20 @@ def _acquired(semaphore: Any) -> bool:
         if acquire(False):
             return True
     return bool(acquire(True, _LOOK_S))
+
+
+def _sendable(answer: Answer) -> bytes:
+    """Return an answer as it goes through the pipe; of one that cannot, the error that says so."""
+    raised, _ = answer
+    try:
+        sent = bytes(ForkingPickler.dumps(answer))
+        if raised is not None:
+            pickle.loads(sent)  # not every exception that can be sent can be received
+    except Exception as error:
+        what = raised or error
+        lost = RuntimeError(f"in a worker process, where it cannot be sent from: {type(what).__name__}: {what}")
+        sent = bytes(ForkingPickler.dumps((lost, None)))
+    return sent
 
 
 def _work(number: int, pipe: Connection, due: Any, done: Any, make: Make, board: Board, *what: Any) -> None:
@@ -265,12 +301,12 @@ def _work(number: int, pipe: Connection, due: Any, done: Any, make: Make, board:
             except Exception as error:  # the caller raises it
                 answer = error, None
             if page == LISTEN:
-                pipe.send(answer)
+                pipe.send_bytes(_sendable(answer))
                 continue
             orders[1 + number] = says_more = answer != _NOTHING
             done.release()
             if says_more:
-                pipe.send(answer)
+                pipe.send_bytes(_sendable(answer))
             if share is not None:
                 share.prepare()
     except (EOFError, BrokenPipeError):

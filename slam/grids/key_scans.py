@@ -106,7 +106,7 @@ class KeyScans:
         _hang(sensor_pose, ids, marks, n, self._poses, self._anchor_ids, self._anchor_local)
         self._variances[n] = variance
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
-        self._scans.append((scan, surface.copy()))
+        self._scans.append((scan.kept(), surface.copy()))
 
     def due(self) -> bool:
         """Count an update; tell whether it is time to look at the landmarks again."""

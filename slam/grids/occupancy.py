@@ -43,6 +43,8 @@ __all__ = ["CLASS_OF", "FREE", "OCCUPIED", "PROBABILITY_BYTE", "UNKNOWN", "Occup
 
 _CHUNK = 32  # the grid's edges lie on multiples of this, so that every overview block is whole
 _SPARE = 2  # chunks more than is needed when it grows
+_FAR = 32 * _CHUNK  # so many cells of nothing are not worth keeping
+_MOST_CHANGES = 1 << 20  # that are kept for who follows; then followers start over
 _OVERVIEW = 64  # the overview never has more than this many blocks a side
 
 
@@ -274,6 +276,9 @@ class OccupancyGrid:
             return
         self._grow(mask_row + r0, mask_col + c0, mask_row + r1 + 1, mask_col + c1 + 1)
         body_x, body_y, radius = (0.0, 0.0, -1.0) if body is None else self._make_room_for(*body)
+        if self._change_count > _MOST_CHANGES:  # nobody follows
+            self._change_count = 0
+            self.revision += 1
         most = self._change_count + (r1 + 1 - r0) * (c1 + 1 - c0) + 1
         if len(self._changes) < most:
             grown = np.zeros((2 * most, 4), np.int32)
@@ -332,6 +337,8 @@ class OccupancyGrid:
         """Make room for lattice cells [row0, row1) × [col0, col1), in chunks and with some to spare."""
         if row0 >= self._row0 and col0 >= self._col0 and row1 <= self._row1 and col1 <= self._col1:
             return
+        if not self.drawings:
+            self._move_near(row0, col0, row1, col1)
         rows, cols = self.shape
         new_row0, new_col0 = (
             old if wanted >= old else (wanted // _CHUNK - _SPARE) * _CHUNK
@@ -352,6 +359,14 @@ class OccupancyGrid:
         self.log_odds, self.visited, self._drawn = log_odds, visited, drawn
         self._row0, self._col0, self._row1, self._col1 = new_row0, new_col0, new_row1, new_col1
         self._build_overview()
+
+    def _move_near(self, row0: int, col0: int, row1: int, col1: int) -> None:
+        """Have the empty grid begin at a box that is far from it: there may be kilometres between."""
+        rows, cols = self.shape
+        if max(self._row0 - row1, row0 - self._row1, self._col0 - col1, col0 - self._col1) > _FAR:
+            self._row0, self._col0 = row0 // _CHUNK * _CHUNK, col0 // _CHUNK * _CHUNK
+            self._row1, self._col1 = self._row0 + rows, self._col0 + cols
+            self.revision += 1
 
     # ---- overview ------------------------------------------------------------------------------------------
 

@@ -40,7 +40,7 @@ def _point_blocks(x: Array, i: int, offset: float, c: float, s: float, h: Array)
     """
     dx = x[0] + offset * c - x[3 + 2 * i]
     dy = x[1] + offset * s - x[4 + 2 * i]
-    rho2 = dx * dx + dy * dy
+    rho2 = max(dx * dx + dy * dy, 1e-12)  # a landmark on the sensor itself has no bearing, but must do no harm
     rho = math.sqrt(rho2)
     h[0, 0], h[0, 1] = dx / rho, dy / rho
     h[1, 0], h[1, 1] = -dy / rho2, dx / rho2

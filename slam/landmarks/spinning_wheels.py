@@ -149,7 +149,7 @@ class SpinningWheels:
         """Take note of a scan and the body's pose ``(3,)``; one that misses landmarks is no measure."""
         self._left = max(self._left - 1, 0)
         if matched > recent - self._least:
-            self._last = scan, body.copy()
+            self._last = scan.kept(), body.copy()
 
 
 def touches(scan: Scan, offset_m: float, length_m: float, width_m: float, sigma_m: float) -> bool:

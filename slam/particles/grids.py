@@ -35,6 +35,7 @@ class Lattice:
         self.cell_m = cell_m
         self.row, self.col = -_CHUNK, -_CHUNK  # lattice index of array cell (0, 0)
         self.shape = (2 * _CHUNK, 2 * _CHUNK)
+        self._empty = True
 
     def enclose(self, low: Array, high: Array) -> tuple[int, int, int, int] | None:
         """Make room for a box [m] with a margin; return by how much it grew (below, left) and its old shape."""
@@ -42,6 +43,11 @@ class Lattice:
         col0, row0 = (math.floor(v / self.cell_m) - margin for v in low.tolist())
         col1, row1 = (math.floor(v / self.cell_m) + margin for v in high.tolist())
         rows, cols = self.shape
+        if self._empty and not (
+            self.row <= row1 and row0 <= self.row + rows and self.col <= col1 and col0 <= self.col + cols
+        ):  # begin there: it may be kilometres away
+            self.row, self.col = row0 // _CHUNK * _CHUNK, col0 // _CHUNK * _CHUNK
+        self._empty = False
         new_row, new_col = min(self.row, row0 // _CHUNK * _CHUNK), min(self.col, col0 // _CHUNK * _CHUNK)
         end_row = max(self.row + rows, -(-row1 // _CHUNK) * _CHUNK)
         end_col = max(self.col + cols, -(-col1 // _CHUNK) * _CHUNK)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import gc
+import pickle
 import weakref
 
 import numpy as np
@@ -77,3 +78,14 @@ def test_nobody_keeps_a_belief_that_was_let_go() -> None:
     gone = weakref.ref(backend.belief)
     gc.collect()
     assert gone() is None
+
+
+@pytest.mark.parametrize("name", slam.names())
+def test_it_can_be_sent_to_another_process(name: str) -> None:
+    backend = slam.make(name)
+    backend.reset()
+    if backend.observes_landmarks and name not in ("odometry", "truth"):
+        _observe(backend)
+    sent = pickle.loads(pickle.dumps(backend.belief))
+    for field in FIELDS:
+        np.testing.assert_array_equal(getattr(sent, field), getattr(backend.belief, field))

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import slam
-from slam.types import Odometry, Scan
+from slam.geometry import compose, exp
+from slam.types import Observations, Odometry, Scan
+from tests.slam.simulated import circle_twist, room_scan
+
+BLIND = ("odometry", "truth")
+OBSERVERS = [name for name in slam.names() if slam.make(name).observes_landmarks and name not in BLIND]
+TWO = Observations(np.array([[2.0, 0.3], [3.0, -1.0]]), np.tile(np.diag([1e-3, 1e-3]), (2, 1, 1)), np.arange(2))
 
 
 @pytest.mark.parametrize("name", slam.names())
@@ -37,6 +44,8 @@ def test_no_backend_minds_what_a_broken_lidar_says(name: str) -> None:
         ({"range_max": math.inf}, "range_max inf"),
         ({"range_max": math.nan}, "range_max nan"),
         ({"angle_increment": math.nan}, "angle_increment nan"),
+        ({"angle_increment": -2.0 * math.pi / 360}, "counter-clockwise"),
+        ({"angle_increment": 0.0}, "counter-clockwise"),
     ],
 )
 def test_what_is_no_scan_is_refused_in_a_sentence(name: str, wrong: dict[str, Any], what: str) -> None:
@@ -57,3 +66,97 @@ def test_odometry_that_is_no_number_changes_nothing(name: str, twist: Any) -> No
     with pytest.raises(ValueError, match="finite numbers"):
         backend.predict(Odometry(twist, 0.1))
     assert np.array_equal(backend.pose, pose) and np.array_equal(backend.pose_cov, cov)
+
+
+@pytest.mark.parametrize("name", slam.names())
+@pytest.mark.parametrize("cov", [np.diag([1.0, 1.0, -1.0]), [[1.0, 0.9, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
+def test_what_is_no_covariance_is_no_start(name: str, cov: Any) -> None:
+    with pytest.raises(ValueError, match="no negative eigenvalue"):
+        slam.make(name).reset(pose_cov=np.array(cov))
+
+
+@pytest.mark.parametrize("name", slam.names())
+def test_a_start_may_be_known_exactly(name: str) -> None:
+    backend = slam.make(name)
+    backend.reset(pose_cov=np.zeros((3, 3)))
+    backend.predict(Odometry((0.2, 0.0, 0.1), 0.1))
+    assert np.all(np.isfinite(backend.pose_cov))
+
+
+@pytest.mark.parametrize("name", slam.names())
+def test_the_map_takes_no_more_memory_where_it_begins_far_from_the_origin(name: str) -> None:
+    shapes, known = [], []
+    for start in ((0.0, 0.0, 0.3), (499_999.0, 5_000_001.0, 0.3)):
+        backend = slam.make(name)
+        backend.reset(start)
+        backend.predict(Odometry((0.0, 0.0, 0.0), 0.1))
+        backend.update(Scan(np.full(360, 2.0), -math.pi, 2.0 * math.pi / 360, 8.0))
+        shapes.append(max(backend.grid.shape))
+        known.append(backend.grid.known_cells)
+        assert np.hypot(*(backend.pose[:2] - start[:2])) < 0.05
+    assert shapes[1] <= 2 * shapes[0] and known[1] == pytest.approx(known[0], rel=0.02)
+
+
+@pytest.mark.parametrize("name", slam.names())
+def test_scans_may_come_in_one_buffer_each_after_the_other(name: str) -> None:
+    """What is kept of a scan, to draw it again, is a copy."""
+    rng, buffer, pose = np.random.default_rng(0), np.zeros(360), np.zeros(3)
+    fresh, reused = slam.make(name), slam.make(name)
+    for backend in (fresh, reused):
+        backend.reset()
+    for k in range(60):
+        twist = circle_twist(k)
+        pose = compose(pose, exp(twist * 0.1))
+        scan = room_scan(pose, rng)
+        buffer[:] = scan.ranges
+        for backend, ranges in ((fresh, scan.ranges), (reused, buffer)):
+            backend.predict(Odometry(tuple(twist), 0.1))
+            backend.update(scan._replace(ranges=ranges))
+    buffer[:] = 0.3
+    for backend in (fresh, reused):
+        backend._redraw_kept(backend.key_scans.poses)
+    assert np.array_equal(fresh.pose, reused.pose)
+    assert np.array_equal(fresh.grid.log_odds, reused.grid.log_odds)
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"ids": np.array([0])}, "ids of 2 observations must be as many whole numbers"),
+        ({"ids": np.array([0.0, 1.0])}, "as many whole numbers"),
+        ({"ids": np.array([0, -1])}, r"must be in \[0, 1000000\], got -1 to 0"),
+        ({"ids": np.array([0, 2_000_000_000])}, r"must be in \[0, 1000000\]"),
+        ({"cov": np.tile(np.diag([1e-3, 0.0]), (2, 1, 1))}, "positive definite"),
+        ({"cov": np.tile([[1e-3, 2e-3], [2e-3, 1e-3]], (2, 1, 1))}, "positive definite"),
+    ],
+)
+def test_observations_that_are_none_change_nothing(name: str, wrong: dict[str, Any], what: str) -> None:
+    backend = slam.make(name)
+    backend.reset()
+    backend.observe(TWO)
+    before = backend.belief
+    before.settle()
+    with pytest.raises(ValueError, match=what):
+        backend.observe(replace(TWO, **wrong))
+    after = backend.belief
+    assert np.array_equal(after.pose, before.pose) and np.array_equal(after.landmarks, before.landmarks)
+    assert np.array_equal(after.landmark_ids, before.landmark_ids)
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_a_landmark_on_the_sensor_itself_does_no_harm(name: str) -> None:
+    backend = slam.make(name)
+    backend.reset()
+    for _ in range(3):
+        backend.observe(Observations(np.array([[0.0, 0.3]]), np.diag([1e-3, 1e-3])[None], np.array([0])))
+    assert np.all(np.isfinite(backend.pose)) and np.all(np.isfinite(backend.pose_cov))
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_sightings_of_known_landmarks_are_counted(name: str) -> None:
+    backend = slam.make(name)
+    backend.reset()
+    for _ in range(4):
+        backend.observe(TWO)
+    assert backend.landmark_details()[0].tolist() == [4, 4]
