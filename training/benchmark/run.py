@@ -26,6 +26,7 @@ from training.benchmark.suites import NOMINAL, SPLITS, Place, Suite
 from training.benchmark.team_episode import TeamJob, run_job
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.room_pictures import parse_seeds
+from training.episodes.team import refuse_bounds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input, one_line
@@ -80,6 +81,8 @@ class BenchmarkPlan:
         """Check options as typed; :class:`BadInput` says what is allowed."""
         with bad_input():
             names = _agent_names(agents)
+            if any(team is not None for team in teams):
+                refuse_bounds(names)
             backends = tuple(backend_names(slam if slam is not None else EnvConfig().slam))
             check_name("split", split, SPLITS)
             chosen = tuple(parse_seeds(seeds, most=_MOST_SEEDS)) if seeds is not None else None

@@ -10,6 +10,7 @@ import numpy as np
 
 from mecanum_env.rooms import load
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES
+from mecanum_env.rooms.files.importers import MAP_SUFFIXES, image_of
 from mecanum_env.team.config import TeamConfig
 from slam.settings import unknown_name
 from training.episodes.team import read_team
@@ -101,13 +102,15 @@ def choose(text: str, *, floor_plans: Path | None = None) -> tuple[Suite, ...]:
         if name not in valid and name in names(floor_plans=True):
             raise BadInput(f"--suite {name} needs the folder of the plans; give --floor-plans DIR")
         if name not in valid:
+            if name == "all":
+                raise BadInput("--suite all stands for every suite; give it alone")
             raise unknown_name("suite", name, (*valid, "all"))
     plans = read_floor_plans(floor_plans) if floor_plans is not None else ()
     return tuple(_make(name, plans) for name in wanted)
 
 
 def read_floor_plans(folder: Path) -> tuple[Place, ...]:
-    """Return the plans in a folder, by name: every ROS map, and every image that belongs to none.
+    """Return the plans in a folder, by name: every ROS map, and every image that is none's.
 
     Raises
     ------
@@ -117,9 +120,10 @@ def read_floor_plans(folder: Path) -> tuple[Place, ...]:
     if not folder.is_dir():
         raise BadInput(f"--floor-plans {folder} is no folder; give one that holds ROS maps (.yaml) or images")
     files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    maps = [path for path in files if path.suffix.lower() in (".yaml", ".yml")]
-    drawn = {path.stem for path in maps}
-    images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.stem not in drawn]
+    maps = [path for path in files if path.suffix.lower() in MAP_SUFFIXES]
+    with bad_input():
+        drawn = {image_of(path).resolve() for path in maps}
+    images = [p for p in files if p.suffix.lower() in IMAGE_SUFFIXES and p.resolve() not in drawn]
     if not maps and not images:
         raise BadInput(
             f"--floor-plans {folder} holds no plan; put ROS maps (.yaml) or images "

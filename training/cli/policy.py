@@ -80,9 +80,10 @@ def _convert(source: Path, target: Path, like: Path | None, member: int | None) 
         raise BadInput("--like belongs to a .zip, and a .zip needs it: the .json file of the policy it comes from")
     if member is not None and kinds[1] != ".zip":
         raise BadInput("--member says which network of a .safetensors becomes a .zip")
-    check_writable(target.parent)
+    check_writable(target.parent, [target.name])
     with needs_extra("train"):
         from training.learning import networks, policies
+    target.parent.mkdir(parents=True, exist_ok=True)
     with bad_input():
         if kinds[0] == ".run":
             policies.export_run(source, target)
@@ -97,9 +98,10 @@ def _join(sources: list[Path], target: Path) -> None:
     for path in (*sources, target):
         if path.suffix != ".safetensors":
             raise BadInput(f"cannot join {path}; several .safetensors become one .safetensors")
-    check_writable(target.parent)
+    check_writable(target.parent, [target.name])
     with needs_extra("train"):
         from training.learning import policies
+    target.parent.mkdir(parents=True, exist_ok=True)
     with bad_input():
         policies.join_policies(sources, target)
     print(f"wrote {target}")
@@ -146,11 +148,14 @@ def _kind(path: Path) -> str:
 
 def _read(path: Path) -> dict[str, object]:
     from slam.files import read_json
+    from slam.settings import from_mapping, to_mapping
+    from training.learning.config import TrainConfig
 
     try:
         described = read_json(path, nan=True)
         if not isinstance(described, dict) or "config" not in described:
             raise ValueError("it does not say with which config the policy was trained")
+        described["config"] = to_mapping(from_mapping(TrainConfig, described["config"]))
     except ValueError as error:
         raise BadInput(f"cannot read {path}: {error}") from error
     # What is of the format is written anew.

@@ -24,7 +24,7 @@ from training.dungeons.bound import BOUNDS
 from training.dungeons.episode import NEAREST, NEAREST_VIEW, SCANS, explore
 from training.dungeons.world import SENSORS, Dungeon, layout, load
 from training.figures.tables import csv_table, markdown_table, number
-from training.runs.campaign import Workers, installed_version, keep_settings
+from training.runs.campaign import Workers, keep_settings, made_by
 from training.runs.errors import BadInput, bad_input
 from training.runs.rows import resume
 from training.runs.running import write_json
@@ -77,12 +77,12 @@ def run_dungeons(
         check_name("--scan", scan, SCANS)
         check_name("--sensor", sensor, SENSORS)
     paths = _maps(maps)
-    if (out / _STORE).exists() and (out / _STORE).read_text("utf-8").startswith("{"):
-        raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
     # A map that cannot be used is found before any work is lost.
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
-    settings = {"protocol": "dungeons", "sensor": sensor, "scan": scan, "version": installed_version()}
+    settings = {"protocol": "dungeons", "sensor": sensor, "scan": scan, **made_by(*agent_names)}
+    if (out / _STORE).is_file() and (out / _STORE).read_bytes()[:1] == b"{":
+        raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     keep_settings(out, settings, [_STORE, _CSV, _SUMMARY])
     files = {digests[path]: path for path in paths}
     asked = [(path, (name, digests[path], scan, sensor)) for path in paths for name in dict.fromkeys(agent_names)]
@@ -96,9 +96,10 @@ def run_dungeons(
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Row]:
-    """Return one summary per agent; ratios are of the mean paths over the maps that both have run.
+    """Return one summary per agent; ratios are of the mean paths over the maps that both have covered.
 
-    Their intervals resample layouts: a map turned or mirrored, or moved by less than a tile, is no new one.
+    Who gave a map up has a short path. Their intervals resample layouts: a map turned or mirrored, or moved by
+    less than a tile, is no new one.
     """
     by_agent: dict[str, dict[str, Row]] = {}
     for row in rows:
@@ -131,15 +132,22 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
-    """Return the ratio of the means and its 95 % interval, resampling layouts, both agents' paths together."""
+    """Return the ratio of the means and its 95 % interval, resampling layouts, both agents' paths together.
+
+    Of a single layout there is no interval.
+    """
     sums: dict[str, list[float]] = {}  # layout → both agents' paths, over its maps
     for name in sorted(own.keys() & other.keys()):
+        if any(row["end"] != "covered" for row in (own[name], other[name])):
+            continue
         both = sums.setdefault(own[name]["layout"], [0.0, 0.0])
         both[0] += own[name]["path_m"]
         both[1] += other[name]["path_m"]
     ours, base = np.array(list(sums.values())).reshape(-1, 2).T
     if base.sum() == 0:
         return {"ratio": None, "ratio_low": None, "ratio_high": None}
+    if len(base) < 2:
+        return {"ratio": float(ours.sum() / base.sum()), "ratio_low": None, "ratio_high": None}
     picks = np.random.default_rng(0).integers(0, len(ours), (_RESAMPLES, len(ours)))
     below = base[picks].sum(axis=1)
     ratios = ours[picks].sum(axis=1) / np.where(below > 0, below, math.nan)
@@ -172,6 +180,8 @@ def table(summary: dict[str, Any]) -> str:
 def _ratio_text(ratio: Row) -> str:
     if ratio.get("ratio") is None:
         return ""
+    if ratio["ratio_low"] is None:
+        return f"{ratio['ratio']:.3f}"
     return f"{ratio['ratio']:.3f} ({ratio['ratio_low']:.3f}–{ratio['ratio_high']:.3f})"
 
 

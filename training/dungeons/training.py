@@ -35,7 +35,7 @@ from training.dungeons.lessons import Lessons, gather, read_lessons
 from training.dungeons.networks import StationNetwork, read_network
 from training.dungeons.plans import dungeon_plan
 from training.runs import options as opt
-from training.runs.campaign import Workers, installed_version, keep_settings
+from training.runs.campaign import Workers, keep_settings, made_by
 from training.runs.errors import bad_input
 
 __all__ = ["Batch", "TrainingConfig", "batch_of", "regret_m", "study", "train", "turned"]
@@ -179,7 +179,7 @@ def train(
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimiser = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     curve = _resume(checkpoint, network, optimiser)
-    batches = len(lessons.planes) // config.batch
+    batches = max(1, len(lessons.planes) // config.batch)  # of few lessons one, of them all
     for epoch in range(len(curve), config.epochs):
         begun = time.monotonic()
         # Drawn anew from the epoch's number: a run that goes on draws what it would have drawn.
@@ -289,7 +289,7 @@ def study(
 
 def run(out: Path, config: TrainingConfig, *, workers: Workers) -> None:
     """Gather lessons, train and write the policy."""
-    settings = {"training": "learned-tour", **asdict(config), "version": installed_version()}
+    settings = {"training": "learned-tour", **asdict(config), **made_by(config.start)}
     keep_settings(out, settings, [_WEIGHTS])
     policy: Path | None = None
     curves = []

@@ -53,7 +53,7 @@ ENDINGS = {
 """Why an episode ended: the word in ``metrics.json``, and what it means."""
 
 AGENT_DONE_AFTER_S = 2.0
-"""An agent without a goal for so long has nothing left to do."""
+"""An agent that says it has ended, and had no goal for so long, has nothing left to do."""
 
 _DEFAULTS: dict[str, Any] = {"agent": "nearest-frontier", "seed": 0}
 _RUN_KINDS = {"agent": (str,), "seed": (int,), "start": (list,), "max_steps": (int,)}
@@ -248,7 +248,7 @@ def run(episode: Episode, progress: Progress, witnesses: Sequence[Witness] = ())
                 episode.end, episode.interrupted = "interrupted", True
             elif terminated and not (info["is_success"] and agent.outlives_coverage):
                 episode.end = "covered" if info["is_success"] else "collision"
-            elif idle >= patience:
+            elif idle >= patience and agent.ended:
                 episode.end = agent.status
             elif not truncated:
                 continue

@@ -6,6 +6,7 @@ While the episode runs little more is done than to keep references; see :class:`
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -109,34 +110,35 @@ class Recorder:
         if step % _SCAN_EVERY == 0:
             self._scans[step] = env.truth.scan.ranges.astype(np.float32)
         if step % _MAP_EVERY == 0:
-            self._note_map(step)
+            self._note_map(step, self._map, self._maps)
         if step % _LANDMARKS_EVERY == 0:
-            self._note_landmarks(step)
+            self._note_landmarks(step, self._landmarks)
 
     def recording(self) -> Recording:
-        """Return what was recorded so far."""
+        """Return what was recorded so far, as it is now; what is recorded later does not depend on it."""
         env, last = self._env, self._steps - 1
-        self._note_map(last)
-        self._note_landmarks(last)
+        maps, landmarks = self._maps.copy(), self._landmarks.copy()
+        self._note_map(last, deepcopy(self._map), maps)
+        self._note_landmarks(last, landmarks)
         record = env.truth.record
         return Recording(
             step_s=env.config.step_s, times=record.times, true_poses=record.true_poses, estimates=record.estimates,
             pose_covs=np.array(self._covs), twists=np.array(self._twists), coverage=record.coverage,
             nees=record.nees, health=record.health, collisions=np.array(self._collisions, np.int32),
             resolution=env.backend.grid.resolution, scan=self._scan, scans=_recorded(self._scans),
-            goals=_recorded(self._goals), landmarks=_recorded(self._landmarks), map_changes=_recorded(self._maps),
+            goals=_recorded(self._goals), landmarks=_recorded(landmarks), map_changes=_recorded(maps),
         )  # fmt: skip
 
-    def _note_map(self, step: int) -> None:
-        changes = self._map.take(self._env.backend.grid)
+    def _note_map(self, step: int, follower: _MapFollower, notes: _Notes) -> None:
+        changes = follower.take(self._env.backend.grid)
         if len(changes):
-            self._maps[step] = changes
+            notes[step] = changes
 
-    def _note_landmarks(self, step: int) -> None:
+    def _note_landmarks(self, step: int, notes: _Notes) -> None:
         belief = self._env.belief
         cov = belief.landmark_cov
         rows = np.column_stack([belief.landmarks, cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]])
-        self._landmarks[step] = rows.astype(np.float32)
+        notes[step] = rows.astype(np.float32)
 
 
 class TeamRecorder:

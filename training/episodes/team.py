@@ -15,6 +15,7 @@ import numpy as np
 from agents.base import Agent, Goal
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.team import Team
+from slam.files import quoted
 from slam.settings import from_mapping
 from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Course, Progress, asked_for, done, make_agent
 from training.episodes.team_log import TeamLog, team_metrics
@@ -22,6 +23,7 @@ from training.runs.config_files import read_config
 from training.runs.errors import BadInput, bad_input
 from training.runs.running import plain
 from training.runs.signals import interrupt_flag
+from training.truth.known_map import KNOWN_MAPS
 
 __all__ = [
     "FILES", "LANDMARKS", "ROBOT_FILE", "TeamEpisode", "TeamWitness", "files_of", "prepare", "read_team", "run",
@@ -108,7 +110,10 @@ def read_team(
                 if name in heard | given:
                     raise BadInput(f"{option} is for several robots; give --robots 2 or more")
         if heard:
-            settings["communication"] = dict(past.get("communication", {})) | heard
+            noted = past.get("communication", {})
+            if not isinstance(noted, dict):
+                raise ValueError(f"[run.team] communication must be a table, got {quoted(noted)}")
+            settings["communication"] = noted | heard
         team = from_mapping(TeamConfig, settings)
         if range_m is not None and team.robots > 1 and team.communication.model in ("unlimited", "none"):
             raise ValueError(
@@ -126,6 +131,13 @@ _OPTIONS = {
 
 def _known(given: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
+
+
+def refuse_bounds(names: Iterable[str]) -> None:
+    """Raise ``ValueError`` for a planner that knows the map: it searches for one robot, and bounds no team."""
+    for name in names:
+        if name in KNOWN_MAPS:
+            raise ValueError(f"{name} is the fastest way of one robot, and no bound of a team's; leave it out")
 
 
 def prepare(
@@ -150,6 +162,7 @@ def prepare(
             floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,
             coverage_target=coverage_target,
         )  # fmt: skip
+        refuse_bounds([run["agent"]])
         if run.get("start") is not None:
             plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)
         robots = Team(team=team, config=replace(world, coverage_target=1.0), max_steps=run["max_steps"])
@@ -202,7 +215,7 @@ def run(episode: TeamEpisode, progress: Progress, witnesses: Iterable[TeamWitnes
             elif not team.active and not any(outcome.truncated for outcome in outcomes.values()):
                 covered = any(outcome.info["is_success"] for outcome in outcomes.values())
                 episode.end = "covered" if covered else "collision"
-            elif idle >= patience:
+            elif idle >= patience and all(agents[k].ended for k in outcomes):
                 statuses = {agents[k].status for k in outcomes}
                 episode.end = next((word for word in _WORST_FIRST if word in statuses), min(statuses))
             elif team.active:

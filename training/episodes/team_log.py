@@ -51,19 +51,19 @@ class TeamLog:
             self._found = np.zeros(team.ground.mappable.shape, np.bool_)
             self._every = max(1, round(_FIRST_EVERY_S / team.config.step_s))
         if len(self._times) % self._every == 0:
-            self._note_first()
+            self._found, self._first = self._who_was_first()
         self._times.append(team.time_s)
         self._coverage.append(team.coverage_share)
         self._groups.append(team.groups)
         self._collisions.append(sum(world.collisions for world in worlds))
         self._robot_collisions.append(sum(world.robot_collisions for world in worlds))
 
-    def _note_first(self) -> None:
+    def _who_was_first(self) -> tuple[NDArray[np.bool_], Array]:
+        """Return what has been mapped by now ``(rows, cols)``, and how much each robot had first ``(robots,)``."""
         layers = self._team.coverage.layers
         counts = layers.sum(axis=0)
         new = (counts > 0) & ~self._found
-        self._found |= new
-        self._first += (layers[:, new] / counts[new]).sum(axis=1)
+        return self._found | new, self._first + (layers[:, new] / counts[new]).sum(axis=1)
 
     @property
     def times(self) -> Array:
@@ -98,8 +98,8 @@ class TeamLog:
         """
         if self._team.joint is not None:
             return np.full(len(self._first), np.nan)
-        self._note_first()
-        return np.asarray(self._first / max(self._first.sum(), 1.0))
+        _, first = self._who_was_first()
+        return np.asarray(first / max(first.sum(), 1.0))
 
 
 def team_map(team: Team) -> tuple[OccupancyGrid, list[int]]:

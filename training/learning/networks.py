@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import pickle
 import zipfile
 from pathlib import Path
 from typing import Any, cast
@@ -173,6 +174,8 @@ def read_zip(path: Path) -> dict[str, NDArray[np.float32]]:
     try:
         with zipfile.ZipFile(path) as archive:
             state = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        raise ValueError(f"{path} holds more than weights, which is not read: it may be code") from error
     except (OSError, KeyError, zipfile.BadZipFile, RuntimeError) as error:
         raise ValueError(f"{path} is no zip that stable-baselines3 wrote: {error}") from error
     weights = {name.removeprefix(_INSIDE): value for name, value in state.items() if name.startswith(_INSIDE)}

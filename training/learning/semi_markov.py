@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sb3_contrib.common.maskable.buffers import MaskableDictRolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from torch import Tensor
+from torch import Tensor, no_grad
 
 __all__ = ["Durations", "SemiMarkovBuffer"]
 
@@ -38,9 +38,21 @@ class SemiMarkovBuffer(MaskableDictRolloutBuffer):
 
 
 class Durations(BaseCallback):
-    """Tells the buffer how many seconds each step took."""
+    """Tells the buffer how many seconds each step took.
+
+    sb3-contrib adds γ V of the last observation to the reward of a step after which an episode is broken off; what
+    γ to the power of its duration differs from that is added here.
+    """
 
     def _on_step(self) -> bool:
-        buffer = self.model.rollout_buffer  # type: ignore[attr-defined]
-        buffer.durations[buffer.pos] = [info["duration_s"] for info in self.locals["infos"]]
+        infos, rewards = self.locals["infos"], self.locals["rewards"]
+        buffer, policy = self.model.rollout_buffer, self.model.policy  # type: ignore[attr-defined]
+        buffer.durations[buffer.pos] = [info["duration_s"] for info in infos]
+        for k in np.flatnonzero(self.locals["dones"]).tolist():
+            info, gamma = infos[k], buffer.gamma
+            if info.get("TimeLimit.truncated", False) and info.get("terminal_observation") is not None:
+                seen, _ = policy.obs_to_tensor(info["terminal_observation"])
+                with no_grad():
+                    value = float(policy.predict_values(seen)[0])
+                rewards[k] += (gamma ** info["duration_s"] - gamma) * value
         return True

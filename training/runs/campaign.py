@@ -11,16 +11,20 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import slam
+from mecanum_env.rooms.files.importers import MAP_SUFFIXES, image_of
 from slam.files import quoted, read_json
 from slam.settings import check_name
 from training.runs.cluster import Cluster, RayPool, ray_pool
-from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.errors import BadInput, Interrupted, bad_input, check_writable
 from training.runs.processes import ProcessPool, process_pool
 from training.runs.progress import Progress
+from training.runs.provenance import project_digest, short_digest
 from training.runs.running import versions, write_json
 from training.runs.typed import parts_of
 
-__all__ = ["Pool", "Workers", "backend_names", "installed_version", "keep_settings", "run_all", "worker_pool"]
+__all__ = [
+    "Pool", "Workers", "backend_names", "installed_version", "keep_settings", "made_by", "run_all", "worker_pool",
+]  # fmt: skip
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -65,6 +69,22 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
 def installed_version() -> str:
     """Return this project's version, part of what a result depends on."""
     return versions().get("mecanum-slam", "not installed")
+
+
+def made_by(*names: str | Path) -> dict[str, Any]:
+    """Return what results depend on besides what is asked for: the code, and what files of these names hold.
+
+    Names of no file, such as those of agents and of generators of rooms, are the code's. A ROS map counts with its
+    image.
+    """
+    files = {str(name): _digest(Path(name)) for name in names if Path(name).is_file()}
+    return {"version": installed_version(), "code": project_digest(), **({"files": files} if files else {})}
+
+
+def _digest(path: Path) -> str:
+    with bad_input():
+        files = [path, image_of(path)] if path.suffix.lower() in MAP_SUFFIXES else [path]
+    return short_digest(each.read_bytes() for each in files)
 
 
 def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:

@@ -7,6 +7,7 @@ prints the table.
 
 from __future__ import annotations
 
+import math
 import statistics
 import tempfile
 from pathlib import Path
@@ -21,7 +22,7 @@ from training.episodes.explore import run_whole
 from training.episodes.room_pictures import parse_seeds
 from training.figures.consistency import consistency_figures
 from training.figures.tables import csv_table, markdown_table, number
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -70,8 +71,11 @@ def summarise(rows: list[Row], seeds: str) -> list[Row]:
             "without_collision": sum(r["collisions"] == 0 for r in group),
         }
         for key in _MEDIANS:
-            values = [r[key] for r in group if r[key] is not None]
-            summary[f"{key}_median"] = statistics.median(values) if values else None
+            # A time that was not reached is later than any.
+            never = [math.inf] * sum(r[key] is None for r in group) if key == "time_to_95_s" else []
+            values = [r[key] for r in group if r[key] is not None] + never
+            middle = statistics.median(values) if values else math.inf
+            summary[f"{key}_median"] = middle if math.isfinite(middle) else None
         summary["final_position_error_m_max"] = max(r["final_position_error_m"] for r in group)
         back = [r["return_error_m"] for r in group if r.get("return_error_m") is not None]
         summary |= {
@@ -129,7 +133,7 @@ def study(
                 make_config(rooms=kind, slam=backend, noise=noise)
         jobs = [(r, b, s, agent, noise) for s in parse_seeds(seeds) for r in kinds for b in backends]
     who = workers_of(workers, ray)
-    keep_settings(out, {"version": installed_version()}, FILES)
+    keep_settings(out, made_by(agent), FILES)
     every = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     rows = [every[job] for job in sorted(set(jobs))]
     summaries = summarise(rows, seeds)

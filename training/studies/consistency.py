@@ -28,7 +28,7 @@ from slam.types import Array
 from training.figures.charts import COLOURS, chart, label, png
 from training.figures.consistency import step_averages
 from training.figures.tables import number, text_table
-from training.runs.campaign import Workers, backend_names, installed_version, keep_settings
+from training.runs.campaign import Workers, backend_names, keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.rows import resume
 from training.runs.running import write_json
@@ -138,7 +138,7 @@ def consistency(
             where = {"agent": AGENT, "noise_config": dataclasses.asdict(scaled_noise(noise))}
     if steps is None:
         steps = world.steps if world is not None else MAX_EPISODE_STEPS
-    settings = {"version": installed_version(), "rooms": rooms, "steps": steps, "noise": noise, **where}
+    settings = {**made_by(), "rooms": rooms, "steps": steps, "noise": noise, **where}
     keep_settings(out, settings, FILES)
     # All backends on one seed before the next seed.
     jobs = [(name, rooms, seed, steps, noise) for seed in range(seed0, seed0 + runs) for name in names]

@@ -16,7 +16,7 @@ from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import PAPER_D
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
-from training.runs.campaign import backend_names, installed_version, keep_settings
+from training.runs.campaign import backend_names, keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -110,7 +110,7 @@ def study(
         backends = backend_names(slam)
         chosen = parse_seeds(seeds)
     who = workers_of(workers, ray)
-    settings = {"version": installed_version(), "max_steps": MAX_STEPS}
+    settings = {**made_by(), "max_steps": MAX_STEPS}
     keep_settings(out, settings, FILES)
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
     rows = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")

@@ -29,6 +29,9 @@ COLUMNS = {
 }
 
 
+_VARIANTS = {"slam": "@{}", "robots": "×{}", "communication": "{}"}
+
+
 def ratio(ours: Array, theirs: Array) -> Interval:
     """Return mean(ours) / mean(theirs) of pairs ``(n,)`` with its 95 % interval, pairs resampled together."""
     return interval(lambda at: ours[at].mean(axis=-1) / theirs[at].mean(axis=-1), ["all"] * len(ours))
@@ -44,7 +47,10 @@ def table(episodes: Path, suite: str, agent: str) -> str:
     """
     values = _read(episodes, suite)
     if agent not in values:
-        raise BadInput(f"{episodes} holds no rows of {agent} on {suite}; run mecanum benchmark with both")
+        there = ", ".join(values) or "none of that suite"
+        raise BadInput(
+            f"{episodes} holds no rows of {agent} on {suite}, but {there}; run mecanum benchmark with both"
+        )
     head = [suite, *(name for name, _, _ in COLUMNS.values())]
     head += [f"`{agent}`: {name.split(' [')[0]}" for name, _, _ in COLUMNS.values()]
     rows = []
@@ -60,22 +66,27 @@ def table(episodes: Path, suite: str, agent: str) -> str:
                 shares.append("")
                 continue
             found = ratio(pairs[:, 0], pairs[:, 1])
-            shares.append(f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]")
+            limits = "" if np.isnan(found.low) else f" [{found.low:.2f}, {found.high:.2f}]"
+            shares.append(f"{found.value:.2f}{limits}")
         rows.append([f"`{other}`", *means, *shares])
     return markdown_table(head, rows)
 
 
 def _read(episodes: Path, suite: str) -> dict[str, dict[tuple[str, int], list[float]]]:
-    """Return the columns' values by agent and episode; a time that was not reached is the limit."""
+    """Return the columns' values by agent and episode; a time that was not reached is the limit.
+
+    Where there are several backends or teams, their names stand behind the agent's.
+    """
     values: dict[str, dict[tuple[str, int], list[float]]] = {}
     try:
         with episodes.open(encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                if row["suite"] != suite:
-                    continue
-                found = [float(row[key] or "nan") for key in COLUMNS]
-                found[0] = float(row["limit_s"]) if np.isnan(found[0]) else found[0]
-                values.setdefault(row["agent"], {})[row["place"], int(row["seed"])] = found
+            rows = [row for row in csv.DictReader(file) if row["suite"] == suite]
+        several = [key for key in _VARIANTS if len({row.get(key) for row in rows}) > 1]
+        for row in rows:
+            found = [float(row[key] or "nan") for key in COLUMNS]
+            found[0] = float(row["limit_s"]) if np.isnan(found[0]) else found[0]
+            agent = " ".join([row["agent"], *(_VARIANTS[key].format(row[key]) for key in several if row[key])])
+            values.setdefault(agent, {})[row["place"], int(row["seed"])] = found
     except (OSError, KeyError, ValueError) as error:
         raise BadInput(f"cannot read {episodes}: {error}; give the folder of a mecanum benchmark") from error
     return values

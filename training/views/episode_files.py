@@ -121,6 +121,7 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     page = episode_page(
         env, recording, title=f"{where}: {who} on {episode.config.slam}",
         metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
+        target=episode.config.coverage_target,
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
     title = f"{where}, {who} on {episode.config.slam}"

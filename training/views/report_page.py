@@ -56,6 +56,7 @@ Arrays = dict[str, NDArray[Any]]
 
 def episode_page(
     env: ExploreEnv, recording: Recording, *, title: str, metrics: Mapping[str, Any], ending: str, config: str,
+    target: float,
 ) -> str:  # fmt: skip
     """Return the page.
 
@@ -69,12 +70,14 @@ def episode_page(
         What was explored by whom, and why it ended.
     metrics : mapping
         As in ``metrics.json``.
+    target : float
+        Coverage that counts as success.
     config : str
         The effective configuration as TOML.
     """
     header, arrays = pack(recording)
     view = episode_view(env.truth.ground, env.belief, longest_px=TRUTH_PX)
-    header |= about_plan(env.config, env.truth.ground, view)
+    header |= about_plan(env.config, env.truth.ground, view) | {"target": target}
     return filled("episode.html", header, arrays, {
         "TITLE": text_html(title),
         "ENDING": text_html(ending),

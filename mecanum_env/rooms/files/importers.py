@@ -21,7 +21,10 @@ from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
 from slam.files import parse_yaml, quoted, shown_path
 
-__all__ = ["from_raster", "load"]
+__all__ = ["MAP_SUFFIXES", "from_raster", "image_of", "load"]
+
+MAP_SUFFIXES = (".yaml", ".yml")
+"""Suffixes of ROS maps."""
 
 Mask = NDArray[np.bool_]
 Pose = Sequence[float]
@@ -61,8 +64,8 @@ def load(
         # Bright pixels are free, the lower-left one is at the origin.
         resolution = _resolution(0.05 if resolution is None else resolution, what)
         raster = read_grey(path)[::-1] > 127, resolution, (0.0, 0.0)
-    elif suffix not in (".yaml", ".yml"):
-        valid = ", ".join((".yaml", ".yml", *IMAGE_SUFFIXES))
+    elif suffix not in MAP_SUFFIXES:
+        valid = ", ".join((*MAP_SUFFIXES, *IMAGE_SUFFIXES))
         raise FloorPlanError(f"floor plan {shown_path(path)} has the unknown suffix {suffix!r}; valid: {valid}")
     elif resolution is not None:
         raise FloorPlanError(
@@ -73,6 +76,27 @@ def load(
         raster = _read_ros_map(path, what)
     free, cell_m, origin = raster
     return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)
+
+
+def image_of(path: Path) -> Path:
+    """Return the image that a ROS map names.
+
+    Raises
+    ------
+    FloorPlanError
+        Where it names none, or one that lies elsewhere.
+    """
+    what = f"map {shown_path(path)}"
+    return _image_of(path, _read_yaml(path, what), what)
+
+
+def _image_of(path: Path, values: Mapping[str, Any], what: str) -> Path:
+    image = values.get("image")
+    if not isinstance(image, str) or not image or "\0" in image:
+        raise FloorPlanError(
+            f"{what}: image must name a file, got {quoted(image)}; add a line such as image: map.pgm"
+        )
+    return _beside(path, image, what)
 
 
 def _read_ros_map(path: Path, what: str) -> Raster:
@@ -91,12 +115,7 @@ def _read_ros_map(path: Path, what: str) -> Raster:
     mode = values.get("mode", "trinary")
     if mode not in _MODES:
         raise FloorPlanError(f"{what}: unknown mode {quoted(mode)}; valid: {', '.join(_MODES)}")
-    image = values.get("image")
-    if not isinstance(image, str) or not image or "\0" in image:
-        raise FloorPlanError(
-            f"{what}: image must name a file, got {quoted(image)}; add a line such as image: map.pgm"
-        )
-    grey = read_grey(_beside(path, image, what))[::-1]
+    grey = read_grey(_image_of(path, values, what))[::-1]
     if mode == "raw":
         occupancy = grey / np.float32(100.0)
     else:

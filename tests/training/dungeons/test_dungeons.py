@@ -317,6 +317,14 @@ def test_the_ratio_is_of_means_and_has_an_interval():
     assert any("nearest frontier" in line and "| 1.307 |" in line for line in lines)
     assert own["ratio"] == pytest.approx(0.9, abs=0.02)
     assert own["ratio_low"] < own["ratio"] < own["ratio_high"] < 0.93
+    # Who gives up half of the maps has short paths there, which do not count.
+    gone = [r | {"end": "nothing left", "path_m": 10.0} if r["agent"] == "tour" and int(r["map"]) % 8 < 4 else r
+            for r in rows]  # fmt: skip
+    assert summarise(gone)["tour"]["ratio"] == pytest.approx(0.9, abs=0.04)
+    assert summarise(gone)["tour"]["covered"] == 20
+    alone = summarise([r for r in rows if int(r["map"]) < 4])["tour"]
+    assert alone["ratio_low"] is None and alone["ratio"] == pytest.approx(0.9, abs=0.1)
+    assert " (None" not in table({"agents": {"nearest-frontier": alone, "tour": alone}})
 
 
 def test_a_published_map_is_covered():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,8 @@ from numpy.typing import NDArray
 from agents.base import Agent, Goal
 from slam.belief import Belief
 from training.episodes import explore
+from training.episodes.recording import Recorder
+from training.views.episode_files import Saver, write_episode
 
 
 class LostAtTheEnd(Agent):
@@ -35,3 +39,34 @@ def test_an_agent_that_is_lost_has_not_ended(tmp_path: Path) -> None:
     explore.run(episode, lambda **_: None)
     assert episode.end == "covered"
     assert episode.metrics()["time_s"] == pytest.approx(4.9 + explore.AGENT_DONE_AFTER_S)
+
+
+class WithoutGoals(Agent):
+    """Drives by its observation alone, and never says that it has ended."""
+
+    def choose(self, belief: Belief) -> Goal | None:
+        return None
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        return np.array([0.1, 0.0, 0.3], np.float32)
+
+
+def test_an_agent_without_goals_explores_until_time_is_up(tmp_path: Path) -> None:
+    episode, recorder = explore.prepare(out=tmp_path, rooms="rectangular", seed=5, max_steps=60), Recorder()
+    episode.agent = WithoutGoals()
+    explore.run(episode, lambda **_: None, [recorder])
+    assert episode.end == "time" and episode.metrics()["steps"] == 60
+    write_episode(episode, recorder.recording())
+    assert "the step limit was reached first" in (tmp_path / "report.html").read_text()
+
+
+def test_what_is_written_on_the_way_changes_nothing_of_the_end(tmp_path: Path) -> None:
+    pages = []
+    for every_s in (math.inf, 0.0):
+        episode, recorder = explore.prepare(out=tmp_path, rooms="rectangular", seed=5, max_steps=63), Recorder()
+        saver = Saver(episode, recorder.recording, every_s=every_s)
+        explore.run(episode, lambda **_: None, [recorder, saver] if every_s == 0.0 else [recorder])
+        write_episode(episode, recorder.recording())
+        pages.append((tmp_path / "report.html").read_text())
+    strip = [re.sub(r"wall_time_s.{0,40}|decision_ms.{0,60}", "", page) for page in pages]
+    assert strip[0] == strip[1]

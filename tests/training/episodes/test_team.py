@@ -100,6 +100,19 @@ def test_landmarks_of_all_are_merged_where_they_are_the_same(explored: Explored,
     assert team_landmarks(without.episode.team) is None
 
 
+def test_who_was_first_is_as_it_is_however_often_it_is_asked_for(explored: Explored) -> None:
+    log = explored.episode.log
+    found, first = log._found.copy(), log._first.copy()
+    shares = log.first_shares
+    assert shares.sum() == pytest.approx(1.0) and np.array_equal(log.first_shares, shares)
+    assert np.array_equal(log._found, found) and np.array_equal(log._first, first)
+
+
+def test_who_knows_the_map_bounds_no_team(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="known-map is the fastest way of one robot"):
+        task.prepare(TeamConfig(robots=2), out=tmp_path, rooms="rectangular", seed=3, agent="known-map")
+
+
 def test_frames_are_where_the_robots_started(tmp_path: Path) -> None:
     explored = explore_together(tmp_path, robots=2, steps=1, unknown_starts=True)
     team = explored.episode.team
@@ -140,6 +153,9 @@ def test_the_team_of_a_file_gives_way_to_the_options(tmp_path: Path) -> None:
     asked = task.read_team(file, robots=2, communication="range", unknown_starts=True)
     assert (asked.robots, asked.communication.model, asked.communication.range_m) == (2, "range", 7.0)
     assert not asked.known_starts and task.read_team() == TeamConfig(robots=1)
+    file.write_text('[run.team]\nrobots = 2\ncommunication = "range"\n')
+    with pytest.raises(BadInput, match=r"\[run.team\] communication must be a table, got 'range'"):
+        task.read_team(file, communication="walls")
     file.write_text("[run]\nteam = 3\n")
     with pytest.raises(BadInput, match="team has the wrong type"):
         task.read_team(file)

@@ -8,7 +8,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
+import gymnasium  # noqa: E402
 from gymnasium import spaces  # noqa: E402
+from sb3_contrib import MaskablePPO  # noqa: E402
 
 from agents.frontier_env import as_observation, choice_space  # noqa: E402
 from agents.learned import choice_network  # noqa: E402
@@ -17,7 +19,7 @@ from agents.learned.chooser import ChooserConfig  # noqa: E402
 from training.learning.choice_world import make_world  # noqa: E402
 from training.learning.config import WorldConfig  # noqa: E402
 from training.learning.networks import ChoiceNetwork  # noqa: E402
-from training.learning.semi_markov import SemiMarkovBuffer  # noqa: E402
+from training.learning.semi_markov import Durations, SemiMarkovBuffer  # noqa: E402
 
 CONFIG = ChooserConfig()
 
@@ -130,6 +132,37 @@ def test_advantages_against_the_sums_they_stand_for():
                     if last:
                         break
                 assert buffer.advantages[t, e] == pytest.approx(total, abs=1e-4)
+
+
+class _Halting(gymnasium.Env):
+    """Steps of three seconds that pay nothing; each second one an episode is broken off."""
+
+    observation_space = spaces.Dict({"x": spaces.Box(-1.0, 1.0, (1,))})
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._steps = 0
+        return {"x": np.zeros(1, np.float32)}, {}
+
+    def step(self, action):
+        self._steps += 1
+        return {"x": np.full(1, 0.7, np.float32)}, 0.0, False, self._steps == 2, {"duration_s": 3.0}
+
+    def action_masks(self):
+        return np.ones(2, np.bool_)
+
+
+def test_where_an_episode_is_broken_off_its_value_is_discounted_by_time():
+    gamma = 0.8
+    model = MaskablePPO(
+        "MultiInputPolicy", _Halting(), n_steps=4, batch_size=4, n_epochs=1, gamma=gamma, learning_rate=1e-12,
+        rollout_buffer_class=SemiMarkovBuffer, seed=0, device="cpu",
+    )  # fmt: skip
+    value = float(model.policy.predict_values({"x": torch.full((1, 1), 0.7)})[0])
+    assert abs(value) > 1e-3
+    model.learn(4, callback=Durations())
+    np.testing.assert_allclose(model.rollout_buffer.rewards.ravel(), [0, gamma**3 * value] * 2, rtol=1e-4)
 
 
 def test_a_room_serves_as_many_episodes_as_it_is_told_to():

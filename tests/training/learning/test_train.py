@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import pickle
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.learned.choice import CANDIDATE, STATE
+from agents.ppo_frontier import SHIPPED
 from slam.settings import from_mapping
 from training.cli import main
 from training.cli.train import CONFIGS, _read
@@ -209,12 +212,22 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
     assert again.with_suffix(".json").read_text() == mine.with_suffix(".json").read_text()
     # What is wrong is said.
     capsys.readouterr()
+    a_folder, foreign = tmp_path / "folder.zip", tmp_path / "foreign.zip"
+    a_folder.mkdir()
+    with zipfile.ZipFile(foreign, "w") as archive:
+        archive.writestr("policy.pth", pickle.dumps(Path))
     for arguments, message in [
         ([mine, tmp_path / "x.safetensors"], "cannot make"),
         ([tmp_path / "none", tmp_path / "x.safetensors"], "there is no"),
         ([tmp_path / "mine.zip", tmp_path / "x.safetensors"], "--like belongs to a .zip"),
         ([tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", mine], "is damaged"),
         ([tmp_path, tmp_path / "x.safetensors"], "holds no finished part of a run"),
+        (
+            [tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", SHIPPED.with_name("ppo.json")],
+            "unknown key",
+        ),
+        ([foreign, tmp_path / "x.safetensors", "--like", mine.with_suffix(".json")], "holds more than weights"),
+        ([mine, a_folder], "it is a folder"),
     ]:
         assert main(["policy", *map(str, arguments)]) == 2
         error = capsys.readouterr().err
@@ -223,7 +236,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
 
 
 def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
-    from agents.ppo_frontier import SHIPPED, load_choice_policy
+    from agents.ppo_frontier import load_choice_policy
 
     config = SMALL | {
         "members": 2, "world": {"rooms": ["rectangular"]},

@@ -43,6 +43,15 @@ def test_a_folder_that_is_not_to_be_used_is_refused_before_any_work(
         assert "choose another --out" in capsys.readouterr().err
 
 
+def test_a_time_that_was_not_reached_is_later_than_any() -> None:
+    row = {name: 1.0 for name in accuracy._MEDIANS} | {
+        "collisions": 0, "nees_each_s": [3.0], "rooms": "cave", "slam": "ekf", "noise": "nominal", "agent": "tour",
+    }  # fmt: skip
+    rows = [row | {"time_to_95_s": time} for time in (20.0, None, None)]
+    assert accuracy.summarise(rows, "0:2")[0]["time_to_95_s_median"] is None
+    assert accuracy.summarise(rows[:2] + rows[:1], "0:2")[0]["time_to_95_s_median"] == 20.0
+
+
 def test_the_summary_has_the_seeds_as_typed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     row = {name: 1.0 for name in accuracy._MEDIANS} | {"collisions": 0, "nees_each_s": [3.0, 3.0]}
 

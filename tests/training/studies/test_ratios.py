@@ -33,6 +33,24 @@ def test_the_table_is_of_means_over_shared_seeds(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == expected
 
 
+def test_backends_and_teams_are_told_apart(tmp_path, capsys):
+    fields = (*FIELDS, "slam", "robots", "communication")
+    with (tmp_path / "episodes.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(fields)
+        for slam, robots, factor in (("ekf", "", 1), ("odometry", "", 2), ("ekf", "2", 4)):
+            for seed in range(3):
+                writer.writerow(
+                    ["caves", "cave", seed, "one", factor, 1, 1, 1, 300, slam, robots, robots and "range"]
+                )
+    found = table(tmp_path / "episodes.csv", "caves", "one @ekf").splitlines()
+    assert [line.split("|")[1:3] for line in found[2:]] == [
+        [" `one @ekf` ", " 1.0 "], [" `one @odometry` ", " 2.0 "], [" `one @ekf ×2 range` ", " 4.0 "],
+    ]  # fmt: skip
+    assert main(["study", "ratios", str(tmp_path), "--suite", "caves", "--agent", "one"]) == 2
+    assert "one @ekf, one @odometry" in capsys.readouterr().err
+
+
 def test_the_interval_holds_the_true_ratio_nearly_always():
     rng = np.random.default_rng(0)
     held = 0

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from agents.ppo_frontier import SHIPPED
 from mecanum_env.env import ExploreEnv
 from slam.geometry import wrap
 from training.cli import main
@@ -109,8 +111,18 @@ def test_the_command_goes_on_where_it_stopped(
     found = json.loads((out / "recovery.json").read_text())
     assert found["invariant-ekf"]["false_alarms"]["times_lost"] == 2
     assert {path.name for path in out.iterdir()} == {*command.FILES, command.STORE, "settings.json"}
+    # Rows of one policy, or plan, are none of another's of the same name.
+    policy, elsewhere = tmp_path / "mine.safetensors", tmp_path / "elsewhere"
+    for name in ("ppo-frontier", "ppo"):
+        for suffix in (".safetensors", ".json"):
+            shutil.copy(SHIPPED.with_name(f"{name}{suffix}"), policy.with_suffix(suffix))
+        code = main([*given[:-1], str(elsewhere), "--seeds", "1", "--agent", str(policy)])
+        assert code == (0 if name == "ppo-frontier" else 2)
+    assert "holds runs with files" in capsys.readouterr().err
 
 
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["study", "recovery", "--seeds", "x", "--out", str(tmp_path)]) == 2
+    assert "seeds" in capsys.readouterr().err and not any(tmp_path.iterdir())
     assert main(["study", "recovery", "--faults", "telport", "--out", str(tmp_path)]) == 2
     assert "teleport" in capsys.readouterr().err

@@ -24,7 +24,7 @@ from slam.motion import move
 from slam.types import Array, Observations, Odometry
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
-from training.runs.campaign import backend_names, installed_version, keep_settings
+from training.runs.campaign import backend_names, keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.rows import resume
 from training.runs.running import write_json
@@ -177,7 +177,7 @@ def complexity(*, backends: str, landmarks: str, steps: int, out: Path) -> dict[
         names = (*backend_names(backends, without=not_observing()), REFERENCE)
     sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
     settings = {
-        "version": installed_version(), "steps": steps, "repeats": REPEATS, "seen": SEEN, "reference": "dsyrk"
+        **made_by(), "steps": steps, "repeats": REPEATS, "seen": SEEN, "reference": "dsyrk"
     }  # fmt: skip
     keep_settings(out, settings, FILES)
     jobs = [(name, n, steps) for n in sizes for name in names]

@@ -41,7 +41,7 @@ def measure(**options: Any) -> dict[str, Any]:
         if recorded:
             kept, recording = episode, recorder.recording()
     began = time.process_time()
-    page = episode_page(kept.env, recording, title="", metrics=kept.metrics(), ending="", config="")
+    page = episode_page(kept.env, recording, title="", metrics=kept.metrics(), ending="", config="", target=1.0)
     without, with_it = (statistics.mean(spent[recorded]) for recorded in (False, True))
     return {
         "seed": options["seed"], "episode_s": float(recording.times[-1]), "cpu_s": without,

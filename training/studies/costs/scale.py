@@ -24,7 +24,7 @@ from slam.types import Array
 from training.episodes.explore import Episode, prepare, run, run_whole
 from training.figures.charts import chart, label, png
 from training.figures.tables import number, text_table
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import BadInput, bad_input
 from training.runs.options import Out, Seed
 from training.runs.processes import memory_mb
@@ -138,7 +138,7 @@ def study(
     for plan in plans:
         if not plan.is_file():
             raise BadInput(f"no such file: {plan}; give a ROS map (.yaml) or an image")
-    keep_settings(out, {"version": installed_version(), "seed": seed, "minutes": minutes}, FILES)
+    keep_settings(out, {**made_by(*plans, *names), "seed": seed, "minutes": minutes}, FILES)
     jobs: list[Job] = [(str(p), name, seed, minutes, str(out)) for p in plans for name in names]
     for k, job in enumerate(jobs):  # each in a process of its own, so that its memory is
         what = f"exploration {k + 1} of {len(jobs)}, {Path(job[0]).stem}, {job[1]}"

@@ -18,7 +18,7 @@ from slam.settings import check_name
 from training.episodes.room_pictures import parse_seeds
 from training.figures.charts import png
 from training.figures.tables import number, text_table
-from training.runs.campaign import backend_names, installed_version, keep_settings
+from training.runs.campaign import backend_names, keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -60,12 +60,13 @@ def study(
         for place in places:
             where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}
             make_config(noise=noise, **where)  # type: ignore[arg-type]
-        settings = {"version": installed_version(), "agent": agent, "noise": noise, "max_steps": max_steps}
+        numbers = parse_seeds(seeds, most=_MOST_SEEDS)
+        settings = {**made_by(agent, *places), "agent": agent, "noise": noise, "max_steps": max_steps}
     who = workers_of(workers, ray)
     keep_settings(out, settings, FILES)
     jobs: list[Job] = [
         (fault, name, agent, place, noise, seed, max_steps)
-        for seed in parse_seeds(seeds, most=_MOST_SEEDS) for fault in chosen for place in places for name in names
+        for seed in numbers for fault in chosen for place in places for name in names
     ]  # fmt: skip
     rows = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     found = _figures(rows, names, chosen)

@@ -32,7 +32,7 @@ from slam.types import Array
 from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import number, text_table
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -212,7 +212,7 @@ def study(
         chosen = parse_seeds(seeds)
         make_config(noise=noise)
     who = workers_of(workers, ray)
-    keep_settings(out, {"version": installed_version()}, [FILE])
+    keep_settings(out, made_by(), [FILE])
     turn = math.radians(start_sigma_deg)
     jobs: list[Job] = [(seed, robots, steps, start_sigma_m, turn, noise) for seed in chosen]
     rows = list(resume(out / STORE, jobs, explore, workers=who, what="episodes").values())

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import typer
 
+from mecanum_env.arguments import make_config
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.accounts.account import Account
@@ -32,7 +33,7 @@ from slam.types import Array
 from training.episodes.explore import make_agent
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import markdown_table, number
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
@@ -223,9 +224,10 @@ def study(
     """Let two robots explore a room each on its own, then align and merge their maps."""
     with bad_input():
         chosen = parse_seeds(seeds)
+        make_config(rooms=rooms)
     who = workers_of(workers, ray)
     settings = {
-        "version": installed_version(), "slam": SLAM, "agent": AGENT, "rooms": rooms, "coverage": coverage,
+        **made_by(), "slam": SLAM, "agent": AGENT, "rooms": rooms, "coverage": coverage,
         "time_s": time_s, "right": [RIGHT_M, RIGHT_RAD], "prior_sigma": list(PRIOR_SIGMA),
         "alignment": to_mapping(AlignmentConfig()), "corner": to_mapping(CornerConfig()),
     }  # fmt: skip

@@ -1,5 +1,10 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
+from training.cli import main
 from training.studies.teams.merging import RIGHT_M, run_job, summarise
 
 
@@ -12,3 +17,10 @@ def test_two_robots_and_what_is_said_of_them() -> None:
     summary = summarise({job: row, ("apartment", 4, 0.7, 60.0): none})
     assert summary["unknown"]["none"] == 1 and summary["known"]["right"] == 2
     assert summary["unknown"]["overlap_of_none"] == row["overlap"]
+
+
+def test_rooms_that_there_are_not_are_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["study", "merging", "--rooms", "apartmnt", "--out", str(tmp_path)]) == 2
+    assert "did you mean 'apartment'" in capsys.readouterr().err and not any(tmp_path.iterdir())
