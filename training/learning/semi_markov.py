@@ -46,7 +46,8 @@ class Durations(BaseCallback):
 
     def _on_step(self) -> bool:
         infos, rewards = self.locals["infos"], self.locals["rewards"]
-        buffer, policy = self.model.rollout_buffer, self.model.policy  # type: ignore[attr-defined]
+        model: Any = self.model
+        buffer, policy = model.rollout_buffer, model.policy
         buffer.durations[buffer.pos] = [info["duration_s"] for info in infos]
         for k in np.flatnonzero(self.locals["dones"]).tolist():
             info, gamma = infos[k], buffer.gamma

@@ -1,4 +1,4 @@
-"""What callers and their environments may do: whatever it is, nothing hangs, and nothing is shown that is not so."""
+"""What callers and their environments may do: nothing hangs, and nothing is shown that is not so."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def test_teams_of_options() -> None:
         (["--robots", "1,x"], "--robots '1,x' must be whole numbers in 1 … 64"),
         (["--communication", "range"], "is for several robots"),
         (
-            ["--robots", "1,2", "--agents", "nearest-frontier,known-map"],
+            ["--robots", "1,2", "--agents", "tour,known-map"],
             "known-map is the fastest way of one robot",
         ),
         (["--robots", "1,2", "--communication", "range,fool"], "line-of-sight, walls, none, got 'fool'"),

@@ -213,6 +213,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
     # What is wrong is said.
     capsys.readouterr()
     a_folder, foreign = tmp_path / "folder.zip", tmp_path / "foreign.zip"
+    end_to_end = SHIPPED.with_name("ppo.json")
     a_folder.mkdir()
     with zipfile.ZipFile(foreign, "w") as archive:
         archive.writestr("policy.pth", pickle.dumps(Path))
@@ -222,10 +223,7 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
         ([tmp_path / "mine.zip", tmp_path / "x.safetensors"], "--like belongs to a .zip"),
         ([tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", mine], "is damaged"),
         ([tmp_path, tmp_path / "x.safetensors"], "holds no finished part of a run"),
-        (
-            [tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", SHIPPED.with_name("ppo.json")],
-            "unknown key",
-        ),
+        ([tmp_path / "mine.zip", tmp_path / "x.safetensors", "--like", end_to_end], "unknown key"),
         ([foreign, tmp_path / "x.safetensors", "--like", mine.with_suffix(".json")], "holds more than weights"),
         ([mine, a_folder], "it is a folder"),
     ]:
