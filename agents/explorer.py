@@ -138,8 +138,8 @@ class Explorer(Driver):
         targets = candidates.frontiers.targets
         if math.hypot(*(targets[picked] - targets[current]).tolist()) <= self.config.patience.same_m:
             return picked
-        if self._doubts >= self.config.patience.doubts:
-            return current
+        if self._doubts >= self.config.patience.doubts and candidates.costs[current] < candidates.travel.beyond_m:
+            return current  # the way there is known
         self._doubts += 1
         return picked
 

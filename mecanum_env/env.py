@@ -184,23 +184,26 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def perceive(self, collisions: int) -> dict[str, Any]:
         """Sense what a step brought, believe it, and return its info; there were so many collisions before."""
+        coverage = self.believe()
+        terms = reward_terms(self.config.reward, self._outcome(self.truth.world.collisions - collisions))
+        info = self._info(coverage, self.truth.pose)
+        info["reward_terms"] = terms
+        return info
+
+    def believe(self) -> float:
+        """Sense what a step brought and believe it; return the coverage."""
         config, truth, backend = self.config, self.truth, self.backend
         world = truth.world
         odometry = self._odometer.odometry(world.wheel_readings, config.step_s, self._sensor_rng)
         self.scan, mapped = self._look()
         self._odometry, truth.scan = odometry, self.scan
-        true_pose = truth.pose
         backend.predict(odometry)
         if self._knows_truth:
-            cast("TruthSlam", backend).give_pose(true_pose)
+            cast("TruthSlam", backend).give_pose(truth.pose)
         backend.update(mapped)
         self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._steps += 1
-        coverage = self.own_coverage.update(backend.grid)
-        terms = reward_terms(config.reward, self._outcome(world.collisions - collisions))
-        info = self._info(coverage, true_pose)
-        info["reward_terms"] = terms
-        return info
+        return self.own_coverage.update(backend.grid)
 
     def _look(self) -> tuple[Scan, Scan]:
         """Take a scan: as the agent sees it, and as it is mapped."""

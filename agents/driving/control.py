@@ -79,17 +79,23 @@ class PathFollower:
     @config.setter
     def config(self, config: ControlConfig) -> None:
         self._config = config
+        lag_s, braking = self._stopping()
+        # From v·lag + v²/2a: faster than this it could not stop within what the check looks at.
+        ahead = WINDOW_M - self._robot.circumscribed_radius_m
+        self._fastest = math.sqrt((lag_s * braking) ** 2 + 2.0 * braking * max(ahead, 0.1)) - lag_s * braking
         robot, view_deg = self._robot, self._lidar.field_of_view_deg
         as_they_are = {name: getattr(config, name) for name in Pace._fields if hasattr(config, name)}
         self._pace = Pace(**as_they_are | {
-            "max_speed_m_s": config.speed_share * robot.max_speed_m_s,
+            "max_speed_m_s": min(config.speed_share * robot.max_speed_m_s, self._fastest),
+            "lag_s": lag_s,
             "max_turn_rad_s": min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s),
-            "half_length_m": 0.5 * robot.length_m,
+            "half_length_m": 0.5 * max(robot.length_m, robot.width_m),
             # A sensor that sees all round can as well be driven backwards out of a narrow place.
             "reversible": view_deg >= 270.0,
             "turn_within_m": self._turn_within_m,
             "any_side": config.any_side and view_deg >= 360.0,
             "lever_m": robot.lever_m,
+            "wide": robot.width_m > robot.length_m,
             "spare_m": robot.circumscribed_radius_m - self._half_across(),
         })  # fmt: skip
         self._motors = Motors(
@@ -102,8 +108,8 @@ class PathFollower:
         self._guard = Guard(
             rim=self._rim,
             half=self._half,
-            lag_s=config.lag_s,
-            braking_m_s2=config.braking_m_s2,
+            lag_s=lag_s,
+            braking_m_s2=braking,
             turn_braking_rad_s2=2.0 * config.turn_acceleration_rad_s2,
             scan_gap_m=config.scan_gap_m,
         )
@@ -111,10 +117,18 @@ class PathFollower:
     def _half_across(self) -> float:
         """Return what the body takes up to either side of the way [m] where a long side leads, and askew."""
         askew = self.config.align_rad
-        return float(self._half[0] * math.cos(askew) + self._half[1] * math.sin(askew))
+        return float(self._half.max() * math.cos(askew) + self._half.min() * math.sin(askew))
+
+    def _stopping(self) -> tuple[float, float]:
+        """Return how long a twist is held before braking shows [s], and the deceleration then [m/s²]."""
+        robot = self._robot
+        moved_kg = robot.mass_kg + 4.0 * robot.wheel_inertia_kg_m2 / robot.wheel_radius_m**2
+        motors = 4.0 * robot.motor_torque_nm / (robot.wheel_radius_m * moved_kg)
+        return max(self.config.lag_s, self._step_s + robot.motor_lag_s), min(self.config.braking_m_s2, motors)
 
     def reset(self) -> None:
         """Stand still, with no path."""
+        self._floors = np.full(2, -math.inf)  # see agents.driving.safety.safe_twist
         self._velocity = np.zeros(2)  # last command in the belief's frame [m/s]
         self._turn = 0.0  # last command [rad/s]
         self._path = np.zeros((1, 2))
@@ -217,12 +231,15 @@ class PathFollower:
         gap: float,
     ) -> Array:  # fmt: skip
         """Smooth, bound and check a wanted velocity (belief frame) and turn rate; remember what goes out."""
+        speed = math.hypot(*velocity)
+        velocity = velocity * min(1.0, self._fastest / speed) if speed > 0.0 else velocity
         sides = parting_lines(
             belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s
         )
         sent, self._velocity, self.blocked = send(
             velocity, turn, self._velocity, self._turn, np.asarray(belief.pose, dtype=np.float64), near, gap,
             scan_points(observation, self._lidar), sides, self._motors, self._guard,
+            self._floors,
         )  # fmt: skip
         self._turn = float(sent[2])
         return np.asarray(sent)

@@ -48,6 +48,7 @@ class Pace(NamedTuple):
     reversible: bool  # whether it may be driven backwards out of a narrow place
     any_side: bool  # whether any side of the body may lead
     lever_m: float
+    wide: bool  # whether the body is wider than long
     spare_m: float  # what the body takes up less, to either side of the way, when a long side leads than turning
     turn_within_m: float  # of the goal: from there on it turns to the goal's heading, even beside a wall
 
@@ -122,12 +123,13 @@ def aim(
 @njit(cache=True, nogil=True)
 def send(
     velocity: Array, turn: float, last_velocity: Array, last_turn: float, pose: Array, near: LocalMap,
-    map_gap: float, hits: Array, sides: Array, motors: Motors, guard: Guard,
+    map_gap: float, hits: Array, sides: Array, motors: Motors, guard: Guard, floors: Array,
 ) -> tuple[Array, Array, bool]:  # fmt: skip
     """Smooth, bound and check a wanted velocity ``(2,)`` [m/s] and turn rate [rad/s].
 
     ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] what the scan shows, ``sides``
-    ``(k, 3)`` are the lines that part it from other robots; see :func:`agents.driving.safety.safe_twist`.
+    ``(k, 3)`` are the lines that part it from other robots, ``floors`` ``(2,)`` what lasts of the check: see
+    :func:`agents.driving.safety.safe_twist`.
 
     Returns
     -------
@@ -149,7 +151,7 @@ def send(
     demand = abs(twist[0]) + abs(twist[1]) + motors.lever_m * abs(twist[2])
     if demand > motors.max_speed_m_s:
         twist *= motors.max_speed_m_s / demand
-    sent = safe_twist(twist, pose, near, map_gap, hits, sides, guard)
+    sent = safe_twist(twist, pose, near, map_gap, hits, sides, guard, floors)
     heading = pose[2] + 0.5 * sent[2] * motors.step_s
     c, s = math.cos(heading), math.sin(heading)
     velocity_sent = np.array([c * sent[0] - s * sent[1], s * sent[0] + c * sent[1]])
@@ -267,6 +269,9 @@ def _wanted_heading(
         dx, dy = _step_between(path, arc, max(middle - 0.2, 0.0), middle + 0.3)
         if math.hypot(dx, dy) > 0.05:
             wanted, tight_in = math.atan2(dy, dx), max(0.0, middle - spot.at_m)
+            if pace.wide:  # its long side lies along the way where a side leads
+                wanted = _nearest_axis(heading, wanted + 0.5 * math.pi, 2)
+                break
             back = abs(wrap_scalar(wanted - heading)) > 0.5 * math.pi
             if pace.any_side:
                 sideways = spot.room_m[k:].min() >= turning_room - pace.spare_m

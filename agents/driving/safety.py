@@ -30,6 +30,7 @@ _POSES = 8  # of a predicted motion, the present one included
 _SPEEDS = (1.0, 0.7, 0.45, 0.25, 0.1)  # shares of the wanted twist that are tried
 _SIDESTEPS = (0.6, -0.6, 1.2, -1.2)  # [rad] off the wanted direction, tried after that
 _SIDESTEP_M_S = 0.12
+_SLACK_M = 0.002  # by which what is drawn and measured of a wall differs from step to step
 
 
 # Named tuples, for these go into kernels as they are.
@@ -133,26 +134,37 @@ def _hits(share: Array, directions: Array, offset_m: float, range_min_m: float, 
 
 @njit(cache=True, nogil=True)
 def safe_twist(
-    twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: Array, sides: Array, guard: Guard
-) -> Array:
+    twist: Array, pose: Array, near: LocalMap, map_gap: float, hits: Array, sides: Array, guard: Guard,
+    floors: Array,
+) -> Array:  # fmt: skip
     """Return the first of a twist ``(3,)`` and its tamer kin whose braking distance is clear; zero if none.
 
     ``map_gap`` [m] is what the body keeps from the map, ``hits`` ``(n, 2)`` [m] scan points in the body frame,
     ``sides`` ``(k, 3)`` the lines not to be crossed, one for each robot nearby: n·p ≤ d as rows nx, ny, d [m],
-    also in the body frame.
+    also in the body frame. ``floors`` ``(2,)`` [m] are the gaps to map and scan below which a body that is too
+    near already must not come: -inf at first, and kept up here from step to step.
     """
     kin = _tamer_kin(twist)
+    map_now, _, scan_now, _ = body_gaps(np.zeros(3), pose, near, hits, guard)
+    map_slack, scan_slack = _slack(map_now, map_gap, floors, 0), _slack(scan_now, guard.scan_gap_m, floors, 1)
     for k in range(len(kin)):
         candidate: Array = kin[k]
         if not candidate.any():
             continue
-        map_now, map_ahead, scan_now, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
+        _, map_ahead, _, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
         # Already too near: any motion that brings it no nearer is allowed, or it would never get away.
-        clear = map_ahead >= min(map_gap, map_now - 0.002)
-        clear &= scan_ahead >= min(guard.scan_gap_m, scan_now - 0.002)
+        clear = map_ahead >= min(map_gap, map_now - map_slack)
+        clear &= scan_ahead >= min(guard.scan_gap_m, scan_now - scan_slack)
         if clear and (len(sides) == 0 or _keeps_side(candidate, sides, guard)):
             return candidate
     return np.zeros(3)
+
+
+@njit(cache=True, nogil=True)
+def _slack(now: float, gap: float, floors: Array, which: int) -> float:
+    """Return by how much a body may come nearer yet [m]: 2 mm in all, from the farthest since it is too near."""
+    floors[which] = max(floors[which], now - _SLACK_M) if now < gap else -np.inf
+    return float(min(max(now - floors[which], 1e-6), _SLACK_M))
 
 
 @njit(cache=True, nogil=True)

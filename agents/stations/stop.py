@@ -5,8 +5,9 @@ Shared by the agents that choose among stations with :mod:`agents.stations.surve
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from agents.stations.sensor import SENSORS, rays
 from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_pieces, survey
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.settings import Config, Few, Gap, Length, OneOf
+from slam.settings import Config, Few, Gap, Length, OneOf, require
 from slam.types import Array
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
@@ -74,6 +75,20 @@ class StationAgent(Agent):
         """Start an episode; where the robot is now is a station, if there are any."""
         super().reset(belief, seed)
         self._began_at, self._looked_at = np.array(belief.pose[:2], dtype=np.float64), ()
+
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+        """Return the next action; see :meth:`agents.base.Agent.act`.
+
+        Raises
+        ------
+        ValueError
+            With ``stations``: who hops from one to the next looks only there, and is driven by ``choose``.
+        """
+        require(
+            self.config.stations.spacing_m == 0.0,
+            f"with stations {type(self).__name__} is driven by choose, not by act; leave stations.spacing_m at 0",
+        )
+        return super().act(observation, belief)  # type: ignore[safe-super]
 
     def looked(self, belief: Belief) -> None:
         """Take note that the sensor looked from the belief's pose."""

@@ -43,6 +43,7 @@ class Fleet:
         self._radii = np.array([robot.circumscribed_radius_m for robot in robots])
         self._halves = 0.5 * np.array([(robot.length_m, robot.width_m) for robot in robots])
         self._fastest = np.array([world.fastest_m_s for world in self.worlds])
+        self._near = np.zeros(len(robots), np.bool_)  # of others, in the last step
         self._check_starts()
 
     def _check_starts(self) -> None:
@@ -67,19 +68,23 @@ class Fleet:
     def step(self, wheel_targets: Sequence[ArrayLike], step_s: float, physics_step_s: float) -> None:
         """Drive every robot for one control step; arguments as in :meth:`World.step`, targets one a robot."""
         near = self.near_others(step_s) if len(self.worlds) > 1 else np.zeros(1, np.bool_)
+        before, self._near = self._near, near
         for world, targets, together in zip(self.worlds, wheel_targets, near.tolist(), strict=True):
             if not together:
                 world.step(targets, step_s, physics_step_s)
         if near.any():
-            self._step_together(np.flatnonzero(near).tolist(), wheel_targets, step_s, physics_step_s)
+            self._step_together(np.flatnonzero(near).tolist(), before, wheel_targets, step_s, physics_step_s)
 
     def _step_together(
-        self, near: list[int], wheel_targets: Sequence[ArrayLike], step_s: float, physics_step_s: float
-    ) -> None:
+        self, near: list[int], before: NDArray[np.bool_], wheel_targets: Sequence[ArrayLike], step_s: float,
+        physics_step_s: float,
+    ) -> None:  # fmt: skip
+        """Step those that are near others; what they touched lasts of those that were so ``before``."""
         steps, dt, substeps = division = divide(step_s, physics_step_s)
-        for world, (body, touch) in zip(self.worlds, self._bodies, strict=True):
+        for world, (body, touch), lasts in zip(self.worlds, self._bodies, before.tolist(), strict=True):
             world.place(body)
-            touch.now = touch.robot = False
+            if not lasts:
+                touch.now = touch.robot = False
         for k in near:
             self.worlds[k].begin(wheel_targets[k], division, clear=False)
         for step in range(steps):

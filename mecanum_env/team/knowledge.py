@@ -133,5 +133,6 @@ class Knowledge:
                 when, pose = seen
             elif not placed:
                 continue
-            found.append(Teammate(robot, pose, time_s - when, goal))
+            # Copies: reports are everybody's.
+            found.append(Teammate(robot, pose.copy(), time_s - when, None if goal is None else goal.copy()))
         return tuple(found)

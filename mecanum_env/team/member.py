@@ -109,6 +109,19 @@ class Member(ExploreEnv):
         self._others = [k for k in range(self._team.robots) if k != self.number]
         self.knowledge = Knowledge(self.number, self.backend, self._team)
 
+    def believe(self) -> float:
+        """Sense what a step brought and believe it; return the coverage.
+
+        What others have drawn on the one map of a joint belief since is no reward of its own.
+        """
+        if self.joint:
+            self._remember()
+            before = cast(JointMember, self.backend).apart
+        coverage = super().believe()
+        if self.joint and cast(JointMember, self.backend).apart != before:
+            self._remember()  # its map is another one now
+        return coverage
+
     def wheel_targets(self, action: NDArray[np.float32]) -> Array:
         """Return the wheels' speeds ``(4,)`` [rad/s] that an action asks for."""
         return np.asarray(self._to_wheels(action), np.float64)
@@ -185,6 +198,11 @@ class Member(ExploreEnv):
         return self.knowledge.teammates(self._steps * self.config.step_s)
 
     # ---- what the robot goes by ----------------------------------------------------------------------------
+
+    @property
+    def map_changes(self) -> NDArray[np.int32] | None:
+        """As of a single robot; None where all draw on the one map of a joint belief: any cell may be another."""
+        return None if self.joint else super().map_changes
 
     @property
     def own_coverage(self) -> Coverage:

@@ -13,7 +13,8 @@ from mecanum_env.team.member import Member
 from mecanum_env.team.picture import render_team
 from mecanum_env.team.team import Team
 from slam.belief import Belief
-from slam.settings import check_name
+from slam.files import quoted
+from slam.settings import check_name, require
 from slam.types import Array
 
 try:
@@ -84,6 +85,8 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     ]:
         """Act for one control step; robots that are done leave ``agents``, and stand where they are."""
         names = self.possible_agents
+        for name in self.agents:
+            require(name in actions, f"actions must have one of each of {self.agents}; that of {name} is missing")
         outcomes = self.team.step({self._numbers[name]: actions[name] for name in self.agents})
         self.agents = [names[k] for k in self.team.active]
         return (
@@ -101,15 +104,27 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
 
     def belief(self, agent: str) -> Belief:
         """Return what a robot believes, its map that of all that it knows."""
+        self._check_begun()
         return self.member(agent).belief
 
     def announce(self, agent: str, goal: Array | None) -> None:
         """Have a robot tell the others where it goes: a point ``(2,)`` [m] in its belief's frame, or nowhere."""
-        self.member(agent).knowledge.goal = None if goal is None else np.array(goal, np.float64)
+        self._check_begun()
+        place = None if goal is None else np.array(goal, np.float64)
+        require(
+            place is None or (place.shape == (2,) and bool(np.isfinite(place).all())),
+            f"a goal must be two finite numbers x, y, got {quoted(goal)}",
+        )
+        self.member(agent).knowledge.goal = place
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the true plan with all robots beside what they have mapped together, as an RGB image."""
+        self._check_begun()
         return render_team(self.team) if self.render_mode == "rgb_array" else None
+
+    def _check_begun(self) -> None:
+        if not hasattr(self.team, "ground"):
+            raise RuntimeError("call reset() first")
 
     def close(self) -> None:
         """Nothing is held open."""

@@ -33,6 +33,7 @@ from slam.types import Array
 __all__ = ["Outcome", "Team"]
 
 _JOINT = "ekf-lines"
+_COVER_EVERY_S = 1.0
 _GATE = chi2_quantile(0.999, 3)  # of a sighting
 _OPTIONS = ("floor_plan", "start_poses", "room_seed")
 
@@ -139,6 +140,7 @@ class Team:
         self.coverage = TeamCoverage(self.ground, [member.truth.ground for member in self.members])
         self.active = list(range(team.robots))
         self._steps, self._every = 0, max(1, round(team.communication.every_s / config.step_s))
+        self._cover_every = max(1, round(_COVER_EVERY_S / config.step_s))
         self.groups = np.zeros(team.robots, np.int64)
         for member in self.members:
             member.join(self.fleet, self.ground)
@@ -176,12 +178,17 @@ class Team:
         before = {member.number: member.truth.world.collisions for member in active}
         self.fleet.step(targets, config.step_s, config.physics_step_s)
         self._show_bodies()
-        infos = [member.perceive(before[member.number]) for member in active]
+        infos = []
+        for member in self.members:
+            if member.number in before:
+                infos.append(member.perceive(before[member.number]))
+            else:  # its episode is over, its sensors are on: it may still be rolling, or be pushed
+                member.believe()
         self._steps += 1
-        self._communicate()
-        self._share(infos)
-        covered = self.coverage_share >= config.coverage_target
         late = self._steps >= self.max_steps
+        self._communicate()
+        self._share(infos, last=late)
+        covered = self.coverage_share >= config.coverage_target
         outcomes = {}
         for member, info in zip(active, infos, strict=True):
             hit = config.terminate_on_collision and member.truth.world.collisions > 0
@@ -232,15 +239,17 @@ class Team:
                 if knowledge.hear(reports):
                     knowledge.merge(time_s)
 
-    def _share(self, infos: Sequence[dict[str, Any]]) -> None:
-        """Put what is the team's into the infos of the active robots."""
-        active = [self.members[k] for k in self.active]
+    def _share(self, infos: Sequence[dict[str, Any]], *, last: bool = False) -> None:
+        """Put what is the team's into the infos of the active robots.
+
+        Where frames differ, coverage is brought up to date once a second, and at the last step.
+        """
         apart = self.joint is not None and any(member.apart for member in self.joint.members)
         if len(self.members) == 1 or self.joint is not None:
             self.coverage_share = max(info["coverage"] for info in infos) if apart else infos[-1]["coverage"]
         else:
-            if self.coverage.each_step or self._steps % self._every == 0:
-                for member in active:
+            if self.coverage.each_step or last or self._steps % self._cover_every == 0:
+                for member in self.members:
                     self.coverage.update(member.number, member.own_coverage, member.backend.grid)
             self.coverage_share = self.coverage.share
         collisions = sum(member.truth.world.robot_collisions for member in self.members)

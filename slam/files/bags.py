@@ -7,6 +7,7 @@ say, and is not read.
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Collection, Iterator
 from dataclasses import replace
@@ -25,6 +26,7 @@ _LARGEST = 256 * _MIB  # of a record; a scan has some kilobytes, a picture some 
 _MOST_PACKED, _FREE_UNPACKED, _FREE_MESSAGE = 50, 8 * _MIB, 2**16
 _ZSTD = b"\x28\xb5\x2f\xfd"  # where the recorder packed each message; CDR begins with 0
 _SUFFIXES = (".mcap", ".db3")
+_NUMBER = re.compile(r"(\d+)")
 
 
 class BagMessage(NamedTuple):
@@ -61,8 +63,9 @@ def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str])
         or a package is missing.
     """
     files = _files(path) if path.is_dir() else [path]
-    if not files:
-        raise ValueError(f"bag {shown_path(path)} is packed file by file; unpack it by zstd -d {path}/*.zstd")
+    if not files or (path.is_dir() and any(path.glob("*.zstd"))):
+        raise ValueError(f"bag {shown_path(path)} is packed file by file; unpack it by zstd -d {path}/*.zstd, and "
+                         "take the packed files away")  # fmt: skip
     for file in files:
         check_file(file, what="bag")
         read = _of_mcap if file.suffix == ".mcap" else _of_sqlite
@@ -85,7 +88,10 @@ class _Refused(Exception):
 
 
 def _files(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix in _SUFFIXES)
+    """Return a bag's files in the order in which they were recorded: they are numbered, without zeros in front."""
+    found = [path for path in folder.iterdir() if path.suffix in _SUFFIXES]
+    # Words and numbers by turns, so that like is compared with like.
+    return sorted(found, key=lambda path: [int(w) if k % 2 else w for k, w in enumerate(_NUMBER.split(path.name))])
 
 
 def _words(error: Exception) -> str:

@@ -14,12 +14,15 @@ from slam.files.reading import MOST_TEXT, check_file
 __all__ = ["check_tables", "open_database", "trust"]
 
 _LONGEST_QUERY_S = 30.0
+_SLOWEST_DISK = 10e6  # bytes a second
 _CHECKED_EVERY = 100_000  # instructions of SQLite's machine
 
 
 @contextmanager
 def open_database(path: Path, *, mode: str = "ro") -> Iterator[sqlite3.Connection]:
-    """Open an SQLite file; what takes longer than half a minute is broken off until :func:`trust` is called.
+    """Open an SQLite file; until :func:`trust` is called, what takes too long is broken off.
+
+    That is half a minute, or what it takes to read all of the file.
 
     Parameters
     ----------
@@ -33,7 +36,8 @@ def open_database(path: Path, *, mode: str = "ro") -> Iterator[sqlite3.Connectio
     """
     if mode == "ro" or path.exists() or path.is_symlink():
         check_file(path, what="database")
-    until = time.monotonic() + _LONGEST_QUERY_S
+    size = path.stat().st_size if path.exists() else 0
+    until = time.monotonic() + max(_LONGEST_QUERY_S, size / _SLOWEST_DISK)  # a check reads all of it
     uri = f"{path.absolute().as_uri()}?mode={mode}"
     # Two runs of the same command wait for each other's rows.
     with closing(sqlite3.connect(uri, uri=True, timeout=60.0, isolation_level=None)) as database:

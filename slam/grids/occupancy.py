@@ -21,6 +21,7 @@ from slam.grids.free_space import crossings_of, mark_free
 from slam.grids.scan_drawing import (
     APART_M,
     CLASS_OF,
+    ENTROPY_BIT,
     FREE,
     GAP_M,
     MAX_LOG_ODDS,
@@ -112,6 +113,7 @@ class OccupancyGrid:
         view[classes == OCCUPIED] = MAX_LOG_ODDS
         view[classes == FREE] = MIN_LOG_ODDS
         grid.known_cells = int(np.count_nonzero(grid.log_odds))
+        grid.entropy_bit = float(np.sum(ENTROPY_BIT[grid.log_odds[grid.log_odds != 0].view(np.uint8)] - 1.0))
         grid._build_overview()
         grid._note_drawn(row, col, row + rows, col + cols)
         return grid

@@ -73,6 +73,8 @@ class _Found:
     scan_frames: dict[str, str] = field(default_factory=dict)
     tracks: dict[str, _Track] = field(default_factory=dict)  # of Odometry and poses, by topic; of odom in /tf
     frames: Frames = field(default_factory=Frames)
+    hanging: dict[str, dict[str, _Track]] = field(default_factory=dict)  # from odom, by topic of /tf and frame
+    wrong: dict[str, str] = field(default_factory=dict)  # what is wrong on a topic, by its first odd message
     ranges: int = 0
 
 
@@ -107,6 +109,8 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     scan_topic = _choose(found, found.scans, topics.scan, "/scan", "scan", where)
     odom_topic = _odometry_topic(found, topics, where)
     track = found.tracks[odom_topic]
+    if odom_topic in found.hanging:
+        track = _robots_own(found, odom_topic, found.scan_frames[scan_topic], where)
     mount = topics.mount or _mount(found, track.child, found.scan_frames[scan_topic], where)
     odometry_times, odometry = track.sorted()
     jump = np.hypot(*np.diff(odometry[:, :2], axis=0).T).max(initial=0.0)
@@ -165,8 +169,8 @@ def _gather(path: Path, topics: BagTopics) -> _Found:
             ) from error
         try:
             _take(found, message, decoded)
-        except ValueError as error:
-            raise ValueError(f"bag {path}: topic {quoted(message.topic)} {error}") from error
+        except ValueError as error:  # it matters where the topic is used
+            found.wrong.setdefault(message.topic, str(error))
     return found
 
 
@@ -177,7 +181,10 @@ def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
             found.frames.add(placed)
             if placed.parent.rpartition("/")[2] == "odom" and topic != "/tf_static":
                 pose = np.array([*placed.matrix[:2, 3], math.atan2(placed.matrix[1, 0], placed.matrix[0, 0])])
-                found.tracks.setdefault(topic, _Track(placed.child)).add(placed.time_s, pose)
+                hanging = found.hanging.setdefault(topic, {})
+                track = hanging.setdefault(placed.child, _Track(placed.child))
+                track.add(placed.time_s, pose)
+                found.tracks.setdefault(topic, track)
         return
     if message.datatype == _SCAN:
         scan = scan_of(decoded)
@@ -199,10 +206,13 @@ def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
 
 def _choose(found: _Found, held: Any, given: str | None, usual: str, what: str, where: str) -> str:
     """Return the topic that is meant: the one given, the usual one, or the only one."""
-    if given is not None and given in held:
-        return given
-    if given is None and (usual in held or len(held) == 1):
-        return usual if usual in held else str(next(iter(held)))
+    chosen = given if given is not None else usual
+    if given is None and usual not in held and len(held) == 1:
+        chosen = str(next(iter(held)))
+    if chosen in found.wrong:
+        raise ValueError(f"{where}: topic {quoted(chosen)} {found.wrong[chosen]}")
+    if chosen in held:
+        return chosen
     word = "odometry" if what == "odom" else what
     said = f"{len(held)} topics could be the {word}" if held else f"no topic of {word}"
     if given is not None:
@@ -215,6 +225,21 @@ def _odometry_topic(found: _Found, topics: BagTopics, where: str) -> str:
     if topics.odom is not None or not held:
         held += [topic for topic in found.tracks if found.topics[topic] == _TF]
     return _choose(found, held, topics.odom, "/odom", "odom", where)
+
+
+def _robots_own(found: _Found, topic: str, sensor: str, where: str) -> _Track:
+    """Return the track of the frame that the lidar hangs from, of those that hang from odom in a topic of /tf."""
+    hanging = found.hanging[topic]
+    if len(hanging) == 1:
+        return next(iter(hanging.values()))
+    own = [child for child in hanging if found.frames.carries(child, sensor)]
+    if len(own) != 1:
+        names = ", ".join(quoted(child) for child in sorted(hanging)[:_MOST_TOPICS])
+        raise ValueError(
+            f"{where}: {names} all hang from odom in {topic}, and transforms do not say which of them carries the "
+            f"lidar {quoted(sensor)}; choose by --odom-topic from {_listed(found)}"
+        )
+    return hanging[own[0]]
 
 
 def _listed(found: _Found) -> str:

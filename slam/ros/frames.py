@@ -68,6 +68,10 @@ class Frames:
                 return found
         return None
 
+    def carries(self, frame: str, sensor: str) -> bool:
+        """Tell whether a sensor is on a frame, or on what hangs from that."""
+        return frame in self._chain(sensor)
+
     def _chain(self, frame: str) -> dict[str, Array]:
         """Return a frame and those above it, each with the first one's place in it."""
         matrix = np.eye(4)

@@ -56,7 +56,7 @@ def scan_of(message: Any) -> Scan:
     if not 0.0 <= low < high <= _FARTHEST_RANGE_M:
         raise ValueError(f"has a scan with range_min {low:.4g} and range_max {high:.4g}, in m; correct its driver")
     with np.errstate(invalid="ignore"):
-        lost = (ranges < low) | ((ranges > high) & np.isfinite(ranges))
+        lost = (ranges < low) | (ranges <= 0.0) | ((ranges > high) & np.isfinite(ranges))
         ranges[ranges == high] = math.inf
     ranges[lost] = math.nan
     return Scan(ranges, first, step, high, low)
@@ -75,9 +75,16 @@ def pose_of(pose: Any) -> Array:
 
 
 def transforms_of(message: Any) -> Iterator[Placed]:
-    """Yield what a ``tf2_msgs/TFMessage`` says; a slash before a frame's name, as in ROS 1, is taken off."""
+    """Yield what a ``tf2_msgs/TFMessage`` says; a slash before a frame's name, as in ROS 1, is taken off.
+
+    What is no transform, or one to kilometres away as from a map to the earth, is passed over: whoever needs it
+    will miss it.
+    """
     for each in message.transforms:
-        matrix = _matrix(each.transform.translation, each.transform.rotation)
+        try:
+            matrix = _matrix(each.transform.translation, each.transform.rotation)
+        except ValueError:
+            continue
         yield Placed(stamp_of(each), each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"), matrix)
 
 

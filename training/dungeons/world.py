@@ -57,7 +57,7 @@ def load(path: Path) -> Dungeon:
         In one line: what is wrong with the file.
     """
     with bad_input():
-        pixels = read_grey(path).astype(np.uint8)
+        pixels = np.nan_to_num(read_grey(path)).astype(np.uint8)
     if max(pixels.shape) > _MOST_PIXELS or min(pixels.shape) < 2:
         raise BadInput(f"map {path} has {pixels.shape[1]} × {pixels.shape[0]} pixels; 2 to {_MOST_PIXELS} a side")
     return dungeon_of(pixels, path.stem)

@@ -105,11 +105,13 @@ class TeamLog:
 def team_map(team: Team) -> tuple[OccupancyGrid, list[int]]:
     """Return the robots' own maps put together in the first one's frame, and the robots that are in it.
 
-    Left out are those of whom the first does not know where their frame is. A joint belief has one map.
+    Left out are those of whom the first does not know where their frame is. A joint belief has one map, of all
+    that are not apart.
     """
     first, *others = team.members
     if team.joint is not None:
-        return first.grid, list(range(len(team.members)))
+        together = [k for k, member in enumerate(team.joint.members) if not member.apart]
+        return team.members[together[0]].grid, together
     frames = _frames_known(team)
     merged = MergedGrid(first.backend.grid)
     merged.take({
@@ -168,6 +170,9 @@ def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
     score = score_map(first.truth.ground, first.backend.belief.in_team(0, merged, ()))
     robots: list[dict[str, Any]] = [dict(member.episode_metrics()) for member in team.members]
     sums = {name: sum(robot[name] for robot in robots) for name in _SUMS}
+    if team.joint is not None:  # one map, and those of the robots apart from it
+        own = [robot["landmarks"] for k, robot in enumerate(robots) if k not in together]
+        sums["landmarks"] = robots[together[0]]["landmarks"] + sum(own)
     means = {name: _mean([robot[name] for robot in robots]) for name in _MEANS}
     corners = [robot["corner_max_m"] for robot in robots if robot["corner_max_m"] is not None]
     weights = [robot["steps"] + 1 for robot in robots]

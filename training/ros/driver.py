@@ -46,6 +46,8 @@ __all__ = ["Driver", "lidar_of"]
 _LOST = 0.1  # health of a belief below which it is no good for driving, as to the agents
 _KEPT = 1000  # odometry messages: seconds of the fastest
 _TOO_FAST = 3.0  # times its limits: no robot's motion, but odometry that began anew
+_LEAST_S = 0.1  # in which so much way is no jump: stamps of single messages may lie closer
+_FARTHEST_M = 100.0  # that a lidar of the agents sees
 _BESIDE_M = 0.05  # that a lidar may sit off the middle line of the body that the agents drive
 _NARROWEST_RAD = math.radians(30.0)
 _STAND = (0.0, 0.0, 0.0)
@@ -99,6 +101,8 @@ class Driver:
         self.config, self._agent_name, self._seed, self._late_s, self.log = config, agent, seed, late_s, log
         self._mount, self._frames = mount, Frames()
         self._odometry: deque[tuple[float, Array]] = deque(maxlen=_KEPT)
+        self._since_jumps = np.zeros(3)  # what its poses are moved by, for jumps to be no motion
+        self._older_since = math.inf  # when messages began to be older than the last one that was taken
         self._pending: tuple[float, str, Scan] | None = None
         self._heard = {"odometry": -math.inf, "scan": -math.inf}
         self._backend: Backend | None = None
@@ -123,11 +127,21 @@ class Driver:
     def hear_odometry(self, message: Any, now_s: float) -> None:
         """Take a ``nav_msgs/Odometry`` that came at a time of the caller's clock [s]."""
         at, pose = stamp_of(message), odometry_of(message)
-        if self._odometry and at <= self._odometry[-1][0]:
-            return  # out of order, or a clock that was set back: late before long
+        if self._odometry and at <= self._odometry[-1][0]:  # out of order
+            self._older_since = min(self._older_since, now_s)
+            if now_s - self._older_since < self._late_s:
+                return
+            self._complain("odometry's clock was set back")
+            self._odometry[-1] = at - 1e-3, self._odometry[-1][1]
+            while len(self._odometry) > 1:
+                self._odometry.popleft()
+            self._pending = None
+            if self._backend is not None:
+                self._at = at - 1e-3, self._at[1]
+        self._older_since = math.inf
         self._base = message.child_frame_id.lstrip("/") or self._base
         self._odom = message.header.frame_id.lstrip("/") or self._odom
-        self._odometry.append((at, pose))
+        self._odometry.append((at, self._without_jumps(at, pose)))
         self._heard["odometry"] = now_s
         self._advance(now_s)
 
@@ -136,6 +150,19 @@ class Driver:
         """Take a ``sensor_msgs/LaserScan`` that came at a time of the caller's clock [s]."""
         self._pending = stamp_of(message), message.header.frame_id.lstrip("/"), scan_of(message)
         self._advance(now_s)
+
+    def _without_jumps(self, at: float, pose: Array) -> Array:
+        """Return where the odometry would be at a time, had it never jumped; a jump is no motion."""
+        if not self._odometry:
+            return pose
+        (before, last), moved = self._odometry[-1], compose(self._since_jumps, pose)
+        robot, most_s = self.config.robot, _TOO_FAST * max(at - before, _LEAST_S)
+        far = math.hypot(moved[0] - last[0], moved[1] - last[1]) > most_s * robot.max_speed_m_s
+        if far or abs(wrap_scalar(float(moved[2] - last[2]))) > most_s * robot.max_turn_rate_rad_s:
+            self._complain("odometry jumped; the jump is left out")
+            self._since_jumps = compose(last, inverse(pose))
+            return last.copy()
+        return moved
 
     # ---- what it believes ----------------------------------------------------------------------------------
 
@@ -163,6 +190,7 @@ class Driver:
         assert self._backend is not None
         lidar, layout = self.config.lidar, self._layout
         mapped = Scan(resampled(levelled, *layout), *layout[:2], lidar.range_max_m, lidar.range_min_m)
+        mapped.ranges[mapped.ranges > lidar.range_max_m] = math.inf
         ahead = resampled(mapped, lidar.angle_min, lidar.angle_increment, lidar.beams)
         self._scan = mapped._replace(
             ranges=ahead, angle_min=lidar.angle_min, angle_increment=lidar.angle_increment
@@ -258,7 +286,7 @@ class Driver:
         """Return map → odom as a ``geometry_msgs/TransformStamped``, of the time of the newest odometry."""
         if self._backend is None:
             return None
-        at = compose(self._backend.pose, inverse(self._at[1]))
+        at = compose(compose(self._backend.pose, inverse(self._at[1])), self._since_jumps)
         return transform_message("map", self._odom, self._odometry[-1][0], at)
 
     def pose(self) -> Message | None:
@@ -303,5 +331,5 @@ def lidar_of(scan: Scan, offset_m: float) -> LidarConfig:
                              "15° to either side of straight ahead are the least to drive by")  # fmt: skip
     return LidarConfig(
         beams=beams, field_of_view_deg=min(math.degrees(sweep), 360.0), offset_m=offset_m,
-        range_min_m=scan.range_min, range_max_m=scan.range_max,
+        range_min_m=scan.range_min, range_max_m=min(scan.range_max, _FARTHEST_M),
     )  # fmt: skip

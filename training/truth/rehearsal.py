@@ -108,7 +108,7 @@ def _drive(
 ) -> Array:  # fmt: skip
     poses = np.zeros((_STEPS, 3))
     pose, velocity, twist = np.zeros(3), np.zeros(2), np.zeros(3)
-    hits, sides = np.zeros((0, 2)), np.zeros((0, 3))
+    hits, sides, floors = np.zeros((0, 2)), np.zeros((0, 3)), np.full(2, -np.inf)
     index, turn, blocked_for, n, dt = 0, 0.0, 0, 1, motors.step_s
     # A twist that is sent is reached as 1 − e^(−t / lag).
     left = math.exp(-dt / lag_s) if lag_s > 0.0 else 0.0
@@ -121,7 +121,7 @@ def _drive(
         if arrived:
             break
         sent, velocity, blocked = send(
-            wanted, wanted_turn, velocity, turn, pose, near, gap, hits, sides, motors, guard
+            wanted, wanted_turn, velocity, turn, pose, near, gap, hits, sides, motors, guard, floors
         )
         turn = sent[2]
         blocked_for = blocked_for + 1 if blocked else 0

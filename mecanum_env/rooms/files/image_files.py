@@ -50,7 +50,7 @@ def _reason(error: Exception) -> str:
 
 
 def read_grey(path: Path) -> NDArray[np.float32]:
-    """Return an image as grey values ``(rows, cols)`` in 0 to 255, row 0 at the top; transparent is 0.
+    """Return an image as grey values ``(rows, cols)`` in 0 to 255, row 0 at the top; transparent is NaN.
 
     Colours are averaged, as ROS's map_server does.
 
@@ -83,4 +83,4 @@ def _grey(image: Image.Image) -> NDArray[np.float32]:
     if image.mode.startswith("I"):  # 16 bits, which Pillow scales to 65535
         return np.asarray(image, np.float32) * np.float32(255.0 / 65535.0)
     pixels = np.asarray(image.convert("RGBA"))
-    return np.where(pixels[..., 3] >= 128, pixels[..., :3].mean(axis=2, dtype=np.float32), np.float32(0))
+    return np.where(pixels[..., 3] >= 128, pixels[..., :3].mean(axis=2, dtype=np.float32), np.float32(np.nan))

@@ -165,6 +165,12 @@ class PlainFollower(PathFollower):
         return twist * (self._robot.max_speed_m_s / demand) if demand > self._robot.max_speed_m_s else twist
 
     def _safe(self, twist: Array, pose: Array, near: LocalMap, gap: float, seen: Array) -> Array:
+        now = body_gaps(np.zeros(3), pose, near, seen, self._guard)[::2]
+        slack = []
+        for which, (gap_now, least) in enumerate(zip(now, (gap, self.config.scan_gap_m), strict=True)):
+            # From step to step 2 mm nearer would be at the wall in the end: they are from the farthest since.
+            self._floors[which] = max(self._floors[which], gap_now - 0.002) if gap_now < least else -math.inf
+            slack.append(min(max(gap_now - self._floors[which], 1e-6), 0.002))
         if not twist.any():
             return twist
         candidates = [twist * share for share in SPEEDS]
@@ -173,14 +179,23 @@ class PlainFollower(PathFollower):
         slow = 0.12 * twist[:2] / max(float(np.hypot(*twist[:2])), 0.12)
         candidates += [np.append(geometry.rotation(angle) @ slow, 0.0) for angle in SIDESTEPS]
         for candidate in candidates:
-            if candidate.any() and self._is_safe(candidate, pose, near, gap, seen):
+            if candidate.any() and self._is_safe(candidate, pose, near, gap, seen, *slack):
                 return candidate
         return np.zeros(3)
 
-    def _is_safe(self, twist: Array, pose: Array, near: LocalMap, gap: float, seen: Array) -> bool:
+    def _is_safe(
+        self,
+        twist: Array,
+        pose: Array,
+        near: LocalMap,
+        gap: float,
+        seen: Array,
+        map_slack: float,
+        scan_slack: float,
+    ) -> bool:
         map_now, map_ahead, scan_now, scan_ahead = body_gaps(twist, pose, near, seen, self._guard)
-        clear_of_map = map_ahead >= min(gap, map_now - 0.002)
-        clear_of_scan = scan_ahead >= min(self.config.scan_gap_m, scan_now - 0.002)
+        clear_of_map = map_ahead >= min(gap, map_now - map_slack)
+        clear_of_scan = scan_ahead >= min(self.config.scan_gap_m, scan_now - scan_slack)
         return bool(clear_of_map and clear_of_scan)
 
 

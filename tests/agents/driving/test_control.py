@@ -93,6 +93,49 @@ def test_never_drives_into_a_wall_it_is_led_into():
     assert min(body_gap(classes, p, ROBOT) for p in poses) > 0.02
 
 
+@pytest.mark.parametrize("wish", [(0.0, 0.0, 0.4), (0.3, 0.0, 0.0), (0.3, -0.1, 0.0), (0.2, -0.2, -0.3)])
+def test_a_body_too_near_a_wall_comes_no_nearer_step_by_step(wish):
+    classes, control = room(6.0, 6.0), follower()
+    fill(classes, 0.0, 0.0, 6.0, 1.0)
+    pose = np.array([3.0, 1.0 + 0.19 + 0.02, 0.0])  # its side two centimetres from the wall, where four are kept
+    first, limits = body_gap(classes, pose, ROBOT), np.array([0.8, 0.8, 1.5])
+    for _ in range(150):
+        twist = control.drive(np.array(wish[:2]), wish[2], None, belief_of(classes, tuple(pose), sigma=0.0))
+        pose = drive(pose, twist / limits, ROBOT)
+        assert body_gap(classes, pose, ROBOT) > first - 0.006  # 2 mm, and what cells and rim points leave out
+
+
+def test_a_body_wider_than_long_goes_sideways_through_a_door():
+    robot, classes = RobotConfig(length_m=0.38, width_m=0.7), two_rooms(0.7)
+    for config, start in ((ControlConfig(), 0.0), (ControlConfig(any_side=True), 0.4)):
+        control, pose = PathFollower(config, robot=robot, lidar=LIDAR, step_s=0.1), np.array([1.2, 2.0, start])
+        control.set_path(resample(np.array([(1.2, 2.0), (6.0, 2.0)]), 0.1), None)
+        for _ in range(500):
+            twist = control.follow(None, belief_of(classes, tuple(pose)))
+            pose = drive(pose, twist / np.array([0.8, 0.8, 1.5]), robot)
+            assert body_gap(classes, pose, robot) > 0.02
+            if control.arrived:
+                break
+        assert control.arrived
+
+
+def test_it_counts_on_no_more_than_the_robot_can():
+    def guard(step_s=0.1, **robot):
+        return PathFollower(ControlConfig(), robot=RobotConfig(**robot), lidar=LIDAR, step_s=step_s)
+
+    usual = guard()
+    assert (usual._guard.lag_s, usual._guard.braking_m_s2) == (0.2, 1.5) and usual._pace.max_speed_m_s == 0.76
+    assert guard(motor_lag_s=1.5)._guard.lag_s == pytest.approx(1.6)
+    assert guard(step_s=1.0)._guard.lag_s == pytest.approx(1.05)
+    heavy = RobotConfig(mass_kg=600.0)
+    braking = guard(mass_kg=600.0)._guard.braking_m_s2
+    assert braking < 4.0 * heavy.motor_torque_nm / (heavy.wheel_radius_m * heavy.mass_kg) < 0.3
+    fast = guard(max_speed_m_s=6.0)
+    speed = fast._pace.max_speed_m_s
+    stops_in = speed * fast._guard.lag_s + speed**2 / (2.0 * fast._guard.braking_m_s2)
+    assert stops_in == pytest.approx(2.0 - RobotConfig().circumscribed_radius_m)
+
+
 def test_brakes_for_what_only_the_scan_shows():
     classes, control, pose = room(8.0, 6.0), follower(), np.array([1.5, 3.0, 0.0])
     control.set_path(resample(np.array([(1.5, 3.0), (6.5, 3.0)]), 0.1), None)

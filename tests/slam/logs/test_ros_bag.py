@@ -102,6 +102,48 @@ def drive(*, mount: Any, at: float = 1e9, base: str = "base_link", place: Any = 
             yield "/scan", SCAN, time_s + 0.02, scan_message(time_s + 0.02, "laser", seen)
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_files_of_a_bag_are_read_by_number(storage: str, tmp_path: Path) -> None:
+    messages = list(drive(mount=mounted(0.2, 0.0, 0.0), scans=24))
+    whole = write_bag(tmp_path / "drive", messages, storage=storage)
+    split = tmp_path / "split"
+    split.mkdir()
+    for k in range(12):
+        part = write_bag(tmp_path / f"part{k}", _twelfth(messages, k), storage=storage)
+        (file,) = (p for p in part.iterdir() if p.suffix in (".mcap", ".db3"))
+        file.rename(split / f"drive_{k}{file.suffix}")
+    assert np.array_equal(bag(split).odometry_poses, bag(whole).odometry_poses)
+    (split / f"drive_12{file.suffix}.zstd").write_bytes(b"")
+    assert "take the packed files away" in refused(split)
+
+
+def _twelfth(messages: list[Any], k: int) -> list[Any]:
+    length = -(-len(messages) // 12)
+    return messages[k * length : (k + 1) * length]
+
+
+def test_the_robot_is_what_carries_the_lidar(log: ScanLog, tmp_path: Path) -> None:
+    """Other frames may hang from odom, too; and odd messages on other topics are nobody's affair."""
+
+    utm = transform_message("utm", "map", 1.0, [448262.0, 5411932.0, 0.0])
+    nowhere = odometry_message(1.0, "odom", "base_link", np.array([math.nan, 0.0, 0.0]), np.zeros(3))
+
+    def more(odd: bool) -> Any:
+        for message in recorded(log, odometry="/tf"):
+            yield message
+            topic, _, at, _ = message
+            if topic == "/tf":
+                dock = transform_message("odom", "dock", at + 0.01, [4.3, 1.7, 0.9])
+                yield "/tf", TF, at + 0.01, {"transforms": [utm, dock]}
+                if odd:
+                    yield "/gps/odom", ODOMETRY, at, nowhere
+
+    check_same(bag(write_bag(tmp_path / "dock", more(True)), odom="/tf"), log)
+    assert "'/gps/odom' has a position" in refused(write_bag(tmp_path / "odd", more(True)), odom="/gps/odom")
+    both = [m for m in more(False) if m[0] != "/tf_static"]
+    assert "all hang from odom in /tf" in refused(write_bag(tmp_path / "none", both), mount=Mount(0.0, 0.0, 0.0))
+
+
 def test_scans_between_two_odometries_and_outside(tmp_path: Path) -> None:
     late = ("/scan", SCAN, 2e9, scan_message(2e9, "laser", scan(np.ones(8))))
     found = bag(write_bag(tmp_path / "b", [*drive(mount=mounted(0.2, 0.0, 0.0)), late]))

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from mecanum_env.arguments import make_config
 from slam.geometry import compose
-from slam.ros import Mount, pose_of, transforms_of
+from slam.ros import Mount, pose_of, transform_message, transforms_of
+from slam.types import Scan
 from tests.slam.ros.bags_on_disk import ODOMETRY, TF, scan
 from tests.training.ros.robots import Robot, packed
 from training.ros.driver import Driver, lidar_of
@@ -128,6 +129,49 @@ def test_odometry_that_begins_anew_moves_nobody() -> None:
     for _ in range(20):
         drive.step()
     assert drive.robot.info["position_error_m"] < 0.1
+
+
+def test_a_jump_between_two_scans_is_no_motion() -> None:
+    """Neither of the belief, nor of what the agent drives by, nor of map → base."""
+    drive = begun(30)
+    backend = drive.driver.backend
+    assert backend is not None
+    before = backend.pose
+    drive.robot.odometry_pose = drive.robot.odometry_pose + np.array([1.0, 0.4, 0.3])
+    drive.robot.clock_s += 0.1
+    drive.driver.hear_odometry(drive.robot.odometry(), drive.now_s)
+    assert np.allclose(drive.driver._belief_now().pose, before, atol=1e-9)
+    (placed,) = transforms_of(packed(TF, {"transforms": [drive.driver.map_to_odom()]}))
+    in_odom = np.array([*placed.matrix[:2, 3], math.atan2(*placed.matrix[1::-1, 0])])
+    assert np.allclose(compose(in_odom, pose_of(drive.robot.odometry().pose.pose)), before, atol=1e-6)
+    drive.robot.clock_s -= 0.05
+    drive.hear(odometry=False)  # a scan from the middle of the jump
+    assert np.hypot(*(backend.pose - before)[:2]) < 0.1  # what it drove in that step
+
+
+def test_a_clock_that_is_set_back_is_gone_on_by() -> None:
+    drive = begun(30)
+    drive.robot.clock_s += 3600.0
+    drive.driver.hear_odometry(drive.robot.odometry(), drive.now_s)
+    drive.robot.clock_s -= 3600.0
+    twists = [drive.step() for _ in range(30)]
+    assert all(twist != STAND for twist in twists[15:])
+    assert any("clock was set back" in text for text in drive.said)
+    assert drive.robot.info["position_error_m"] < 0.1
+
+
+def test_a_transform_that_is_none_hides_no_other() -> None:
+    drive = Drive()
+    message = drive.robot.mount()
+    bad = packed(TF, {"transforms": [transform_message("utm", "map", 0.0, [448262.0, 5411932.0, 0.0])]})
+    message.transforms = [*bad.transforms, *message.transforms]
+    drive.driver.hear_transforms(message)
+    assert drive.step() is not None
+
+
+def test_a_lidar_that_sees_farther_than_a_hundred_metres_is_taken_as_far() -> None:
+    scan = Scan(np.full(360, 110.0), -math.pi, 2.0 * math.pi / 360, 120.0)
+    assert lidar_of(scan, 0.0).range_max_m == 100.0
 
 
 def test_nobody_is_told_to_drive_before_it_has_begun() -> None:

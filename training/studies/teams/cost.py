@@ -44,6 +44,8 @@ def measure(team: Team, seeds: list[int], steps: int) -> dict[str, float]:
                 took.append(1e3 * (time.perf_counter() - began))
             for k, outcome in outcomes.items():
                 observations[k] = outcome.observation
+            if not team.active:
+                break
     return {"median_ms": statistics.median(took), "mean_ms": float(np.mean(took))}
 
 
@@ -57,7 +59,9 @@ def study(
     """Measure a step of a team that explores, resets and decisions left out."""
     with bad_input():
         chosen, counts = parse_seeds(seeds), whole_numbers("--robots", robots, low=1, high=64)
-        teams = {count: Team(count, rooms=rooms, config={"coverage_target": 1.0}) for count in counts}
+        teams = {
+            count: Team(count, rooms=rooms, config={"coverage_target": 1.0}, max_steps=steps) for count in counts
+        }
     for team in teams.values():
         measure(team, chosen[:1], _WARM_UP + 1)  # kernels are compiled
     found: dict[int, dict[str, Any]] = {count: measure(team, chosen, steps) for count, team in teams.items()}
