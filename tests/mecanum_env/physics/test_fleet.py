@@ -101,6 +101,20 @@ def test_a_wall_touched_near_another_robot_is_no_robot_touched() -> None:
     assert all(w.pose[1] < 8.0 - 0.5 * ROBOT.width_m + 0.01 for w in fleet.worlds)
 
 
+def test_who_slides_along_a_wall_does_so_whoever_stands_by() -> None:
+    """A contact lasts from one control step to the next, in the space of several robots as in one's own."""
+    plan, slide = _hall(), TARGETS.of_twist(np.array((0.7, 0.5, 0.1)))
+    alone = _worlds(plan, [(2.0, 7.7, 0.0)])[0]
+    fleet = Fleet(_worlds(plan, [(2.0, 7.7, 0.0), (3.5, 6.6, 0.0)]))
+    for _ in range(25):
+        alone.step(slide, 0.1, 0.02)
+        fleet.step([slide, STILL], 0.1, 0.02)
+        assert fleet.worlds[1].collisions == 0
+    assert alone.collisions > 0 and alone.pose[0] > 2.3
+    np.testing.assert_allclose(fleet.worlds[0].pose, alone.pose, atol=1e-4)
+    np.testing.assert_allclose(fleet.worlds[0].twist, alone.twist, atol=1e-3)
+
+
 def test_the_same_robots_go_the_same_way() -> None:
     def go() -> list[float]:
         fleet = Fleet(_worlds(_hall(), [(2.0, 4.0, 0.0), (5.0, 4.3, np.pi), (3.5, 2.0, 1.0)]))

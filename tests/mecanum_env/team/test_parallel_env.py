@@ -47,6 +47,19 @@ def test_agents_have_beliefs_goals_and_a_picture() -> None:
         mecanum_env.parallel_env(render_mode="human")
 
 
+def test_what_is_missing_or_no_goal_is_said() -> None:
+    env = mecanum_env.parallel_env(robots=2, rooms="rectangular", render_mode="rgb_array")
+    for early in (env.render, lambda: env.belief("robot_0"), lambda: env.announce("robot_0", None)):
+        with pytest.raises(RuntimeError, match=r"call reset\(\) first"):
+            early()
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="that of robot_1 is missing"):
+        env.step({"robot_0": np.zeros(3, np.float32)})
+    for goal in ([1.0, 2.0, 3.0], [np.nan, 0.0]):
+        with pytest.raises(ValueError, match="a goal must be two finite numbers"):
+            env.announce("robot_0", np.array(goal))
+
+
 def test_all_are_done_together_when_the_target_is_covered() -> None:
     env = mecanum_env.parallel_env(robots=2, config={"coverage_target": 0.01})
     env.reset(seed=0)
