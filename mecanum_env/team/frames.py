@@ -12,11 +12,13 @@ from slam.accounts.account import Account
 from slam.backend import Backend
 from slam.geometry import compose, inverse
 from slam.teams.alignment import align
+from slam.teams.apart import Start, without_start
 from slam.teams.sighting import combine, relative_pose
 from slam.types import Array, Sighting
 
 __all__ = ["Frames"]
 
+_EXACT = 1e-8 * np.eye(3)
 _TRY_AGAIN_S = 10.0  # maps have to grow before another look finds what one did not
 _LOOK_AGAIN_S = 60.0  # at a frame that is known, for a better one
 
@@ -34,14 +36,16 @@ class Frames:
         Whose.
     backend : Backend
         Its estimator, which has to keep a joint covariance.
-    start_cov : Array, optional
-        Covariance ``(3, 3)`` of any other's frame, where starts are known so well.
+    start : Start, optional
+        Its own, in the frame of all, where that is not known for sure.
+    known : bool
+        Whether starts are known, as well as each says, and so the frames are about one.
     """
 
-    def __init__(self, robot: int, backend: Backend, start_cov: Array | None = None) -> None:
+    def __init__(self, robot: int, backend: Backend, start: Start | None = None, *, known: bool = False) -> None:
         self.found: dict[int, Array] = {}
         """Pose ``(3,)`` of a robot's frame in the own one, as far as maps tell."""
-        self._robot, self._backend, self._start_cov = robot, backend, start_cov
+        self._robot, self._backend, self._start, self._known = robot, backend, start, known
         self._rough: dict[int, tuple[Array, Array]] = {}  # pose and covariance, by sightings
         self._looked_s: dict[int, float] = {}
 
@@ -51,7 +55,7 @@ class Frames:
             return self.found[robot]
         if robot in self._rough:
             return self._rough[robot][0]
-        return None if self._start_cov is None else np.zeros(3)
+        return np.zeros(3) if self._known else None
 
     def take_sighting(self, sighting: Sighting, report: Report) -> None:
         """Take in that a robot was seen, and what it told at the same instant."""
@@ -90,10 +94,15 @@ class Frames:
             return
         self._looked_s[robot] = time_s
         prior = self._rough.get(robot)
-        if prior is None and self._start_cov is not None:
-            prior = np.zeros(3), self._start_cov
+        other, starts = report.account, (self._start, report.start)
+        if prior is None and self._known:
+            prior = np.zeros(3), sum((start.frame_cov for start in starts if start is not None), _EXACT)
+        if self._start is not None:
+            account = without_start(account, self._start)
+        if report.start is not None:
+            other = without_start(other, report.start)
         chart = report.chart
         grids = None if chart is None else (self._backend.grid, chart.grid(self._backend.grid.resolution))
-        found = align(account, report.account, grids=grids, prior=prior)
+        found = align(account, other, grids=grids, prior=prior)
         if found is not None:
             self.found[robot] = found.pose

@@ -18,6 +18,7 @@ from slam.backend import Backend
 from slam.belief import Teammate
 from slam.geometry import compose, transform_points
 from slam.grids.occupancy import OccupancyGrid
+from slam.teams.apart import Start
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Array, Sighting
 
@@ -37,9 +38,11 @@ class Knowledge:
         Its own estimator.
     team : TeamConfig
         How many there are, and what is known of their starts.
+    start : Start, optional
+        Its own, in the frame of all, where that is known but not for sure.
     """
 
-    def __init__(self, robot: int, backend: Backend, team: TeamConfig) -> None:
+    def __init__(self, robot: int, backend: Backend, team: TeamConfig, start: Start | None = None) -> None:
         self.robot = robot
         self.goal: Array | None = None  # (2,) [m] where it says that it goes
         self._backend, self._team = backend, team
@@ -48,8 +51,8 @@ class Knowledge:
         self._seen: dict[int, tuple[float, Array]] = {}  # time [s] and pose ``(3,)`` in the own frame
         self._frames: Frames | None = None  # where they are not all the same
         if team.robots > 1 and team.belief == "own" and not team.starts_exact:
-            rough = 2.0 * np.diag(np.square((team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad)))
-            self._frames = Frames(robot, backend, rough if team.known_starts else None)
+            self._frames = Frames(robot, backend, start, known=team.known_starts)
+        self._start = start
         self._chart: tuple[float, Chart | None, Account | None] = (-math.inf, None, None)
         self._grid = None if team.belief == "joint" else MergedGrid(backend.grid)
 
@@ -64,7 +67,9 @@ class Knowledge:
     def report(self, time_s: float) -> Report:
         """Return what this robot tells of itself."""
         frames = {} if self._frames is None else dict(self._frames.found)
-        return Report(time_s, self._backend.pose, self._backend.pose_cov, self.goal, *self._chart, frames)
+        return Report(
+            time_s, self._backend.pose, self._backend.pose_cov, self.goal, *self._chart, self._start, frames
+        )
 
     # ---- hearing and seeing --------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from slam.backend import Backend
 from slam.belief import Belief, Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
+from slam.teams.apart import Start
 from slam.teams.centralised import JointMember
 from slam.types import Array, Scan, Sighting
 
@@ -107,7 +108,8 @@ class Member(ExploreEnv):
         # The other bodies' sides behind the plan's surfaces.
         self._surfaces = np.vstack([plan.segments, np.zeros((4 * (self._team.robots - 1), 4))])
         self._others = [k for k in range(self._team.robots) if k != self.number]
-        self.knowledge = Knowledge(self.number, self.backend, self._team)
+        start = None if self.start_cov is None else Start(self.start, self.start_cov)
+        self.knowledge = Knowledge(self.number, self.backend, self._team, start)
 
     def believe(self) -> float:
         """Sense what a step brought and believe it; return the coverage.

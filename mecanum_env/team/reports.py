@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from slam.accounts.account import Account
+from slam.teams.apart import Start
 from slam.teams.merged_grid import Chart
 from slam.types import Array
 
@@ -22,4 +23,5 @@ class Report(NamedTuple):
     chart_s: float  # when chart and account were made
     chart: Chart | None
     account: Account | None  # where frames have to be found
+    start: Start | None  # where starts are known, but not for sure: which it believes in
     frames: Mapping[int, Array]  # poses (3,) of others' frames, as far as it found them

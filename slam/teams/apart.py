@@ -12,7 +12,7 @@ hundred times as large as that of the alignment: about a hundredth of that infor
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +24,12 @@ from slam.teams.alignment import align
 from slam.teams.frames import compose_jacobians, points_into, pose_into, walls_into
 from slam.types import Array, Odometry, Scan
 
-__all__ = ["EXACT_COV", "Apart", "Start"]
+__all__ = ["EXACT_COV", "Apart", "Start", "without_start"]
 
 EXACT_COV = 1e-8 * np.eye(3)
 """Of the start of a robot that maps alone."""
 
+_LEAST = 1e-10  # eigenvalue of a covariance [m², rad²]
 _LOOSER = 100.0  # in covariance
 _EVERY, _FIRST = 50, 10  # scans between two looks for the others, and before the first: some start side by side
 
@@ -38,6 +39,33 @@ class Start(NamedTuple):
 
     pose: Array  # (3,)
     cov: Array  # (3, 3)
+
+    @property
+    def frame_cov(self) -> Array:
+        """Σ ``(3, 3)`` of the frame that a robot maps in which takes this start for exact, in that of all."""
+        by_start, _ = compose_jacobians(self.pose, inverse(self.pose))
+        cov: Array = by_start @ self.cov @ by_start.T
+        return cov
+
+
+def without_start(account: Account, start: Start) -> Account:
+    """Return an account as it would be had the robot known where it started: less what all in it have in common.
+
+    Where another map says where that is, the start's own covariance tells nothing more, and is as wide as it was
+    believed to be, however well the maps agree.
+    """
+    by_frame = _by_frame(account.pose, account.points, account.walls)
+    values, axes = np.linalg.eigh(account.cov - by_frame @ start.frame_cov @ by_frame.T)
+    return replace(account, cov=(axes * np.maximum(values, _LEAST)) @ axes.T)  # it is linear but nearly
+
+
+def _by_frame(pose: Array, points: Array, walls: Array) -> Array:
+    """Return the Jacobian ``(3 + 2n + 2k, 3)`` of pose, points and walls by the frame that they are in."""
+    none = np.zeros(3)
+    return np.vstack([
+        pose_into(none, pose)[2], points_into(none, points)[2].reshape(-1, 3),
+        walls_into(none, walls)[2].reshape(-1, 3),
+    ])  # fmt: skip
 
 
 @dataclass(kw_only=True)
@@ -51,9 +79,7 @@ class Apart:
     @property
     def cov(self) -> Array:
         """Σ ``(3, 3)`` of the frame that it maps in, in that of all."""
-        by_start, _ = compose_jacobians(self.start.pose, inverse(self.start.pose))
-        cov: Array = by_start @ self.start.cov @ by_start.T
-        return cov
+        return self.start.frame_cov
 
     def keep(self, measured: Odometry | Scan) -> None:
         """Remember what is told to the filter; arrays may be someone's buffers."""
@@ -66,11 +92,7 @@ class Apart:
 
     def in_all(self, pose: Array, points: Array, walls: Array) -> Array:
         """Return what Σ adds to the covariance ``(3 + 2n + 2k,)`` squared of pose, points and walls."""
-        none = np.zeros(3)
-        by_frame = np.vstack([
-            pose_into(none, pose)[2], points_into(none, points)[2].reshape(-1, 3),
-            walls_into(none, walls)[2].reshape(-1, 3),
-        ])  # fmt: skip
+        by_frame = _by_frame(pose, points, walls)
         added: Array = by_frame @ self.cov @ by_frame.T
         return added
 

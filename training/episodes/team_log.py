@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from agents.base import Goal
 from mecanum_env.episode import score_map
+from mecanum_env.team.member import Member
 from mecanum_env.team.team import Team
 from slam.accounts.account import Account
 from slam.accounts.corners import settled
@@ -19,6 +20,7 @@ from slam.geometry import compose, inverse
 from slam.grids.occupancy import OccupancyGrid
 from slam.metrics import measures
 from slam.teams.alignment import align
+from slam.teams.apart import Start, without_start
 from slam.teams.fusion import MergedMap, fuse
 from slam.teams.merged_grid import Chart, MergedGrid
 from slam.types import Array
@@ -132,7 +134,7 @@ def team_landmarks(team: Team) -> MergedMap | None:
     if team.joint is not None:
         return None
     try:
-        accounts = [Account.of(k, team.time_s, team.members[k].backend) for k in frames]
+        accounts = [_account(team.members[k], team.time_s) for k in frames]
     except ValueError:
         return None
     alignments = []
@@ -149,6 +151,12 @@ def team_landmarks(team: Team) -> MergedMap | None:
         tied |= {one.a, one.b} if {one.a, one.b} & tied else set()
     kept = [one for one in found if one.a in tied]
     return fuse([account for account in accounts if account.robot in tied], kept)
+
+
+def _account(member: Member, time_s: float) -> Account:
+    """Return what a robot tells of its map, less what it does not know of its start, which the others' maps tell."""
+    account = Account.of(member.number, time_s, member.backend)
+    return account if member.start_cov is None else without_start(account, Start(member.start, member.start_cov))
 
 
 def _frames_known(team: Team) -> dict[int, Array]:

@@ -157,9 +157,9 @@ def test_maps_are_shared_by_those_that_know_their_frames(known: bool) -> None:
         assert np.allclose(b[:2], (9, 3), atol=0.05)
 
 
-@pytest.mark.parametrize("sigma", [0.0, 0.05])
-def test_frames_are_found_by_maps_and_are_the_true_ones(sigma: float) -> None:
-    starts = {"known_starts": sigma > 0.0, "start_sigma_m": sigma, "start_sigma_rad": 0.2 * sigma}
+@pytest.mark.parametrize(("sigma", "turn"), [(0.0, 0.0), (0.05, 0.01), (0.15, 0.01), (0.05, 0.04)])
+def test_frames_are_found_by_maps_and_are_the_true_ones(sigma: float, turn: float) -> None:
+    starts = {"known_starts": sigma > 0.0, "start_sigma_m": sigma, "start_sigma_rad": turn}
     team = Team(3, rooms="apartment", team=starts, config=ALL)
     observations = [o for o, _ in team.reset(seed=4)]
     drivers = [agents.make("nearest-frontier") for _ in team.members]

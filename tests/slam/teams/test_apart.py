@@ -6,8 +6,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import slam
+from slam.accounts.account import Account
 from slam.geometry import compose, inverse, wrap
-from slam.teams.apart import Apart, Start
+from slam.teams.apart import Apart, Start, without_start
 from slam.teams.centralised import JointEkf
 from slam.teams.frames import points_into, pose_into, walls_into
 from slam.types import Observations, Odometry
@@ -96,3 +98,22 @@ def test_joining_measures_again_what_was_measured() -> None:
     assert team.members[1].grid is team.grid
     assert np.linalg.norm(team.joint_pose_cov()[:3, 3:]) > 0.0
     assert len(team.members[0].belief.lines) == 4
+
+
+def test_an_account_without_its_start_is_that_of_one_who_knew_it() -> None:
+    """The invariant filter carries the start's covariance along: what is left is as though it had been exact."""
+    accounts, cov = [], np.diag([0.2, 0.1, 0.03]) ** 2
+    start = np.array([3.0, -2.0, 0.7])
+    for told in (1e-8 * np.eye(3), cov):
+        backend, draw = slam.make("invariant-ekf"), np.random.default_rng(1)
+        backend.reset(start, pose_cov=told)
+        for _ in range(20):
+            backend.predict(Odometry((0.3, 0.1, 0.2), 0.1))
+            seen = np.array([[2.0, 0.3], [3.0, -1.0], [4.0, 1.2]]) + 1e-3 * draw.standard_normal((3, 2))
+            backend.observe(Observations(seen, np.tile(np.diag([1e-4, 1e-5]), (3, 1, 1)), np.arange(3)))
+        accounts.append(Account.of(0, 0.0, backend))
+    exact, rough = accounts
+    found = without_start(rough, Start(start, cov))
+    scale = np.sqrt(np.diag(exact.cov))
+    assert np.abs((found.cov - exact.cov) / np.outer(scale, scale)).max() < 0.15
+    assert np.trace(rough.cov[3:, 3:]) > 5.0 * np.trace(found.cov[3:, 3:])
