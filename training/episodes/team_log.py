@@ -154,7 +154,7 @@ def team_landmarks(team: Team) -> MergedMap | None:
 
 
 def _account(member: Member, time_s: float) -> Account:
-    """Return what a robot tells of its map, less what it does not know of its start, which the others' maps tell."""
+    """Return what a robot tells of its map, less what it does not know of its start: the others tell that."""
     account = Account.of(member.number, time_s, member.backend)
     return account if member.start_cov is None else without_start(account, Start(member.start, member.start_cov))
 
