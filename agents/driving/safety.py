@@ -145,7 +145,7 @@ def safe_twist(
     near already must not come: -inf at first, and kept up here from step to step.
     """
     kin = _tamer_kin(twist)
-    map_now, _, scan_now, _ = body_gaps(np.zeros(3), pose, near, hits, guard)
+    map_now, scan_now = _gaps_at(0.0, 0.0, 0.0, pose, near, hits, guard)
     map_slack, scan_slack = _slack(map_now, map_gap, floors, 0), _slack(scan_now, guard.scan_gap_m, floors, 1)
     for k in range(len(kin)):
         candidate: Array = kin[k]
@@ -198,32 +198,38 @@ def body_gaps(
     tuple
         Gap to the map now, gap to the map ahead, gap to the scan now, gap to the scan ahead.
     """
-    rim, half = guard.rim, guard.half
     way = _braking_way(twist, guard)
     map_now = map_ahead = scan_now = scan_ahead = np.inf
-    heading = pose[2]
-    cos_b, sin_b = math.cos(heading), math.sin(heading)
     for k in range(_POSES):
-        x, y = way[k, 0], way[k, 1]
-        c, s = math.cos(way[k, 2]), math.sin(way[k, 2])
-        map_gap = np.inf
-        for i in range(rim.shape[0]):
-            bx, by = x + c * rim[i, 0] - s * rim[i, 1], y + s * rim[i, 0] + c * rim[i, 1]
-            wx, wy = pose[0] + cos_b * bx - sin_b * by, pose[1] + sin_b * bx + cos_b * by
-            map_gap = min(map_gap, clearance_at(near, wx, wy))
-        scan_gap = np.inf
-        for i in range(hits.shape[0]):
-            dx, dy = hits[i, 0] - x, hits[i, 1] - y
-            out_x = abs(c * dx + s * dy) - half[0]
-            out_y = abs(-s * dx + c * dy) - half[1]
-            out = max(out_x, out_y)
-            if out < scan_gap:  # few are: the root is taken for them alone
-                scan_gap = min(scan_gap, math.hypot(out_x, out_y) if out_x > 0.0 and out_y > 0.0 else out)
+        map_gap, scan_gap = _gaps_at(way[k, 0], way[k, 1], way[k, 2], pose, near, hits, guard)
         if k == 0:
             map_now, scan_now = map_gap, scan_gap
         else:
             map_ahead, scan_ahead = min(map_ahead, map_gap), min(scan_ahead, scan_gap)
     return map_now, map_ahead, scan_now, scan_ahead
+
+
+@njit(cache=True, nogil=True)
+def _gaps_at(
+    x: float, y: float, turned: float, pose: Array, near: LocalMap, hits: Array, guard: Guard
+) -> tuple[float, float]:
+    """Return gaps [m] to what the map and the scan show with the body at a pose in the body frame now."""
+    rim, half = guard.rim, guard.half
+    cos_b, sin_b = math.cos(pose[2]), math.sin(pose[2])
+    c, s = math.cos(turned), math.sin(turned)
+    map_gap = scan_gap = np.inf
+    for i in range(rim.shape[0]):
+        bx, by = x + c * rim[i, 0] - s * rim[i, 1], y + s * rim[i, 0] + c * rim[i, 1]
+        wx, wy = pose[0] + cos_b * bx - sin_b * by, pose[1] + sin_b * bx + cos_b * by
+        map_gap = min(map_gap, clearance_at(near, wx, wy))
+    for i in range(hits.shape[0]):
+        dx, dy = hits[i, 0] - x, hits[i, 1] - y
+        out_x = abs(c * dx + s * dy) - half[0]
+        out_y = abs(-s * dx + c * dy) - half[1]
+        out = max(out_x, out_y)
+        if out < scan_gap:  # few are: the root is taken for them alone
+            scan_gap = min(scan_gap, math.hypot(out_x, out_y) if out_x > 0.0 and out_y > 0.0 else out)
+    return map_gap, scan_gap
 
 
 @njit(cache=True, nogil=True)

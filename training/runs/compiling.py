@@ -14,7 +14,7 @@ __all__ = ["VARIABLE", "compiling_shown"]
 VARIABLE = "MECANUM_COMPILING"
 """The environment variable that keeps it quiet where it is 0."""
 
-_EPISODE = 220  # kernels of ours that an episode of `mecanum explore` runs
+_EPISODE = 250  # kernels of ours that an episode of `mecanum explore` runs
 _OURS = ("slam.", "mecanum_env.", "agents.", "training.")
 
 
