@@ -222,12 +222,14 @@ class Backend(abc.ABC):
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
         grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
         if self.key_scans.wants(x, y, theta):
-            ids, marks = self._landmarks_in_view()
-            self.key_scans.keep(np.array([x, y, theta]), scan, surface, ids, marks, self._end_variance())
+            self.key_scans.keep(
+                np.array([x, y, theta]), scan, surface, *self._landmarks_in_view(), ahead_m=offset,
+                variance=self._end_variance(),
+            )  # fmt: skip
 
-    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        """Return ids ``(k,)`` of the landmarks that the last scan showed, and ``(k, 3)`` as key scans keep."""
-        return np.zeros(0, np.int64), np.zeros((0, 3))
+    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """Return ids ``(k,)`` of what the last scan showed, marks and covariance as key scans take them."""
+        return np.zeros(0, np.int64), np.zeros((0, 3)), self.pose_cov
 
     # ---- health ------------------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig
 from slam.belief import Belief
-from slam.gaussian.joint_gaussian import ANYWHERE_COV, OBSERVED_LIMIT
+from slam.gaussian.joint_gaussian import ANYWHERE_COV, OBSERVED_LIMIT, state_rows
 from slam.geometry import rotation
 from slam.landmark_backend import LandmarkBackend, observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED
@@ -325,6 +325,10 @@ class FastSlam(LandmarkBackend):
     @property
     def _points(self) -> Array:
         return self._landmark_moments()[0]
+
+    def _cov_with(self, rows: Indices) -> Array:
+        states = state_rows(rows, robot=True)
+        return self._inherited.cov[np.ix_(states, states)]
 
     @property
     def ancestors(self) -> int:

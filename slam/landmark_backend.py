@@ -91,8 +91,13 @@ class LandmarkBackend(Backend):
         marks = marks[marks[:, 0] != LINE]
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
-    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array]:
-        return self._book.just_seen(self._points)
+    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array, Array]:
+        rows, ids, marks = self._book.just_seen(self._points)
+        return ids, marks, self._cov_with(rows)
+
+    @abc.abstractmethod
+    def _cov_with(self, rows: NDArray[np.int64]) -> Array:
+        """Return the covariance ``(3 + 2k, 3 + 2k)`` of the pose and some of the book's landmarks."""
 
     def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""

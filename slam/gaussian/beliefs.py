@@ -60,9 +60,12 @@ class GaussianBackend(LandmarkBackend):
 
     def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         """Return the covariance of the robot and some landmarks."""
-        rows = joint.state_rows(landmarks, robot=True)
-        out = np.empty((len(rows), len(rows)))
-        joint.read_block(self._p, rows, out)
+        return self._cov_with(landmarks)
+
+    def _cov_with(self, rows: NDArray[np.int64]) -> Array:
+        states = joint.state_rows(rows, robot=True)
+        out = np.empty((len(states), len(states)))
+        joint.read_block(self._p, states, out)
         return out
 
     def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:

@@ -1,10 +1,10 @@
 """Key scans: what the map is redrawn from when the filter corrects the past.
 
 A grid is drawn from poses that the filter later corrects. Each key scan therefore hangs on the landmarks that
-were seen with it, points and walls: where those have moved, the scan's pose moves along (least squares over
-SE(2)), and once a key scan would be drawn more than half a cell from where it was, the map is redrawn from all of
-them. So a closed loop mends the map instead of doubling its walls. What the landmarks of a scan leave open, as the
-way along a single wall, follows the scan before it.
+were seen with it, points and walls: where those have moved, the scan's pose moves by as much as their covariance
+with it, when it was taken, says (docs/reference/occupancy.md). Once a key scan would be drawn more than half a
+cell from where it was, the map is redrawn from all of them. So a closed loop mends the map instead of doubling its
+walls. What the landmarks of a scan leave open, as the way along a single wall, follows the scan before it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _ANCHORS = 12  # landmarks that a key scan hangs on, at most
 
 _RECENT = 100  # key scans, some 20 m of way
 
-# How well a key scan hangs on what: weights are σ⁻², σ in m and rad.
-_POINT = 0.02**-2  # a point, or how far off a wall is
-_TURN = 0.005**-2  # the direction of a wall
-_NEIGHBOUR_SHIFT, _NEIGHBOUR_TURN = 0.1**-2, 0.02**-2  # what moved the key scan before it
+_PASSES = 10  # two where no landmark is gone, mostly
+
+# Variances [m², rad²] of the way from the key scan before.
+_STEP_SHIFT, _STEP_TURN = 0.01**2, 0.0025**2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,10 +51,12 @@ class KeyScans:
     def __init__(self, config: KeyScanConfig | None = None) -> None:
         self.config = config or KeyScanConfig()
         self._scans: list[tuple[Scan, NDArray[np.int16]]] = []
-        self._poses = np.zeros((64, 3))  # of the sensor, as last drawn
+        self._poses = np.zeros((64, 3))  # of the sensor, as last drawn …
+        self._kept = np.zeros((64, 3))  # … and as believed when the scan was taken
         self._variances = np.zeros(64)  # [m²] of where the beams ended, when the scan was taken
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
+        self._gains = np.zeros((64, 3, 6 + 2 * _ANCHORS))  # K, (I - K) G J and (I - K) G
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
         self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
@@ -90,20 +92,20 @@ class KeyScans:
 
     def keep(
         self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array,
-        variance: float = 0.0,
+        cov: Array, *, ahead_m: float = 0.0, variance: float = 0.0,
     ) -> None:  # fmt: skip
         """Keep a scan, and what was seen with it.
 
-        ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as it is now, or α, r, 1 of a wall.
-        ``variance`` [m²] is that of where its beams ended.
+        ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as it is now, or α, r, 1 of a wall;
+        ``cov`` ``(3 + 2k, 3 + 2k)`` is the covariance of the body's pose and theirs, the sensor being ``ahead_m``
+        ahead of the body's centre. ``variance`` [m²] is that of where the beams ended.
         """
         n = len(self._scans)
         if n == len(self._poses):
-            self._poses = np.vstack([self._poses, np.zeros_like(self._poses)])
-            self._variances = np.concatenate([self._variances, np.zeros_like(self._variances)])
-            self._anchor_ids = np.vstack([self._anchor_ids, np.full_like(self._anchor_ids, -1)])
-            self._anchor_local = np.vstack([self._anchor_local, np.zeros_like(self._anchor_local)])
-        _hang(sensor_pose, ids, marks, n, self._poses, self._anchor_ids, self._anchor_local)
+            for name in ("_poses", "_kept", "_variances", "_anchor_ids", "_anchor_local", "_gains"):
+                setattr(self, name, np.concatenate([getattr(self, name), np.zeros_like(getattr(self, name))]))
+        self._poses[n] = self._kept[n] = sensor_pose
+        _hang(sensor_pose, ids, marks, cov, ahead_m, self._anchor_ids[n], self._anchor_local[n], self._gains[n])
         self._variances[n] = variance
         self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan.kept(), surface.copy()))
@@ -142,8 +144,8 @@ class KeyScans:
         self._since_check = 0
         corrected = np.empty((n, 3))
         largest = _corrected_poses(
-            self._poses[:n], self._anchor_ids, self._anchor_local, landmarks, row_of_id, self.config.lever_m,
-            corrected,
+            self._kept[:n], self._poses[:n], self._anchor_ids, self._anchor_local, self._gains, landmarks,
+            row_of_id, self.config.lever_m, corrected,
         )  # fmt: skip
         return corrected, largest
 
@@ -152,7 +154,6 @@ class KeyScans:
         n = len(poses)
         del self._scans[n:]
         self._poses[:n] = poses
-        self._anchor_ids[n:] = -1
         self._last = tuple(poses[-1].tolist()) if n else (0.0, 0.0, 0.0)
         grid.redraw(poses, self._scans)
 
@@ -165,85 +166,132 @@ def largest_shift(poses: Array, drawn: Array, lever_m: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
-    sensor_pose: Array, ids: NDArray[np.int64], marks: Array, n: int, poses: Array,
-    anchor_ids: NDArray[np.int64], anchor_local: Array,
+    sensor_pose: Array, ids: NDArray[np.int64], marks: Array, cov: Array, ahead_m: float,
+    anchor_ids: NDArray[np.int64], anchor_local: Array, gains: Array,
 ) -> None:  # fmt: skip
-    """Write the n-th key scan's pose, and its landmarks in that pose's frame."""
+    """Write a key scan's landmarks in its pose's frame, and how far it goes with the scan before and with them."""
+    count = min(ids.shape[0], anchor_ids.shape[0])
+    n = 3 + 2 * count
     x, y, theta = sensor_pose
-    poses[n, 0], poses[n, 1], poses[n, 2] = x, y, theta
     c, s = math.cos(theta), math.sin(theta)
-    for k in range(min(ids.shape[0], anchor_ids.shape[1])):
-        anchor_ids[n, k] = ids[k]
+    frame = np.eye(n)  # errors in the map → in this pose's frame
+    frame[0, 0], frame[0, 1], frame[1, 0], frame[1, 1] = c, s, -s, c
+    frame[1, 2] = ahead_m
+    moved = np.zeros((2 * count, 3))  # the marks by a motion of the frame
+    anchor_ids[:] = -1
+    for k in range(count):
+        anchor_ids[k] = ids[k]
         u, v, wall = marks[k]
-        anchor_local[n, k, 2] = wall
+        i = 3 + 2 * k
         if wall:
-            anchor_local[n, k, 0], anchor_local[n, k, 1] = u - theta, v - x * math.cos(u) - y * math.sin(u)
+            nx, ny = math.cos(u), math.sin(u)
+            local_u, local_v = u - theta, v - x * nx - y * ny
+            frame[i + 1, i] = x * ny - y * nx
+            moved[2 * k, 2] = 1.0
+            moved[2 * k + 1, 0], moved[2 * k + 1, 1] = math.cos(local_u), math.sin(local_u)
         else:
-            dx, dy = u - x, v - y
-            anchor_local[n, k, 0], anchor_local[n, k, 1] = c * dx + s * dy, -s * dx + c * dy
+            local_u, local_v = c * (u - x) + s * (v - y), c * (v - y) - s * (u - x)
+            frame[i, i], frame[i, i + 1], frame[i + 1, i], frame[i + 1, i + 1] = c, s, -s, c
+            moved[2 * k, 0] = moved[2 * k + 1, 1] = 1.0
+            moved[2 * k, 2], moved[2 * k + 1, 2] = -local_v, local_u
+        anchor_local[k, 0], anchor_local[k, 1], anchor_local[k, 2] = local_u, local_v, wall
+    p = frame @ cov[:n, :n].copy() @ frame.T
+    _sweep(p)
+    rest = p[:3, :3].copy()  # C: what the landmarks leave open
+    by_way = rest.copy()
+    by_way[0, 0] += _STEP_SHIFT
+    by_way[1, 1] += _STEP_SHIFT
+    by_way[2, 2] += _STEP_TURN
+    before = rest @ np.linalg.inv(by_way)
+    gain = (np.eye(3) - before) @ p[:3, 3:].copy()
+    gains[:, :3], gains[:, 3:6] = before, gain @ moved
+    gains[:, 6 : n + 3], gains[:, n + 3 :] = gain, 0.0
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def _sweep(p: Array) -> None:
+    """Turn the first three rows of a covariance (a, b) into those of C = P_aa − P_ab P_bb⁻¹ P_ba and P_ab P_bb⁻¹.
+
+    By the sweep operator (Beaton 1964), one state of b after the other.
+    """
+    n = p.shape[0]
+    for j in range(3, n):
+        pivot = p[j, j]
+        if not pivot > 1e-15:  # the others say all of it
+            for i in range(n):
+                p[i, j] = p[j, i] = 0.0
+            continue
+        for i in range(n):
+            if i < 3 or i > j:
+                share = p[i, j] / pivot
+                for q in range(n):
+                    p[i, q] -= share * p[j, q]
+                p[i, j] = share
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _corrected_poses(
-    poses: Array, ids: NDArray[np.int64], local: Array, landmarks: Array, row_of_id: NDArray[np.int64],
-    lever: float, out: Array,
+    kept: Array, drawn: Array, ids: NDArray[np.int64], local: Array, gains: Array, landmarks: Array,
+    row_of_id: NDArray[np.int64], lever: float, out: Array,
 ) -> float:  # fmt: skip
-    """Write each key scan's pose as its landmarks now have it; return the largest shift [m]."""
-    normals = np.empty((landmarks.shape[0], 2))  # of those that are walls
-    for i in range(landmarks.shape[0]):
-        normals[i, 0], normals[i, 1] = math.cos(landmarks[i, 0]), math.sin(landmarks[i, 0])
+    """Write each key scan's pose as its landmarks now have it; return the largest shift [m] from where it is."""
     largest = 0.0
-    shift_x = shift_y = turn = 0.0  # of the scan before
-    for k in range(poses.shape[0]):
-        expected = poses[k, 0] + shift_x, poses[k, 1] + shift_y, poses[k, 2] + turn
-        x, y, theta = expected
-        for _ in range(2):  # Gauss-Newton; turns are small
-            dx, dy, dt = _step(x, y, theta, expected, k, ids, local, landmarks, normals, row_of_id)
-            x, y, theta = x + dx, y + dy, theta + dt
-        shift_x, shift_y, turn = x - poses[k, 0], y - poses[k, 1], theta - poses[k, 2]
-        out[k, 0], out[k, 1], out[k, 2] = x, y, wrap_scalar(theta)
-        largest = max(largest, math.hypot(shift_x, shift_y) + abs(turn) * lever)
+    before = np.zeros(3)  # motion of the scan before, as the k-th one's own frame has it, and of the k-th itself
+    motion = np.zeros(3)
+    for k in range(kept.shape[0]):
+        x, y, theta = kept[k]
+        c, s = math.cos(theta), math.sin(theta)
+        if k:
+            turn = wrap_scalar(out[k - 1, 2] - kept[k - 1, 2])
+            ct, st = math.cos(turn), math.sin(turn)
+            dx, dy = x - kept[k - 1, 0], y - kept[k - 1, 1]
+            dx, dy = out[k - 1, 0] + ct * dx - st * dy - x, out[k - 1, 1] + st * dx + ct * dy - y
+            before[0], before[1], before[2] = c * dx + s * dy, c * dy - s * dx, turn
+        for i in range(3):
+            motion[i] = before[i]
+        for _ in range(_PASSES):
+            ahead, left, turn = _moved(kept[k], before, motion, ids[k], local[k], gains[k], landmarks, row_of_id)
+            off = abs(ahead - motion[0]) + abs(left - motion[1]) + abs(turn - motion[2])
+            motion[0], motion[1], motion[2] = ahead, left, turn
+            if off < 1e-4:
+                break
+        out[k, 0], out[k, 1] = x + c * motion[0] - s * motion[1], y + s * motion[0] + c * motion[1]
+        out[k, 2] = wrap_scalar(theta + motion[2])
+        shift = math.hypot(out[k, 0] - drawn[k, 0], out[k, 1] - drawn[k, 1])
+        largest = max(largest, shift + abs(wrap_scalar(out[k, 2] - drawn[k, 2])) * lever)
     return largest
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
-def _step(
-    x: float, y: float, theta: float, expected: tuple[float, float, float], k: int, ids: NDArray[np.int64],
-    local: Array, landmarks: Array, normals: Array, row_of_id: NDArray[np.int64],
+def _moved(
+    kept: Array, before: Array, motion: Array, ids: NDArray[np.int64], local: Array, gain: Array, landmarks: Array,
+    row_of_id: NDArray[np.int64],
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return the step from the k-th key scan's pose to where its landmarks, and the scan before it, want it."""
+    """Return how a key scan moves, linearised about a motion with which landmarks that are gone go along."""
+    c, s = math.cos(kept[2]), math.sin(kept[2])
+    x, y = kept[0] + c * motion[0] - s * motion[1], kept[1] + s * motion[0] + c * motion[1]
+    theta, ct, st = kept[2] + motion[2], math.cos(motion[2]), math.sin(motion[2])
     c, s = math.cos(theta), math.sin(theta)
-    # The normal equations' upper triangle and right-hand side, at first of the scan before it alone.
-    xx = yy = _NEIGHBOUR_SHIFT
-    tt = _NEIGHBOUR_TURN
-    xy = xt = yt = 0.0
-    bx, by, bt = xx * (expected[0] - x), yy * (expected[1] - y), tt * (expected[2] - theta)
-    for a in range(ids.shape[1]):
-        row = row_of_id[ids[k, a]] if ids[k, a] >= 0 else -1
+    ahead = left = turn = 0.0
+    for a in range(ids.shape[0]):
+        row = row_of_id[ids[a]] if ids[a] >= 0 else -1
         if row < 0:
             continue
-        u, v, local_u, local_v = landmarks[row, 0], landmarks[row, 1], local[k, a, 0], local[k, a, 1]
-        if local[k, a, 2]:
-            nx, ny = normals[row, 0], normals[row, 1]
-            turn = wrap_scalar(u - theta - local_u)
-            if abs(turn) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
-                u, v, turn = u + math.pi, -v, wrap_scalar(turn + math.pi)
-                nx, ny = math.cos(u), math.sin(u)
-            off = v - nx * x - ny * y - local_v
-            xx, xy, yy = xx + _POINT * nx * nx, xy + _POINT * nx * ny, yy + _POINT * ny * ny
-            bx, by = bx + _POINT * nx * off, by + _POINT * ny * off
-            tt, bt = tt + _TURN, bt + _TURN * turn
+        u, v = landmarks[row, 0], landmarks[row, 1]
+        if local[a, 2]:
+            du = wrap_scalar(u - theta - local[a, 0])
+            if abs(du) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
+                u, v, du = u + math.pi, -v, wrap_scalar(du + math.pi)
+            dv = v - math.cos(u) * x - math.sin(u) * y - local[a, 1]
         else:
-            px, py = c * local_u - s * local_v, s * local_u + c * local_v
-            ex, ey = u - x - px, v - y - py
-            xx, yy, tt = xx + _POINT, yy + _POINT, tt + _POINT * (px * px + py * py)
-            xt, yt = xt - _POINT * py, yt + _POINT * px
-            bx, by, bt = bx + _POINT * ex, by + _POINT * ey, bt + _POINT * (px * ey - py * ex)
-    # Solved by elimination of x and then y; the matrix is positive definite.
-    f, g = xy / xx, xt / xx
-    yy, yt, by = yy - f * xy, yt - f * xt, by - f * bx
-    tt, bt = tt - g * xt, bt - g * bx
-    h = yt / yy
-    turn = (bt - h * by) / (tt - h * yt)
-    dy = (by - yt * turn) / yy
-    return (bx - xy * dy - xt * turn) / xx, dy, turn
+            du, dv = c * (u - x) + s * (v - y) - local[a, 0], c * (v - y) - s * (u - x) - local[a, 1]
+        i = 6 + 2 * a
+        ahead += gain[0, i] * du + gain[0, i + 1] * dv
+        left += gain[1, i] * du + gain[1, i + 1] * dv
+        turn += gain[2, i] * du + gain[2, i + 1] * dv
+    ahead, left = ct * ahead - st * left, st * ahead + ct * left  # so far in the moved frame
+    for i in range(3):
+        ahead += gain[0, i] * before[i] + gain[0, 3 + i] * motion[i]
+        left += gain[1, i] * before[i] + gain[1, 3 + i] * motion[i]
+        turn += gain[2, i] * before[i] + gain[2, 3 + i] * motion[i]
+    return ahead, left, turn

@@ -134,7 +134,7 @@ def test_the_landmarks_just_seen_are_those_of_the_last_update() -> None:
         match = rng.choice(50, 9, replace=False) - 10
         book.count_sightings(match)
         rows = np.array([r for r in sorted(match.tolist()) if r >= 0], np.int64)
-        ids, seen = book.just_seen(points)
+        _, ids, seen = book.just_seen(points)
         np.testing.assert_array_equal(ids, 3 * rows)
         np.testing.assert_array_equal(seen[:, :2], points[rows])
         np.testing.assert_array_equal(seen[:, 2], rows % 5 == 0)
