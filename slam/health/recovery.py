@@ -7,8 +7,9 @@ nothing is written any more until a place is found that explains several scans i
 row no longer speak against where the wheels have it: it was the map that was wrong, or the robot has come to where
 there is none, or where no scan can say anything. Buildings repeat themselves, so from there no other place is
 looked for on the whole map, and one that is found there must explain the scan far better than the believed one. A
-scan that fits for the most part right beside the belief does not give it up, either: where the robot comes back to
-a map that has drifted, it is a little off. Scans that agree with the map cost one look at them and nothing else.
+scan that fits for the most part right beside the belief does not give it up at once: where the robot comes back to
+a map that has drifted, it is a little off, and landmarks put that right. Scans that agree with the map cost one
+look at them and nothing else.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ class Recovery:
         self.monitor.restart(1.0 - self.config.lost_per_scan)
         self.lost = False
         self.times_lost = self.relocalisations = self.scans_lost = 0
+        self._waited = 0  # scans for which it would have been given up, but for a place right beside
         self.kept: Any = None  # what the backend was before the first doubtful scan of a row
         self._relocaliser: Relocaliser | None = None
         self._trail: _Trail | None = None
@@ -91,9 +93,13 @@ class Recovery:
         return self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
 
     def gone(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
-        """Tell whether the belief is to be given up: it contradicts the scans, and not by a little."""
+        """Tell whether the belief is to be given up: it contradicts the scans by more than a little, or for long."""
         if self.monitor.fine >= self.config.give_up:
+            self._waited = 0
             return False
+        self._waited += 1
+        if self._waited > self._relocalisation.patience:
+            return True
         return not self._beside(Relocaliser(self._relocalisation, grid, self._offset_m), body, scan)
 
     def _beside(self, relocaliser: Relocaliser, body: Array, scan: Scan) -> bool:
@@ -110,7 +116,7 @@ class Recovery:
         self.lost = True
         self.times_lost += 1
         self.kept, self._relocaliser, self._trail = None, None, None
-        self._searched = self._unopposed = self._silent = 0
+        self._waited = self._searched = self._unopposed = self._silent = 0
         self._searched_from: Array | None = None  # where the wheels had it when all of the map was last searched
 
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:

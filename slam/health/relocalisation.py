@@ -53,7 +53,8 @@ class RelocalisationConfig(Config):
     # has drifted explains a scan worse than it should, and buildings repeat themselves.
     far_margin: Share = 0.35
     beside_m: Gap = 0.25  # how far off that is beside, …
-    mostly: Share = 0.5  # … and the quality from which on it says that the robot is no longer lost
+    mostly: Share = 0.5  # … and the quality from which on it says that the robot is no longer lost, or not yet …
+    patience: Count = 3  # … for so many scans: a belief that nothing corrects meanwhile is wrong
     # Around the last known pose, one after the other, …
     radii_m: Annotated[tuple[float, ...], Within("(0, inf]")] = (1.5, 4.0, math.inf)
     # … for so many scans, the last one until it is found.

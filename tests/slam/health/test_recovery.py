@@ -90,6 +90,20 @@ def test_a_drawing_from_unsure_poses_says_nothing_against_a_sure_one(
         assert not backend._doubtful  # it is drawn anew meanwhile
 
 
+def test_a_belief_that_is_wrong_sure_and_corrected_by_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scans fit the map right beside it, but its covariance lets nothing move it there."""
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    assert isinstance(backend, EkfSlam)
+    monkeypatch.setattr(backend, "_features", lambda scan: np.zeros((0, 12)))
+    backend._x[:3] = compose(backend._x[:3], np.array([0.1, 0.08, 0.12]))
+    for _ in range(40):
+        env.step(np.zeros(3, np.float32))
+    assert backend.recovery.times_lost == 1 and backend.health > 0.9
+    off = backend.pose - env.truth.pose
+    assert np.hypot(*off[:2]) < 0.04 and abs(off[2]) < 0.02
+
+
 @pytest.mark.parametrize("name", ["ekf", "invariant-ekf"])
 def test_where_no_landmark_is_in_sight_the_drawn_map_puts_the_pose_right(
     name: str, monkeypatch: pytest.MonkeyPatch

@@ -273,8 +273,8 @@ def test_two_robots_map_one_room_once() -> None:
 
 def test_where_the_map_moves_all_robots_scans_move_along() -> None:
     team = JointEkf(2, CONFIG)
-    start = compose(inverse(np.array([2.0, 2.0, 0.3])), np.array([4.0, 3.0, -1.2]))
-    team.reset([np.zeros(3), start], np.tile(np.diag([0.05, 0.05, 0.01]) ** 2, (2, 1, 1)))
+    starts = [np.zeros(3), compose(inverse(np.array([2.0, 2.0, 0.3])), np.array([4.0, 3.0, -1.2]))]
+    team.reset(starts, np.tile(np.diag([0.05, 0.05, 0.01]) ** 2, (2, 1, 1)))
     rooms(team, 40, np.random.default_rng(2))
     member = team.members[1]
     assert not member._redraw_if_moved()
@@ -288,9 +288,8 @@ def test_where_the_map_moves_all_robots_scans_move_along() -> None:
     assert team.grid.revision > revision
     for member, poses in zip(team.members, before, strict=True):
         assert len(poses) > 2
-        np.testing.assert_allclose(
-            member.key_scans.poses - poses, np.tile([0.1, 0, 0], (len(poses), 1)), atol=0.02
-        )
+        want = np.tile([0.1, 0, 0], (len(poses), 1))
+        np.testing.assert_allclose(member.key_scans.poses - poses, want, atol=0.02)
     assert not member._redraw_if_moved()
 
 
