@@ -63,10 +63,7 @@ class GaussianBackend(LandmarkBackend):
         return self._cov_with(landmarks)
 
     def _cov_with(self, rows: NDArray[np.int64]) -> Array:
-        states = joint.state_rows(rows, robot=True)
-        out = np.empty((len(states), len(states)))
-        joint.read_block(self._p, states, out)
-        return out
+        return joint.with_robot(self._p, rows)
 
     def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
         """Return the covariances ``(n, 2, 2)`` of some landmarks, each by itself."""

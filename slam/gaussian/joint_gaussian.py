@@ -29,6 +29,7 @@ __all__ = [
     "read_block",
     "state_rows",
     "symmetric_block",
+    "with_robot",
 ]
 
 OBSERVED_LIMIT = 1e4
@@ -165,6 +166,19 @@ def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -
         for q in range(5):
             out[j, q] = min(max(out[j, q], -OBSERVED_LIMIT), OBSERVED_LIMIT)
         out[j, 5] = 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def with_robot(p: Array, landmarks: NDArray[np.int64]) -> Array:
+    """Return the covariance ``(3 + 2k, 3 + 2k)`` of the robot and these landmarks; p is an upper triangle."""
+    rows = np.empty(3 + 2 * len(landmarks), np.int64)
+    for i in range(3):
+        rows[i] = i
+    for k in range(len(landmarks)):
+        rows[3 + 2 * k], rows[4 + 2 * k] = 3 + 2 * landmarks[k], 4 + 2 * landmarks[k]
+    out = np.empty((len(rows), len(rows)))
+    read_block(p, rows, out)
+    return out
 
 
 def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:

@@ -25,11 +25,11 @@ from slam.types import Array, Scan
 
 __all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
 
-_ANCHORS = 12  # landmarks that a key scan hangs on, at most
+_ANCHORS = 8  # landmarks that a key scan hangs on, at most
 
 _RECENT = 100  # key scans, some 20 m of way
 
-_PASSES = 10  # two where no landmark is gone, mostly
+_PASSES = 10  # one where little has moved, two where no landmark is gone, mostly
 
 # Variances [m², rad²] of the way from the key scan before.
 _STEP_SHIFT, _STEP_TURN = 0.01**2, 0.0025**2
@@ -56,7 +56,9 @@ class KeyScans:
         self._variances = np.zeros(64)  # [m²] of where the beams ended, when the scan was taken
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
-        self._gains = np.zeros((64, 3, 6 + 2 * _ANCHORS))  # K, (I - K) G J and (I - K) G
+        self._gains = np.zeros(
+            (64, 3, 6 + 2 * _ANCHORS)
+        )  # by the scan before, by all that goes along, by each landmark
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
         self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
@@ -174,43 +176,68 @@ def _hang(
     n = 3 + 2 * count
     x, y, theta = sensor_pose
     c, s = math.cos(theta), math.sin(theta)
-    frame = np.eye(n)  # errors in the map → in this pose's frame
-    frame[0, 0], frame[0, 1], frame[1, 0], frame[1, 1] = c, s, -s, c
-    frame[1, 2] = ahead_m
+    p = np.empty((n + 3, n + 3))  # of errors in the map, soon of those in this pose's frame
+    for i in range(n):
+        for j in range(n):
+            p[i, j] = cov[i, j]
+    _turn(p, n, 0, c, s)
+    _add(p, n, 1, 2, ahead_m)
     moved = np.zeros((2 * count, 3))  # the marks by a motion of the frame
     anchor_ids[:] = -1
     for k in range(count):
         anchor_ids[k] = ids[k]
         u, v, wall = marks[k]
-        i = 3 + 2 * k
         if wall:
             nx, ny = math.cos(u), math.sin(u)
             local_u, local_v = u - theta, v - x * nx - y * ny
-            frame[i + 1, i] = x * ny - y * nx
+            _add(p, n, 4 + 2 * k, 3 + 2 * k, x * ny - y * nx)
             moved[2 * k, 2] = 1.0
             moved[2 * k + 1, 0], moved[2 * k + 1, 1] = math.cos(local_u), math.sin(local_u)
         else:
             local_u, local_v = c * (u - x) + s * (v - y), c * (v - y) - s * (u - x)
-            frame[i, i], frame[i, i + 1], frame[i + 1, i], frame[i + 1, i + 1] = c, s, -s, c
+            _turn(p, n, 3 + 2 * k, c, s)
             moved[2 * k, 0] = moved[2 * k + 1, 1] = 1.0
             moved[2 * k, 2], moved[2 * k + 1, 2] = -local_v, local_u
         anchor_local[k, 0], anchor_local[k, 1], anchor_local[k, 2] = local_u, local_v, wall
-    p = frame @ cov[:n, :n].copy() @ frame.T
+    # One more: the scan before goes where this one goes, but for the way from it.
+    for i in range(3):
+        for j in range(n):
+            p[n + i, j] = p[j, n + i] = p[i, j]
+        for j in range(3):
+            p[n + i, n + j] = p[i, j]
+        p[n + i, n + i] += _STEP_TURN if i == 2 else _STEP_SHIFT
     _sweep(p)
-    rest = p[:3, :3].copy()  # C: what the landmarks leave open
-    by_way = rest.copy()
-    by_way[0, 0] += _STEP_SHIFT
-    by_way[1, 1] += _STEP_SHIFT
-    by_way[2, 2] += _STEP_TURN
-    before = rest @ np.linalg.inv(by_way)
-    gain = (np.eye(3) - before) @ p[:3, 3:].copy()
-    gains[:, :3], gains[:, 3:6] = before, gain @ moved
-    gains[:, 6 : n + 3], gains[:, n + 3 :] = gain, 0.0
+    for i in range(3):
+        for j in range(3):
+            gains[i, j] = p[i, n + j]
+            along = 0.0
+            for k in range(2 * count):
+                along += p[i, 3 + k] * moved[k, j]
+            gains[i, 3 + j] = along
+        gains[i, 6 : n + 3], gains[i, n + 3 :] = p[i, 3:n], 0.0
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def _turn(p: Array, n: int, i: int, c: float, s: float) -> None:
+    """Turn the vector of states i and i + 1, of n of a covariance, into a frame turned by (cos, sin)."""
+    for j in range(n):
+        p[i, j], p[i + 1, j] = c * p[i, j] + s * p[i + 1, j], c * p[i + 1, j] - s * p[i, j]
+    for j in range(n):
+        p[j, i], p[j, i + 1] = c * p[j, i] + s * p[j, i + 1], c * p[j, i + 1] - s * p[j, i]
+
+
+@njit(nogil=True, error_model="numpy", forceinline=True)
+def _add(p: Array, n: int, i: int, j: int, times: float) -> None:
+    """Add a multiple of state j, of n of a covariance, to state i."""
+    for k in range(n):
+        p[i, k] += times * p[j, k]
+    for k in range(n):
+        p[k, i] += times * p[k, j]
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def _sweep(p: Array) -> None:
-    """Turn the first three rows of a covariance (a, b) into those of C = P_aa − P_ab P_bb⁻¹ P_ba and P_ab P_bb⁻¹.
+    """Turn the first three rows of a covariance of (a, b) into those of P_aa − P_ab P_bb⁻¹ P_ba and P_ab P_bb⁻¹.
 
     By the sweep operator (Beaton 1964), one state of b after the other.
     """
@@ -235,6 +262,9 @@ def _corrected_poses(
     row_of_id: NDArray[np.int64], lever: float, out: Array,
 ) -> float:  # fmt: skip
     """Write each key scan's pose as its landmarks now have it; return the largest shift [m] from where it is."""
+    normals = np.empty((landmarks.shape[0], 2))  # of those that are walls
+    for i in range(landmarks.shape[0]):
+        normals[i, 0], normals[i, 1] = math.cos(landmarks[i, 0]), math.sin(landmarks[i, 0])
     largest = 0.0
     before = np.zeros(3)  # motion of the scan before, as the k-th one's own frame has it, and of the k-th itself
     motion = np.zeros(3)
@@ -250,10 +280,12 @@ def _corrected_poses(
         for i in range(3):
             motion[i] = before[i]
         for _ in range(_PASSES):
-            ahead, left, turn = _moved(kept[k], before, motion, ids[k], local[k], gains[k], landmarks, row_of_id)
+            ahead, left, turn = _moved(
+                kept[k], before, motion, ids[k], local[k], gains[k], landmarks, normals, row_of_id
+            )  # fmt: skip
             off = abs(ahead - motion[0]) + abs(left - motion[1]) + abs(turn - motion[2])
             motion[0], motion[1], motion[2] = ahead, left, turn
-            if off < 1e-4:
+            if off < 5e-4:
                 break
         out[k, 0], out[k, 1] = x + c * motion[0] - s * motion[1], y + s * motion[0] + c * motion[1]
         out[k, 2] = wrap_scalar(theta + motion[2])
@@ -265,7 +297,7 @@ def _corrected_poses(
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def _moved(
     kept: Array, before: Array, motion: Array, ids: NDArray[np.int64], local: Array, gain: Array, landmarks: Array,
-    row_of_id: NDArray[np.int64],
+    normals: Array, row_of_id: NDArray[np.int64],
 ) -> tuple[float, float, float]:  # fmt: skip
     """Return how a key scan moves, linearised about a motion with which landmarks that are gone go along."""
     c, s = math.cos(kept[2]), math.sin(kept[2])
@@ -279,10 +311,10 @@ def _moved(
             continue
         u, v = landmarks[row, 0], landmarks[row, 1]
         if local[a, 2]:
-            du = wrap_scalar(u - theta - local[a, 0])
+            du, dv = wrap_scalar(u - theta - local[a, 0]), v - normals[row, 0] * x - normals[row, 1] * y
             if abs(du) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
-                u, v, du = u + math.pi, -v, wrap_scalar(du + math.pi)
-            dv = v - math.cos(u) * x - math.sin(u) * y - local[a, 1]
+                du, dv = wrap_scalar(du + math.pi), -dv
+            dv -= local[a, 1]
         else:
             du, dv = c * (u - x) + s * (v - y) - local[a, 0], c * (v - y) - s * (u - x) - local[a, 1]
         i = 6 + 2 * a

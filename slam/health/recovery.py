@@ -93,7 +93,7 @@ class Recovery:
         return self.monitor.doubtful(self.look(grid, (x, y, theta), scan))
 
     def gone(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
-        """Tell whether the belief is to be given up: it contradicts the scans by more than a little, or for long."""
+        """Tell whether the belief is to be given up: it contradicts the scans, and not by a little or for long."""
         if self.monitor.fine >= self.config.give_up:
             self._waited = 0
             return False
