@@ -26,26 +26,27 @@ unexport PYTHONDONTWRITEBYTECODE
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
+# Python compiles what it imports, and most of what is installed is never imported: --no-compile.
 # A stamp's file date says whether what it stands for is older than what it was made from.
 $(VENV)/core.stamp: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e .
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e .
 	@touch $@
 
 $(VENV)/test.stamp: $(VENV)/core.stamp
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[test,train,multi,human,video,ros,rerun,ray,parquet,docs,release]'
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[test,train,multi,human,video,ros,rerun,ray,parquet,docs,release]'
 	@touch $@
 
 $(OTHER).stamp: $(VENV)/test.stamp
 	rm -rf $(OTHER)
-	$(BIN)/python -m pip install --quiet --no-deps --target $(OTHER) gymnasium==$(OTHER_GYMNASIUM)
+	$(BIN)/python -m pip install --quiet --no-compile --no-deps --target $(OTHER) gymnasium==$(OTHER_GYMNASIUM)
 	@touch $@
 
 # RLlib pins the oldest Gymnasium, so it cannot share an environment with the newest: all other versions stay.
 $(RLLIB).stamp: pyproject.toml constraints.txt
 	test -x $(RLLIB)/bin/python || $(PYTHON) -m venv $(RLLIB)
 	grep -v '^gymnasium==' constraints.txt > $(RLLIB)/constraints.txt
-	$(RLLIB)/bin/python -m pip install --quiet -c $(RLLIB)/constraints.txt -e '.[rllib,test]'
+	$(RLLIB)/bin/python -m pip install --quiet --no-compile -c $(RLLIB)/constraints.txt -e '.[rllib,test]'
 	@touch $@
 
 install: $(VENV)/core.stamp ## install the core into .venv
@@ -77,14 +78,15 @@ lint: $(VENV)/test.stamp ## ruff
 types: $(VENV)/test.stamp ## mypy
 	$(BIN)/mypy
 
+# A file's tests run in one process: two would compile its kernels at the same time.
 pytest: $(VENV)/test.stamp ## the tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 # The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
 other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
-	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) $(API_TESTS)
+	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(API_TESTS)
 
 # After the tests: it takes over the kernels that they have compiled.
 package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and exploring
@@ -94,11 +96,11 @@ rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in
 	$(RLLIB)/bin/python -m pytest tests/examples -k rllib
 
 online: $(VENV)/test.stamp ## the tests of --wandb and hf://, offline all the same (not in CI: large)
-	$(BIN)/python -m pip install --quiet -e '.[hub,wandb]'
+	$(BIN)/python -m pip install --quiet --no-compile -e '.[hub,wandb]'
 	$(BIN)/python -m pytest tests/agents/learned/test_hub.py tests/training/learning/test_follow.py
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
-	$(BIN)/python -m pytest -n $(WORKERS) -m monte_carlo
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m monte_carlo
 
 evaluate: $(VENV)/core.stamp ## the table of docs/studies/estimators.md: 300 episodes on the test seeds
 	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate
