@@ -80,13 +80,13 @@ types: $(VENV)/test.stamp ## mypy
 
 # A file's tests run in one process: two would compile its kernels at the same time.
 pytest: $(VENV)/test.stamp ## the tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 # The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
 other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
-	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(API_TESTS)
+	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(API_TESTS)
 
 # After the tests: it takes over the kernels that they have compiled.
 package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and exploring
@@ -100,7 +100,7 @@ online: $(VENV)/test.stamp ## the tests of --wandb and hf://, offline all the sa
 	$(BIN)/python -m pytest tests/agents/learned/test_hub.py tests/training/learning/test_follow.py
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m monte_carlo
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m monte_carlo
 
 evaluate: $(VENV)/core.stamp ## the table of docs/studies/estimators.md: 300 episodes on the test seeds
 	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from mecanum_env.ground_truth import Coverage, GroundTruth, on_lattice
+from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import FREE, OccupancyGrid
 
@@ -50,9 +50,9 @@ class TeamCoverage:
         """Whether an update costs little: where frames differ, it goes over the whole map."""
         return self._shared
 
-    def update(self, robot: int, coverage: Coverage, grid: OccupancyGrid) -> None:
-        """Take over a robot's own grid, after its own ``coverage`` was updated."""
-        if self._cells is not None or coverage.changes is None:
+    def update(self, robot: int, changes: NDArray[np.int32] | None, grid: OccupancyGrid) -> None:
+        """Take over a robot's own grid, in which these cells have changed (see ``Coverage``), or any (None)."""
+        if self._cells is not None or changes is None:
             free = grid.classes() == FREE
             ground = self._frames[robot]
             layer = on_lattice(free, grid.lattice_origin, ground)
@@ -65,9 +65,7 @@ class TeamCoverage:
             self._covered = int(np.count_nonzero(self._counts))
         else:
             row0, col0 = self._ground.lattice_origin
-            self._covered += _mark(
-                coverage.changes, self._ground.mappable, row0, col0, self._layers[robot], self._counts
-            )
+            self._covered += _mark(changes, self._ground.mappable, row0, col0, self._layers[robot], self._counts)
 
 
 def _same_cells(ground: GroundTruth, frame: GroundTruth) -> NDArray[np.int64]:

@@ -242,15 +242,18 @@ class Team:
     def _share(self, infos: Sequence[dict[str, Any]], *, last: bool = False) -> None:
         """Put what is the team's into the infos of the active robots.
 
-        Where frames differ, coverage is brought up to date once a second, and at the last step.
+        Where frames differ, or robots map apart from a joint belief, coverage is brought up to date once a second,
+        and at the last step.
         """
         apart = self.joint is not None and any(member.apart for member in self.joint.members)
-        if len(self.members) == 1 or self.joint is not None:
-            self.coverage_share = max(info["coverage"] for info in infos) if apart else infos[-1]["coverage"]
+        if len(self.members) == 1 or (self.joint is not None and not apart):
+            self.coverage_share = infos[-1]["coverage"]
         else:
-            if self.coverage.each_step or last or self._steps % self._cover_every == 0:
+            each_step = self.coverage.each_step and not apart
+            if each_step or last or self._steps % self._cover_every == 0:
                 for member in self.members:
-                    self.coverage.update(member.number, member.own_coverage, member.backend.grid)
+                    changes = None if apart else member.own_coverage.changes
+                    self.coverage.update(member.number, changes, member.backend.grid)
             self.coverage_share = self.coverage.share
         collisions = sum(member.truth.world.robot_collisions for member in self.members)
         for info in infos:

@@ -299,6 +299,8 @@ def test_a_joint_belief_is_one_map_and_all_poses() -> None:
         assert team.joint is not None
         assert [member.apart for member in team.joint.members] == [False, True, True]
         assert len({id(m.own_coverage) for m in team.members}) == 3
+        shares = [m.own_coverage.update(m.backend.grid) for m in team.members]
+        assert max(shares) < team.coverage_share <= sum(shares)  # of what any of them has
         _drive(team, 70)
         assert not any(member.apart for member in team.joint.members)
         assert len({id(m.belief.grid) for m in team.members}) == 1
