@@ -147,7 +147,7 @@ class Backend(abc.ABC):
             self._update(scan)
         else:
             if recovery.kept is None:
-                recovery.kept = self._copy()
+                recovery.kept, recovery.waited = self._copy(), 0
             self._update(scan)
             if recovery.kept is not None and recovery.gone(self.grid, self.pose, scan):
                 self._put_back(recovery.kept)
@@ -222,14 +222,12 @@ class Backend(abc.ABC):
         x, y = body_x + offset * math.cos(theta), body_y + offset * math.sin(theta)
         grid.integrate((x, y, theta), scan, surface, body=(body_x, body_y, config.body_radius_m))
         if self.key_scans.wants(x, y, theta):
-            self.key_scans.keep(
-                np.array([x, y, theta]), scan, surface, *self._landmarks_in_view(), ahead_m=offset,
-                variance=self._end_variance(),
-            )  # fmt: skip
+            self._keep(np.array([x, y, theta]), scan)
 
-    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array, Array]:
-        """Return ids ``(k,)`` of what the last scan showed, marks and covariance as key scans take them."""
-        return np.zeros(0, np.int64), np.zeros((0, 3)), self.pose_cov
+    def _keep(self, sensor_pose: Array, scan: Scan) -> None:
+        """Keep a scan that was drawn, for redrawing."""
+        none = np.zeros(0, np.int64), np.zeros((0, 3)), self.pose_cov
+        self.key_scans.keep(sensor_pose, scan, self.extractor.surface, *none, variance=self._end_variance())
 
     # ---- health ------------------------------------------------------------------------------------------------
 

@@ -280,6 +280,7 @@ class FastSlam(LandmarkBackend):
         n = self.config.particles
         self._poses[:], self._covs[:] = pose, np.triu(pose_cov)
         self._weights[:], self._log_weights[:] = 1.0 / n, -math.log(n)
+        self._inherited.place(pose_cov)
         self._spinning.forget_motion()
         self._believe()
 

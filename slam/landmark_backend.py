@@ -91,9 +91,12 @@ class LandmarkBackend(Backend):
         marks = marks[marks[:, 0] != LINE]
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
-    def _landmarks_in_view(self) -> tuple[NDArray[np.int64], Array, Array]:
+    def _keep(self, sensor_pose: Array, scan: Scan) -> None:
         rows, ids, marks = self._book.just_seen(self._points)
-        return ids, marks, self._cov_with(rows)
+        self.key_scans.keep(
+            sensor_pose, scan, self.extractor.surface, ids, marks, self._cov_with(rows), *self._map_points(),
+            ahead_m=self.config.lidar_offset_m, variance=self._end_variance(),
+        )  # fmt: skip
 
     @abc.abstractmethod
     def _cov_with(self, rows: NDArray[np.int64]) -> Array:

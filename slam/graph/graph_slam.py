@@ -225,7 +225,7 @@ class GraphSlam(SurfaceBackend):
         sensor, surface = self.sensor_pose(self._mean), self.extractor.surface
         self.grid.integrate(sensor, scan, surface, body=(x, y, self.config.body_radius_m))
         if self.key_scans.wants(*sensor.tolist()):
-            self.key_scans.keep(sensor, scan, surface, *self._landmarks_in_view())
+            self._keep(sensor, scan)
             self._drawn.append((scan.kept(), surface.copy()))
             self._drawn_at.append(len(self._at) - 1)
             self._shown.append(sensor)

@@ -29,9 +29,14 @@ _ANCHORS = 8  # landmarks that a key scan hangs on, at most
 
 _RECENT = 100  # key scans, some 20 m of way
 
-_PASSES = 10  # one where little has moved, two where no landmark is gone, mostly
+_LATELY = 10  # key scans that are brought up to date before another one follows them
 
-# Variances [m², rad²] of the way from the key scan before.
+_ROWS = (
+    "_poses", "_kept", "_latest", "_before", "_variances", "_anchor_ids", "_anchor_local", "_covs", "_steps",
+    "_gains",
+)  # fmt: skip
+
+# Variances [m², rad²] of the way from the key scan before, 0.2 m or 0.25 rad of it.
 _STEP_SHIFT, _STEP_TURN = 0.01**2, 0.0025**2
 
 
@@ -51,14 +56,15 @@ class KeyScans:
     def __init__(self, config: KeyScanConfig | None = None) -> None:
         self.config = config or KeyScanConfig()
         self._scans: list[tuple[Scan, NDArray[np.int16]]] = []
-        self._poses = np.zeros((64, 3))  # of the sensor, as last drawn …
-        self._kept = np.zeros((64, 3))  # … and as believed when the scan was taken
+        # Poses of the sensor: as last drawn, as believed when the scan was taken, as the landmarks had it lately …
+        self._poses, self._kept, self._latest = np.zeros((64, 3)), np.zeros((64, 3)), np.zeros((64, 3))
+        self._before = np.zeros((64, 3))  # … and that of the scan before when the scan was taken
         self._variances = np.zeros(64)  # [m²] of where the beams ended, when the scan was taken
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
-        self._gains = np.zeros(
-            (64, 3, 6 + 2 * _ANCHORS)
-        )  # by the scan before, by all that goes along, by each landmark
+        self._covs = np.zeros((64, 3 + 2 * _ANCHORS, 3 + 2 * _ANCHORS))  # of pose and landmarks, in that frame
+        self._steps = np.zeros(64)  # σ's of the way from the scan before, in those of a step
+        self._gains = np.zeros((64, 3, 6 + 2 * _ANCHORS))  # K, G J and G of docs/reference/occupancy.md
         self._since_check = 0
         self._last = (0.0, 0.0, 0.0)
         self._cos_spacing = math.cos(min(self.config.spacing_rad, math.pi))
@@ -94,22 +100,37 @@ class KeyScans:
 
     def keep(
         self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array,
-        cov: Array, *, ahead_m: float = 0.0, variance: float = 0.0,
+        cov: Array, landmarks: Array | None = None, row_of_id: NDArray[np.int64] | None = None, *,
+        ahead_m: float = 0.0, variance: float = 0.0,
     ) -> None:  # fmt: skip
         """Keep a scan, and what was seen with it.
 
         ``ids`` are the landmarks; ``marks`` ``(k, 3)`` are x, y, 0 of a point as it is now, or α, r, 1 of a wall;
         ``cov`` ``(3 + 2k, 3 + 2k)`` is the covariance of the body's pose and theirs, the sensor being ``ahead_m``
-        ahead of the body's centre. ``variance`` [m²] is that of where the beams ended.
+        ahead of the body's centre. ``landmarks`` and ``row_of_id`` are all of them, as for
+        :meth:`redraw_if_moved`. ``variance`` [m²] is that of where the beams ended.
         """
         n = len(self._scans)
         if n == len(self._poses):
-            for name in ("_poses", "_kept", "_variances", "_anchor_ids", "_anchor_local", "_gains"):
+            for name in _ROWS:
                 setattr(self, name, np.concatenate([getattr(self, name), np.zeros_like(getattr(self, name))]))
-        self._poses[n] = self._kept[n] = sensor_pose
-        _hang(sensor_pose, ids, marks, cov, ahead_m, self._anchor_ids[n], self._anchor_local[n], self._gains[n])
+        last_x, last_y, last_theta = self._last
+        self._last = x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
+        if n:
+            if landmarks is not None and row_of_id is not None:
+                self._follow(landmarks, row_of_id, max(n - _LATELY, 0))
+            self._before[n] = self._latest[n - 1]
+            steps = max(
+                math.hypot(x - last_x, y - last_y) / 0.2, abs(wrap_scalar(theta - last_theta)) / 0.25, 1.0
+            )  # fmt: skip
+        else:
+            steps = math.inf  # nothing is known of a way from anywhere
+        self._poses[n] = self._kept[n] = self._latest[n] = sensor_pose
+        self._steps[n] = steps
+        hung = self._anchor_ids[n], self._anchor_local[n], self._covs[n]
+        _hang(sensor_pose, ids, marks, cov, ahead_m, *hung)
+        _weigh(*hung, steps, self._gains[n])
         self._variances[n] = variance
-        self._last = (float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2]))
         self._scans.append((scan.kept(), surface.copy()))
 
     def due(self) -> bool:
@@ -142,20 +163,22 @@ class KeyScans:
 
     def _corrected(self, landmarks: Array, row_of_id: NDArray[np.int64]) -> tuple[Array, float]:
         """Return where the key scans ``(n, 3)`` should be drawn, and by how much [m] one moved most."""
-        n = len(self._scans)
         self._since_check = 0
-        corrected = np.empty((n, 3))
-        largest = _corrected_poses(
-            self._kept[:n], self._poses[:n], self._anchor_ids, self._anchor_local, self._gains, landmarks,
-            row_of_id, self.config.lever_m, corrected,
+        largest = self._follow(landmarks, row_of_id, 0)
+        return self._latest[: len(self._scans)].copy(), largest
+
+    def _follow(self, landmarks: Array, row_of_id: NDArray[np.int64], first: int) -> float:
+        """Have the key scans from ``first`` on go with their landmarks; return the largest shift [m]."""
+        return _follow(
+            first, len(self._scans), self._kept, self._before, self._poses, self._anchor_ids, self._anchor_local,
+            self._covs, self._steps, self._gains, landmarks, row_of_id, self.config.lever_m, self._latest,
         )  # fmt: skip
-        return corrected, largest
 
     def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
         """Keep only as many scans as there are sensor poses ``(n, 3)``, the first ones, and redraw ``grid``."""
         n = len(poses)
         del self._scans[n:]
-        self._poses[:n] = poses
+        self._poses[:n] = self._latest[:n] = poses
         self._last = tuple(poses[-1].tolist()) if n else (0.0, 0.0, 0.0)
         grid.redraw(poses, self._scans)
 
@@ -169,20 +192,18 @@ def largest_shift(poses: Array, drawn: Array, lever_m: float) -> float:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
     sensor_pose: Array, ids: NDArray[np.int64], marks: Array, cov: Array, ahead_m: float,
-    anchor_ids: NDArray[np.int64], anchor_local: Array, gains: Array,
+    anchor_ids: NDArray[np.int64], anchor_local: Array, p: Array,
 ) -> None:  # fmt: skip
-    """Write a key scan's landmarks in its pose's frame, and how far it goes with the scan before and with them."""
+    """Write a key scan's landmarks in its pose's frame, and the covariance of it and them there."""
     count = min(ids.shape[0], anchor_ids.shape[0])
     n = 3 + 2 * count
     x, y, theta = sensor_pose
     c, s = math.cos(theta), math.sin(theta)
-    p = np.empty((n + 3, n + 3))  # of errors in the map, soon of those in this pose's frame
     for i in range(n):
         for j in range(n):
             p[i, j] = cov[i, j]
     _turn(p, n, 0, c, s)
     _add(p, n, 1, 2, ahead_m)
-    moved = np.zeros((2 * count, 3))  # the marks by a motion of the frame
     anchor_ids[:] = -1
     for k in range(count):
         anchor_ids[k] = ids[k]
@@ -191,30 +212,51 @@ def _hang(
             nx, ny = math.cos(u), math.sin(u)
             local_u, local_v = u - theta, v - x * nx - y * ny
             _add(p, n, 4 + 2 * k, 3 + 2 * k, x * ny - y * nx)
-            moved[2 * k, 2] = 1.0
-            moved[2 * k + 1, 0], moved[2 * k + 1, 1] = math.cos(local_u), math.sin(local_u)
         else:
             local_u, local_v = c * (u - x) + s * (v - y), c * (v - y) - s * (u - x)
             _turn(p, n, 3 + 2 * k, c, s)
-            moved[2 * k, 0] = moved[2 * k + 1, 1] = 1.0
-            moved[2 * k, 2], moved[2 * k + 1, 2] = -local_v, local_u
         anchor_local[k, 0], anchor_local[k, 1], anchor_local[k, 2] = local_u, local_v, wall
-    # One more: the scan before goes where this one goes, but for the way from it.
-    for i in range(3):
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh(ids: NDArray[np.int64], local: Array, cov: Array, steps: float, gains: Array) -> None:
+    """Write how far a key scan goes with the scan before and with those of its landmarks that there are."""
+    of = np.empty(ids.shape[0], np.int64)
+    count = 0
+    for a in range(ids.shape[0]):
+        if ids[a] >= 0:
+            of[count] = a
+            count += 1
+    n = 3 + 2 * count
+    p = np.empty((n + 3, n + 3))
+    for i in range(n):
+        row = i if i < 3 else 3 + 2 * of[(i - 3) // 2] + (i - 3) % 2
         for j in range(n):
-            p[n + i, j] = p[j, n + i] = p[i, j]
-        for j in range(3):
-            p[n + i, n + j] = p[i, j]
-        p[n + i, n + i] += _STEP_TURN if i == 2 else _STEP_SHIFT
+            p[i, j] = cov[row, j if j < 3 else 3 + 2 * of[(j - 3) // 2] + (j - 3) % 2]
+    # One more: the scan before goes where this one goes, but for the way from it.
+    for i in range(n, n + 3):
+        for j in range(n):
+            p[i, j] = p[j, i] = p[i - n, j] if steps < math.inf else 0.0
+        for j in range(n, n + 3):
+            p[i, j] = p[i - n, j - n] if steps < math.inf else 0.0
+        p[i, i] += steps * steps * (_STEP_TURN if i == n + 2 else _STEP_SHIFT)
     _sweep(p)
+    gains[:] = 0.0
     for i in range(3):
         for j in range(3):
             gains[i, j] = p[i, n + j]
-            along = 0.0
-            for k in range(2 * count):
-                along += p[i, 3 + k] * moved[k, j]
-            gains[i, 3 + j] = along
-        gains[i, 6 : n + 3], gains[i, n + 3 :] = p[i, 3:n], 0.0
+        for k in range(count):
+            a, by_u, by_v = of[k], p[i, 3 + 2 * k], p[i, 4 + 2 * k]
+            gains[i, 6 + 2 * a], gains[i, 7 + 2 * a] = by_u, by_v
+            # How the landmark goes with a motion of the frame.
+            if local[a, 2]:
+                gains[i, 3] += math.cos(local[a, 0]) * by_v
+                gains[i, 4] += math.sin(local[a, 0]) * by_v
+                gains[i, 5] += by_u
+            else:
+                gains[i, 3] += by_u
+                gains[i, 4] += by_v
+                gains[i, 5] += local[a, 0] * by_v - local[a, 1] * by_u
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
@@ -244,7 +286,7 @@ def _sweep(p: Array) -> None:
     n = p.shape[0]
     for j in range(3, n):
         pivot = p[j, j]
-        if not pivot > 1e-15:  # the others say all of it
+        if not 1e-15 < pivot < math.inf:  # the others say all of it, or it says nothing
             for i in range(n):
                 p[i, j] = p[j, i] = 0.0
             continue
@@ -257,35 +299,43 @@ def _sweep(p: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _corrected_poses(
-    kept: Array, drawn: Array, ids: NDArray[np.int64], local: Array, gains: Array, landmarks: Array,
-    row_of_id: NDArray[np.int64], lever: float, out: Array,
+def _follow(
+    first: int, n: int, kept: Array, before: Array, drawn: Array, ids: NDArray[np.int64], local: Array,
+    covs: Array, steps: Array, gains: Array, landmarks: Array, row_of_id: NDArray[np.int64], lever: float,
+    out: Array,
 ) -> float:  # fmt: skip
-    """Write each key scan's pose as its landmarks now have it; return the largest shift [m] from where it is."""
-    normals = np.empty((landmarks.shape[0], 2))  # of those that are walls
-    for i in range(landmarks.shape[0]):
+    """Write key scans' poses as their landmarks now have them; return the largest shift [m] from where one is."""
+    # Of those that are walls; for a few scans not worth while.
+    normals = np.empty((landmarks.shape[0] if first == 0 else 0, 2))
+    for i in range(normals.shape[0]):
         normals[i, 0], normals[i, 1] = math.cos(landmarks[i, 0]), math.sin(landmarks[i, 0])
     largest = 0.0
-    before = np.zeros(3)  # motion of the scan before, as the k-th one's own frame has it, and of the k-th itself
+    going = np.zeros(3)  # how the scan before has moved since, as the k-th one's own frame has it, and the k-th
     motion = np.zeros(3)
-    for k in range(kept.shape[0]):
+    for k in range(first, n):
+        gone = False
+        for a in range(ids.shape[1]):
+            if ids[k, a] >= 0 and row_of_id[ids[k, a]] < 0:
+                ids[k, a], gone = -1, True
+        if gone:
+            _weigh(ids[k], local[k], covs[k], steps[k], gains[k])
         x, y, theta = kept[k]
         c, s = math.cos(theta), math.sin(theta)
         if k:
-            turn = wrap_scalar(out[k - 1, 2] - kept[k - 1, 2])
+            turn = wrap_scalar(out[k - 1, 2] - before[k, 2])
             ct, st = math.cos(turn), math.sin(turn)
-            dx, dy = x - kept[k - 1, 0], y - kept[k - 1, 1]
+            dx, dy = x - before[k, 0], y - before[k, 1]
             dx, dy = out[k - 1, 0] + ct * dx - st * dy - x, out[k - 1, 1] + st * dx + ct * dy - y
-            before[0], before[1], before[2] = c * dx + s * dy, c * dy - s * dx, turn
+            going[0], going[1], going[2] = c * dx + s * dy, c * dy - s * dx, turn
         for i in range(3):
-            motion[i] = before[i]
-        for _ in range(_PASSES):
+            motion[i] = going[i]
+        for _ in range(2):  # turns are small
             ahead, left, turn = _moved(
-                kept[k], before, motion, ids[k], local[k], gains[k], landmarks, normals, row_of_id
+                kept[k], going, motion, ids[k], local[k], gains[k], landmarks, normals, row_of_id
             )  # fmt: skip
             off = abs(ahead - motion[0]) + abs(left - motion[1]) + abs(turn - motion[2])
             motion[0], motion[1], motion[2] = ahead, left, turn
-            if off < 5e-4:
+            if off < 1e-3:
                 break
         out[k, 0], out[k, 1] = x + c * motion[0] - s * motion[1], y + s * motion[0] + c * motion[1]
         out[k, 2] = wrap_scalar(theta + motion[2])
@@ -296,22 +346,23 @@ def _corrected_poses(
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def _moved(
-    kept: Array, before: Array, motion: Array, ids: NDArray[np.int64], local: Array, gain: Array, landmarks: Array,
+    kept: Array, going: Array, motion: Array, ids: NDArray[np.int64], local: Array, gain: Array, landmarks: Array,
     normals: Array, row_of_id: NDArray[np.int64],
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Return how a key scan moves, linearised about a motion with which landmarks that are gone go along."""
+    """Return how a key scan moves, linearised about a motion of it."""
     c, s = math.cos(kept[2]), math.sin(kept[2])
     x, y = kept[0] + c * motion[0] - s * motion[1], kept[1] + s * motion[0] + c * motion[1]
     theta, ct, st = kept[2] + motion[2], math.cos(motion[2]), math.sin(motion[2])
     c, s = math.cos(theta), math.sin(theta)
     ahead = left = turn = 0.0
     for a in range(ids.shape[0]):
-        row = row_of_id[ids[a]] if ids[a] >= 0 else -1
-        if row < 0:
+        if ids[a] < 0:
             continue
+        row = row_of_id[ids[a]]
         u, v = landmarks[row, 0], landmarks[row, 1]
         if local[a, 2]:
-            du, dv = wrap_scalar(u - theta - local[a, 0]), v - normals[row, 0] * x - normals[row, 1] * y
+            nx, ny = (normals[row, 0], normals[row, 1]) if normals.shape[0] else (math.cos(u), math.sin(u))
+            du, dv = wrap_scalar(u - theta - local[a, 0]), v - nx * x - ny * y
             if abs(du) > 0.5 * math.pi:  # the wall passed the map's origin: the other normal
                 du, dv = wrap_scalar(du + math.pi), -dv
             dv -= local[a, 1]
@@ -323,7 +374,7 @@ def _moved(
         turn += gain[2, i] * du + gain[2, i + 1] * dv
     ahead, left = ct * ahead - st * left, st * ahead + ct * left  # so far in the moved frame
     for i in range(3):
-        ahead += gain[0, i] * before[i] + gain[0, 3 + i] * motion[i]
-        left += gain[1, i] * before[i] + gain[1, 3 + i] * motion[i]
-        turn += gain[2, i] * before[i] + gain[2, 3 + i] * motion[i]
+        ahead += gain[0, i] * going[i] + gain[0, 3 + i] * motion[i]
+        left += gain[1, i] * going[i] + gain[1, 3 + i] * motion[i]
+        turn += gain[2, i] * going[i] + gain[2, 3 + i] * motion[i]
     return ahead, left, turn

@@ -63,7 +63,7 @@ class Recovery:
         self.monitor.restart(1.0 - self.config.lost_per_scan)
         self.lost = False
         self.times_lost = self.relocalisations = self.scans_lost = 0
-        self._waited = 0  # scans for which it would have been given up, but for a place right beside
+        self.waited = 0  # scans for which it would have been given up, but for a place right beside
         self.kept: Any = None  # what the backend was before the first doubtful scan of a row
         self._relocaliser: Relocaliser | None = None
         self._trail: _Trail | None = None
@@ -95,10 +95,10 @@ class Recovery:
     def gone(self, grid: OccupancyGrid, body: Array, scan: Scan) -> bool:
         """Tell whether the belief is to be given up: it contradicts the scans, and not by a little or for long."""
         if self.monitor.fine >= self.config.give_up:
-            self._waited = 0
+            self.waited = 0
             return False
-        self._waited += 1
-        if self._waited > self._relocalisation.patience:
+        self.waited += 1
+        if self.waited > self._relocalisation.patience:
             return True
         return not self._beside(Relocaliser(self._relocalisation, grid, self._offset_m), body, scan)
 
@@ -116,7 +116,7 @@ class Recovery:
         self.lost = True
         self.times_lost += 1
         self.kept, self._relocaliser, self._trail = None, None, None
-        self._waited = self._searched = self._unopposed = self._silent = 0
+        self._searched = self._unopposed = self._silent = 0
         self._searched_from: Array | None = None  # where the wheels had it when all of the map was last searched
 
     def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:

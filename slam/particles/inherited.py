@@ -49,6 +49,12 @@ class InheritedError:
         self._p[:3, :3] += cov
         self.motion += cov
 
+    def place(self, cov: Array) -> None:
+        """Have the pose err by ``cov`` ``(3, 3)``, by itself: it was set anew."""
+        self._p[:3], self._p[:, :3] = 0.0, 0.0
+        self._p[:3, :3] = cov
+        self.motion = cov.copy()
+
     def correct(
         self, pose: Array, points: Array, covs: Array, z: Array, match: Indices, offset: float, drawn: float
     ) -> None:
