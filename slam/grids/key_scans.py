@@ -29,12 +29,14 @@ _ANCHORS = 8  # landmarks that a key scan hangs on, at most
 
 _RECENT = 100  # key scans, some 20 m of way
 
-_LATELY = 10  # key scans that are brought up to date before another one follows them
-
 _ROWS = (
-    "_poses", "_kept", "_latest", "_before", "_variances", "_anchor_ids", "_anchor_local", "_covs", "_steps",
-    "_gains",
+    "_poses", "_kept", "_latest", "_before", "_variances", "_anchor_ids", "_anchor_local", "_held", "_covs",
+    "_steps", "_gains",
 )  # fmt: skip
+
+_PASSES = 5  # two, mostly: turns are small
+
+_UNTOLD = 0.01  # share of a motion that is carried on from so far back that it may be of the last look
 
 # Variances [m², rad²] of the way from the key scan before, 0.2 m or 0.25 rad of it.
 _STEP_SHIFT, _STEP_TURN = 0.01**2, 0.0025**2
@@ -62,6 +64,7 @@ class KeyScans:
         self._variances = np.zeros(64)  # [m²] of where the beams ended, when the scan was taken
         self._anchor_ids = np.full((64, _ANCHORS), -1, np.int64)
         self._anchor_local = np.zeros((64, _ANCHORS, 3))  # in that pose's frame: x, y, 0, or α, r, 1
+        self._held = np.zeros((64, _ANCHORS), np.bool_)  # those that were in the map when gains were last reckoned
         self._covs = np.zeros((64, 3 + 2 * _ANCHORS, 3 + 2 * _ANCHORS))  # of pose and landmarks, in that frame
         self._steps = np.zeros(64)  # σ's of the way from the scan before, in those of a step
         self._gains = np.zeros((64, 3, 6 + 2 * _ANCHORS))  # K, G J and G of docs/reference/occupancy.md
@@ -118,7 +121,7 @@ class KeyScans:
         self._last = x, y, theta = float(sensor_pose[0]), float(sensor_pose[1]), float(sensor_pose[2])
         if n:
             if landmarks is not None and row_of_id is not None:
-                self._follow(landmarks, row_of_id, max(n - _LATELY, 0))
+                self._follow(landmarks, row_of_id, _pinned(self._gains, n))
             self._before[n] = self._latest[n - 1]
             steps = max(
                 math.hypot(x - last_x, y - last_y) / 0.2, abs(wrap_scalar(theta - last_theta)) / 0.25, 1.0
@@ -127,9 +130,10 @@ class KeyScans:
             steps = math.inf  # nothing is known of a way from anywhere
         self._poses[n] = self._kept[n] = self._latest[n] = sensor_pose
         self._steps[n] = steps
-        hung = self._anchor_ids[n], self._anchor_local[n], self._covs[n]
-        _hang(sensor_pose, ids, marks, cov, ahead_m, *hung)
-        _weigh(*hung, steps, self._gains[n])
+        local, own_cov, held = self._anchor_local[n], self._covs[n], self._held[n]
+        _hang(sensor_pose, ids, marks, cov, ahead_m, self._anchor_ids[n], local, own_cov)
+        np.greater_equal(self._anchor_ids[n], 0, out=held)
+        _weigh(held, local, own_cov, steps, self._gains[n])
         self._variances[n] = variance
         self._scans.append((scan.kept(), surface.copy()))
 
@@ -171,7 +175,8 @@ class KeyScans:
         """Have the key scans from ``first`` on go with their landmarks; return the largest shift [m]."""
         return _follow(
             first, len(self._scans), self._kept, self._before, self._poses, self._anchor_ids, self._anchor_local,
-            self._covs, self._steps, self._gains, landmarks, row_of_id, self.config.lever_m, self._latest,
+            self._held, self._covs, self._steps, self._gains, landmarks, row_of_id, self.config.lever_m,
+            self._latest,
         )  # fmt: skip
 
     def put_back(self, grid: OccupancyGrid, poses: Array) -> None:
@@ -219,12 +224,12 @@ def _hang(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(ids: NDArray[np.int64], local: Array, cov: Array, steps: float, gains: Array) -> None:
+def _weigh(held: NDArray[np.bool_], local: Array, cov: Array, steps: float, gains: Array) -> None:
     """Write how far a key scan goes with the scan before and with those of its landmarks that there are."""
-    of = np.empty(ids.shape[0], np.int64)
+    of = np.empty(held.shape[0], np.int64)
     count = 0
-    for a in range(ids.shape[0]):
-        if ids[a] >= 0:
+    for a in range(held.shape[0]):
+        if held[a]:
             of[count] = a
             count += 1
     n = 3 + 2 * count
@@ -299,10 +304,23 @@ def _sweep(p: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _pinned(gains: Array, n: int) -> int:
+    """Return the scan from which on all must follow their landmarks for the last of n to be where they have it."""
+    carried = 1.0
+    while n > 0 and carried > _UNTOLD:
+        n -= 1
+        largest = 0.0
+        for i in range(3):
+            largest = max(largest, abs(gains[n, i, 0]) + abs(gains[n, i, 1]) + abs(gains[n, i, 2]))
+        carried *= min(largest, 1.0)
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _follow(
     first: int, n: int, kept: Array, before: Array, drawn: Array, ids: NDArray[np.int64], local: Array,
-    covs: Array, steps: Array, gains: Array, landmarks: Array, row_of_id: NDArray[np.int64], lever: float,
-    out: Array,
+    held: NDArray[np.bool_], covs: Array, steps: Array, gains: Array, landmarks: Array,
+    row_of_id: NDArray[np.int64], lever: float, out: Array,
 ) -> float:  # fmt: skip
     """Write key scans' poses as their landmarks now have them; return the largest shift [m] from where one is."""
     # Of those that are walls; for a few scans not worth while.
@@ -313,12 +331,13 @@ def _follow(
     going = np.zeros(3)  # how the scan before has moved since, as the k-th one's own frame has it, and the k-th
     motion = np.zeros(3)
     for k in range(first, n):
-        gone = False
+        others = False  # landmarks than last time: some were dropped, or are there again
         for a in range(ids.shape[1]):
-            if ids[k, a] >= 0 and row_of_id[ids[k, a]] < 0:
-                ids[k, a], gone = -1, True
-        if gone:
-            _weigh(ids[k], local[k], covs[k], steps[k], gains[k])
+            there = ids[k, a] >= 0 and row_of_id[ids[k, a]] >= 0
+            if there != held[k, a]:
+                held[k, a], others = there, True
+        if others:
+            _weigh(held[k], local[k], covs[k], steps[k], gains[k])
         x, y, theta = kept[k]
         c, s = math.cos(theta), math.sin(theta)
         if k:
@@ -329,9 +348,9 @@ def _follow(
             going[0], going[1], going[2] = c * dx + s * dy, c * dy - s * dx, turn
         for i in range(3):
             motion[i] = going[i]
-        for _ in range(2):  # turns are small
+        for _ in range(_PASSES):
             ahead, left, turn = _moved(
-                kept[k], going, motion, ids[k], local[k], gains[k], landmarks, normals, row_of_id
+                kept[k], going, motion, ids[k], held[k], local[k], gains[k], landmarks, normals, row_of_id
             )  # fmt: skip
             off = abs(ahead - motion[0]) + abs(left - motion[1]) + abs(turn - motion[2])
             motion[0], motion[1], motion[2] = ahead, left, turn
@@ -346,8 +365,8 @@ def _follow(
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def _moved(
-    kept: Array, going: Array, motion: Array, ids: NDArray[np.int64], local: Array, gain: Array, landmarks: Array,
-    normals: Array, row_of_id: NDArray[np.int64],
+    kept: Array, going: Array, motion: Array, ids: NDArray[np.int64], held: NDArray[np.bool_], local: Array,
+    gain: Array, landmarks: Array, normals: Array, row_of_id: NDArray[np.int64],
 ) -> tuple[float, float, float]:  # fmt: skip
     """Return how a key scan moves, linearised about a motion of it."""
     c, s = math.cos(kept[2]), math.sin(kept[2])
@@ -356,7 +375,7 @@ def _moved(
     c, s = math.cos(theta), math.sin(theta)
     ahead = left = turn = 0.0
     for a in range(ids.shape[0]):
-        if ids[a] < 0:
+        if not held[a]:
             continue
         row = row_of_id[ids[a]]
         u, v = landmarks[row, 0], landmarks[row, 1]
