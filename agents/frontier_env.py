@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
+from mecanum_env.arguments import check_arguments
 from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
 from slam.files import quoted
@@ -154,6 +155,7 @@ class ExploreFrontierEnv(ChoiceEnv):
         render_mode: str | None = None,
         **kwargs: Any,
     ) -> None:
+        check_arguments(kwargs, ExploreFrontierEnv)
         self.discount = checked("discount", Discount, discount)
         with argument("driver"):
             super().__init__(from_mapping(ChooserConfig, driver))

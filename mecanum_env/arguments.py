@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import (
@@ -28,12 +29,14 @@ from slam.files import plain_name, quoted
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
-from slam.settings import argument, check_name, from_mapping, require
+from slam.settings import Within, argument, check_name, checked, from_mapping, require
 
-__all__ = ["Settings", "make_backend", "make_config", "make_plan"]
+__all__ = ["Settings", "check_arguments", "make_backend", "make_config", "make_plan", "room_seed_of"]
 
 Settings = str | Mapping[str, Any]
 """A name, or a mapping that configures what it names."""
+
+RoomSeed = Annotated[int, Within("[0, 9223372036854775807]")]
 
 
 def make_config(
@@ -56,8 +59,7 @@ def make_config(
     stands for its lidar and noise too, where those are not given.
     Unknown names, keys and arguments raise ``ValueError`` that lists the valid ones.
     """
-    for name in unknown:
-        check_name("argument", name, {"action", "render_mode", *(make_config.__kwdefaults__ or ())})
+    check_arguments(unknown)
     if isinstance(config, str | Path):
         base = from_toml(config)
     else:
@@ -106,6 +108,22 @@ def make_config(
     return made
 
 
+def check_arguments(given: Iterable[str], *takers: Callable[..., Any]) -> None:
+    """Raise ``ValueError`` for what is a keyword argument neither of ``takers`` nor of :func:`make_config`."""
+    valid = {
+        p.name for taker in (*takers, make_config) for p in inspect.signature(taker).parameters.values()
+        if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)
+    }  # fmt: skip
+    for name in given:
+        check_name("argument", name, valid)
+
+
+def room_seed_of(options: Mapping[str, Any], seed: int) -> int:
+    """Return the seed that the room is drawn by: the option ``room_seed`` of a reset, else the episode's."""
+    given = options.get("room_seed")
+    return seed if given is None else int(checked("room_seed", RoomSeed, given))
+
+
 def make_plan(
     config: EnvConfig, seed: int, *, given: FloorPlan | str | Path | None = None,
     start: Sequence[float] | None = None,
@@ -115,6 +133,8 @@ def make_plan(
     ``start`` is a pose x, y, θ in the plan's frame, for the plan's own.
     """
     given = config.floor_plan if given is None else given
+    if not isinstance(given, FloorPlan | str | Path | None):
+        raise ValueError(f"floor_plan must be a FloorPlan or a path, got {quoted(given)}")
     if given is not None and not isinstance(given, FloorPlan):
         return room_registry.load(given, start=start, seed=seed)
     plan = room_registry.make(config.rooms, seed=seed, config=config.rooms_config) if given is None else given

@@ -14,7 +14,7 @@ from gymnasium.wrappers import TimeLimit
 from numba import njit
 from numpy.typing import NDArray
 
-from mecanum_env.arguments import make_backend, make_config, make_plan
+from mecanum_env.arguments import check_arguments, make_backend, make_config, make_plan, room_seed_of
 from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
@@ -80,6 +80,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         floor_plan: str | Path | FloorPlan | None = None,
         **settings: Any,
     ) -> None:
+        check_arguments(settings, ExploreEnv)
         check_name("action", action, ACTIONS)
         if render_mode is not None:
             check_name("render_mode", render_mode, self.metadata["render_modes"])
@@ -106,13 +107,13 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
+        self._ready = False
         options = options or {}
         for key in options:
             check_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
-        room_seed = options.get("room_seed")
         plan = make_plan(
-            self.config, episode_seed if room_seed is None else int(room_seed),
+            self.config, room_seed_of(options, episode_seed),
             given=options.get("floor_plan", self._plan), start=options.get("start_pose"),
         )  # fmt: skip
         self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)

@@ -8,10 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from training.episodes import explore as task
-from training.episodes.recording import Recorder
+from mecanum_env.config import Steps
+from slam.files import quoted
+from slam.settings import PositiveShare, Seed, checked, require
+from training.episodes import explore as single
+from training.episodes import team as several
+from training.episodes.recording import Recorder, TeamRecorder
 from training.runs.errors import BadInput
 from training.views.episode_files import write_episode
+from training.views.team_files import write_team_episode
 
 __all__ = ["Explored", "explore"]
 
@@ -23,6 +28,12 @@ _SHOWN = {  # key of the metrics → what it is called, its factor and unit
     "collisions": ("collisions", 1.0, ""),
     "map_iou": ("IoU of walls", 1.0, ""),
     "final_position_error_m": ("final position error", 100.0, "cm"),
+    "robot_collisions": ("collisions of robots", 1.0, ""),
+}
+_PICTURES = {
+    "map.png": "what it believes",
+    "truth.png": "what is so",
+    "team.png": "what is so, what they have mapped",
 }
 
 
@@ -37,12 +48,14 @@ class Explored:
         rows = "".join(
             f"<tr><th style='text-align:left'>{name}</th><td>{_text(self.metrics[key], factor, unit)}</td></tr>"
             for key, (name, factor, unit) in _SHOWN.items()
+            if key in self.metrics
         )
         pictures = "".join(
             f"<figure style='display:inline-block;margin:0 1% 0 0;width:48%'>"
             f"<img src='{_data_uri(self.out / file)}' alt='{what}' style='width:100%'>"
             f"<figcaption>{what}</figcaption></figure>"
-            for file, what in (("map.png", "what it believes"), ("truth.png", "what is so"))
+            for file, what in _PICTURES.items()
+            if (self.out / file).exists()
         )
         report = html.escape(str(self.out / "report.html"))
         return f"<div>{pictures}<table>{rows}</table><p>Replayed in <code>{report}</code></p></div>"
@@ -53,6 +66,8 @@ def explore(
     slam: str | None = None, seed: int | None = None, floor_plan: str | Path | None = None,
     start: tuple[float, float, float] | None = None, robot: str | None = None, noise: str | None = None,
     config: str | Path | None = None, max_steps: int | None = None, coverage_target: float | None = None,
+    robots: int | None = None, communication: str | None = None, range_m: float | None = None,
+    starts: str | None = None, unknown_starts: bool = False, joint_belief: bool = False,
 ) -> Explored:  # fmt: skip
     """Let an agent explore for one episode, write its files into ``out``, and return what came of it.
 
@@ -60,23 +75,41 @@ def explore(
     ----------
     out, agent, rooms, slam, seed, floor_plan, start, robot, noise, config, max_steps, coverage_target
         As the options of ``mecanum explore``; of what is None the config file or the default decides.
+    robots, communication, range_m, starts, unknown_starts, joint_belief
+        The same, of several robots that explore together (``docs/how-to/teams.md``).
 
     Raises
     ------
     ValueError
         For a name, number or file that cannot be used; the message says which, and what is valid.
     """
+    given: dict[str, Any] = {
+        "out": _path("out", out), "agent": agent, "rooms": rooms, "slam": slam, "robot": robot, "noise": noise,
+        "seed": checked("seed", Seed | None, seed), "floor_plan": _path("floor_plan", floor_plan),
+        "start": checked("start", tuple[float, float, float] | None, start),
+        "config": _path("config", config), "max_steps": checked("max_steps", Steps | None, max_steps),
+        "coverage_target": checked("coverage_target", PositiveShare | None, coverage_target),
+    }  # fmt: skip
     try:
-        episode = task.prepare(
-            out=Path(out), agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed,
-            floor_plan=None if floor_plan is None else Path(floor_plan), start=start,
-            config=None if config is None else Path(config), max_steps=max_steps, coverage_target=coverage_target,
+        team = several.read_team(
+            given["config"], robots=robots, communication=communication, range_m=range_m, starts=starts,
+            unknown_starts=checked("unknown_starts", bool, unknown_starts),
+            joint_belief=checked("joint_belief", bool, joint_belief),
         )  # fmt: skip
+        alone = team.robots == 1
+        episode: Any = single.prepare(**given) if alone else several.prepare(team, **given)
     except BadInput as error:
         raise ValueError(str(error)) from error
-    recorder = Recorder()
-    task.run(episode, lambda **_: None, [recorder])
-    return Explored(metrics=write_episode(episode, recorder.recording()), out=Path(out))
+    recorder = Recorder() if alone else TeamRecorder()
+    run: Any = single.run if alone else several.run
+    write: Any = write_episode if alone else write_team_episode
+    run(episode, lambda **_: None, [recorder])
+    return Explored(metrics=write(episode, recorder.recording()), out=given["out"])
+
+
+def _path(name: str, given: str | Path | None) -> Path | None:
+    require(given is None or isinstance(given, str | Path), f"{name} must be a path, got {quoted(given)}")
+    return None if given is None else Path(given)
 
 
 def _text(value: Any, factor: float, unit: str) -> str:

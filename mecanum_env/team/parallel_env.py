@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from mecanum_env.arguments import check_arguments
 from mecanum_env.observation import Observation
 from mecanum_env.team.member import Member
 from mecanum_env.team.picture import render_team
@@ -48,6 +50,7 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     }  # fmt: skip
 
     def __init__(self, *, render_mode: str | None = None, **settings: Any) -> None:
+        check_arguments(settings, ExploreParallelEnv, Team)
         if render_mode is not None:
             check_name("render_mode", render_mode, self.metadata["render_modes"])
         self.render_mode = render_mode
@@ -70,7 +73,9 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Start an episode; see :meth:`mecanum_env.team.team.Team.reset`."""
         # PettingZoo's own test of the interface sends an option of this name.
-        options = {key: value for key, value in (options or {}).items() if key != "options"}
+        self.agents = []
+        if isinstance(options, Mapping):
+            options = {key: value for key, value in options.items() if key != "options"}
         found = self.team.reset(seed=seed, options=options)
         self.agents = self.possible_agents[:]
         return (
@@ -85,6 +90,9 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     ]:
         """Act for one control step; robots that are done leave ``agents``, and stand where they are."""
         names = self.possible_agents
+        require(isinstance(actions, Mapping), f"actions must be a mapping by agent, got {quoted(actions)}")
+        for name in actions:
+            check_name("agent", name, names)
         for name in self.agents:
             require(name in actions, f"actions must have one of each of {self.agents}; that of {name} is missing")
         outcomes = self.team.step({self._numbers[name]: actions[name] for name in self.agents})
@@ -110,7 +118,10 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
     def announce(self, agent: str, goal: Array | None) -> None:
         """Have a robot tell the others where it goes: a point ``(2,)`` [m] in its belief's frame, or nowhere."""
         self._check_begun()
-        place = None if goal is None else np.array(goal, np.float64)
+        try:
+            place = None if goal is None else np.array(goal, np.float64)
+        except (TypeError, ValueError):
+            place = np.full(2, np.nan)
         require(
             place is None or (place.shape == (2,) and bool(np.isfinite(place).all())),
             f"a goal must be two finite numbers x, y, got {quoted(goal)}",

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from mecanum_env.arguments import make_config, make_plan
+from mecanum_env.arguments import check_arguments, make_config, make_plan, room_seed_of
 from mecanum_env.config import EnvConfig, Steps
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
@@ -23,10 +24,11 @@ from mecanum_env.team.coverage import TeamCoverage
 from mecanum_env.team.member import Member
 from mecanum_env.team.starts import start_poses
 from slam.accounts.account import Account
+from slam.files import quoted
 from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
-from slam.settings import argument, check_name, checked, from_mapping
+from slam.settings import argument, check_name, checked, from_mapping, require
 from slam.teams.centralised import JointEkf
 from slam.types import Array
 
@@ -79,6 +81,7 @@ class Team:
         max_steps: int = 3000,
         **settings: Any,
     ) -> None:
+        check_arguments(settings, Team)
         self.max_steps = checked("max_steps", Steps, max_steps)
         with argument("team"):
             given = from_mapping(TeamConfig, team)
@@ -112,14 +115,15 @@ class Team:
 
         ``options`` are ``floor_plan``, ``start_poses`` ``(robots, 3)`` in the plan's frame and ``room_seed``.
         """
-        options = dict(options or {})
+        self.active = []
+        options = {} if options is None else options
+        require(isinstance(options, Mapping), f"options must be a mapping, got {quoted(options)}")
         for key in options:
             check_name("reset option", key, _OPTIONS)
         if seed is not None:
-            self._rng = np.random.default_rng(seed)
+            self._rng, _ = np_random(seed)
         seed = int(self._rng.integers(2**31)) if seed is None else int(seed)
-        room_seed = options.get("room_seed")
-        plans = self._plans(options, seed, seed if room_seed is None else int(room_seed))
+        plans = self._plans(options, seed, room_seed_of(options, seed))
         config, team = self.config, self.team
         drawn = np.random.default_rng(np.random.SeedSequence([seed, 2])).standard_normal((team.robots, 3))
         sigmas = np.array([team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad])
@@ -158,7 +162,10 @@ class Team:
         if starts is None:
             rng = np.random.default_rng(np.random.SeedSequence([seed, 3]))
             starts = start_poses(plan, robot, robots, scattered=self.team.starts == "scattered", rng=rng)
-        starts = np.asarray(starts, dtype=np.float64)
+        try:
+            starts = np.asarray(starts, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"start_poses must be {robots} poses x, y, θ; got {quoted(starts)}") from None
         if starts.shape != (robots, 3):
             raise ValueError(f"start_poses must be {robots} poses x, y, θ; got shape {starts.shape}")
         return [
@@ -170,7 +177,7 @@ class Team:
     def step(self, actions: Mapping[int, NDArray[np.float32]]) -> dict[int, Outcome]:
         """Act for one control step; ``actions`` and what is returned are by the numbers of the active robots."""
         if not self.active:
-            raise RuntimeError("call reset() before step()")
+            raise RuntimeError("no robot is exploring: the episode is over, or has not begun; call reset()")
         config, active = self.config, [self.members[k] for k in self.active]
         targets: list[Array] = [np.zeros(4)] * len(self.members)  # who has ended stands still
         for member in active:

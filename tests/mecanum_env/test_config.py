@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import pytest
 
-import mecanum_env  # noqa: F401 - registers the environments
+import mecanum_env
 from mecanum_env.config import EnvConfig, from_toml, to_toml
 
 
@@ -40,3 +41,19 @@ def test_a_configuration_keeps_its_settings_when_the_callers_change() -> None:
 def test_an_argument_that_there_is_not_is_named_with_those_that_there_are(name: str) -> None:
     with pytest.raises(ValueError, match=r"^unknown argument .room. \(did you mean .rooms.\?\); valid: .*slam$"):
         gymnasium.make(f"mecanum_env/{name}", room="maze")
+
+
+@pytest.mark.parametrize(
+    ("make", "own"),
+    [
+        (lambda: gymnasium.make("mecanum_env/Explore-v0", bogus=1), ["action", "render_mode"]),
+        (lambda: gymnasium.make("mecanum_env/ExploreFrontier-v0", bogus=1), ["discount", "driver", "render_mode"]),
+        (lambda: mecanum_env.parallel_env(bogus=1), ["action", "max_steps", "render_mode", "robots", "team"]),
+    ],
+)
+def test_the_arguments_that_there_are_are_the_environment_s(make: Callable[[], Any], own: list[str]) -> None:
+    with pytest.raises(ValueError, match="unknown argument 'bogus'; valid: ") as refused:
+        make()
+    named = str(refused.value).split("valid: ")[1].split(", ")
+    shared = ["config", "floor_plan", "lidar", "noise", "odometry_filter", "reward", "robot", "rooms", "slam"]
+    assert named == sorted([*shared, *own])

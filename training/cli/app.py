@@ -21,7 +21,7 @@ from training.cli.policy import policy
 from training.cli.replay import replay
 from training.cli.rooms import rooms
 from training.cli.ros import ros
-from training.cli.study import study
+from training.cli.study import STUDIES, study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
 from training.runs.options import Command
@@ -102,6 +102,8 @@ def _run(arguments: list[str]) -> int:
         command = typer.main.get_command(app)
         if arguments and arguments[0] in _commands():
             name = f"mecanum {arguments[0]}"
+        if arguments[:1] == ["study"] and arguments[1:] and arguments[1] in STUDIES:
+            name = f"mecanum study {arguments[1]}"
         code = command.main(args=arguments, prog_name="mecanum", standalone_mode=False)
         sys.stdout.flush()
         if code == INTERRUPTED:  # newer versions of typer hand KeyboardInterrupt back so

@@ -20,6 +20,7 @@ import typer
 import agents
 import slam
 from mecanum_env import rooms
+from slam.formats import atomic_write
 
 __all__ = ["Episode", "digest", "episodes", "study"]
 
@@ -98,7 +99,7 @@ def study(
         found[name] = digest(episode)
         print(name, found[name][:16], file=sys.stderr, flush=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(found, indent=1) + "\n")
+    atomic_write(out, (json.dumps(found, indent=1) + "\n").encode())
     if against is not None:
         before: dict[str, str] = json.loads(against.read_text())
         other = sorted(name for name in {*found, *before} if found.get(name) != before.get(name))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import gymnasium
 import numpy as np
 import pytest
 import supersuit
@@ -55,9 +58,33 @@ def test_what_is_missing_or_no_goal_is_said() -> None:
     env.reset(seed=1)
     with pytest.raises(ValueError, match="that of robot_1 is missing"):
         env.step({"robot_0": np.zeros(3, np.float32)})
-    for goal in ([1.0, 2.0, 3.0], [np.nan, 0.0]):
+    for goal in (np.array([1.0, 2.0, 3.0]), np.array([np.nan, 0.0]), "there"):
         with pytest.raises(ValueError, match="a goal must be two finite numbers"):
-            env.announce("robot_0", np.array(goal))
+            env.announce("robot_0", goal)  # type: ignore[arg-type]
+    still = {name: np.zeros(3, np.float32) for name in (*env.agents, "robot_9")}
+    for actions, words in ((still, "unknown agent 'robot_9'"), ([0.0], "actions must be a mapping")):
+        with pytest.raises(ValueError, match=words):
+            env.step(actions)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"options": "x"}, "options must be a mapping"),
+        ({"options": {"floor_plan": 3}}, "floor_plan must be a FloorPlan or a path, got 3"),
+        ({"options": {"room_seed": 1.7}}, "room_seed must be a whole number"),
+        ({"options": {"start_poses": "here"}}, "start_poses must be 2 poses"),
+        ({"seed": "x"}, "Seed must be a python integer"),
+    ],
+)
+def test_a_reset_that_is_refused_leaves_no_episode(given: dict[str, Any], words: str) -> None:
+    env = mecanum_env.parallel_env(robots=2, rooms="rectangular")
+    env.reset(seed=1)
+    with pytest.raises((ValueError, gymnasium.error.Error), match=words):
+        env.reset(**given)
+    assert env.agents == []
+    with pytest.raises(RuntimeError, match=r"call reset\(\)"):
+        env.step({})
 
 
 def test_all_are_done_together_when_the_target_is_covered() -> None:

@@ -124,5 +124,9 @@ def test_the_command_goes_on_where_it_stopped(
 def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["study", "recovery", "--seeds", "x", "--out", str(tmp_path)]) == 2
     assert "seeds" in capsys.readouterr().err and not any(tmp_path.iterdir())
+    (tmp_path / "words.md").write_text("no plan")
+    for rooms in ("aprtment", str(tmp_path / "words.md")):
+        assert main(["study", "recovery", "--rooms", rooms, "--out", str(tmp_path / "out")]) == 2
+        assert "mecanum study recovery: " in capsys.readouterr().err and not (tmp_path / "out").exists()
     assert main(["study", "recovery", "--faults", "telport", "--out", str(tmp_path)]) == 2
     assert "teleport" in capsys.readouterr().err

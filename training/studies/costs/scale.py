@@ -18,6 +18,7 @@ import typer
 import agents
 from agents.base import Goal
 from mecanum_env.env import ExploreEnv
+from mecanum_env.rooms import load
 from mecanum_env.views.pictures import draw_map, episode_view
 from slam.formats import atomic_write
 from slam.types import Array
@@ -138,6 +139,8 @@ def study(
     for plan in plans:
         if not plan.is_file():
             raise BadInput(f"no such file: {plan}; give a ROS map (.yaml) or an image")
+        with bad_input():
+            load(plan)
     keep_settings(out, {**made_by(*plans, *names), "seed": seed, "minutes": minutes}, FILES)
     jobs: list[Job] = [(str(p), name, seed, minutes, str(out)) for p in plans for name in names]
     for k, job in enumerate(jobs):  # each in a process of its own, so that its memory is

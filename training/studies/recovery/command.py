@@ -13,6 +13,7 @@ import typer
 
 import agents
 from mecanum_env.arguments import make_config
+from mecanum_env.rooms import load
 from slam.formats import atomic_write
 from slam.settings import check_name
 from training.episodes.room_pictures import parse_seeds
@@ -58,8 +59,10 @@ def study(
             check_name("fault", name, FAULTS)
         places = parts_of(rooms)
         for place in places:
-            where = {"floor_plan": place} if Path(place).suffix else {"rooms": place}
-            make_config(noise=noise, **where)  # type: ignore[arg-type]
+            if Path(place).suffix:
+                load(place)
+            where: dict[str, Any] = {"floor_plan" if Path(place).suffix else "rooms": place}
+            make_config(noise=noise, **where)
         numbers = parse_seeds(seeds, most=_MOST_SEEDS)
         settings = {**made_by(agent, *places), "agent": agent, "noise": noise, "max_steps": max_steps}
     who = workers_of(workers, ray)

@@ -45,6 +45,10 @@ def test_an_exploration_that_was_broken_off_is_no_result(tmp_path: Path, monkeyp
 def test_what_was_typed_wrong_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["study", "scale", str(tmp_path / "none.yaml"), "--out", str(tmp_path)]) == 2
     assert "no such file" in capsys.readouterr().err
-    plan = write_room(tmp_path / "hall.png")
+    plan, out = write_room(tmp_path / "hall.png"), tmp_path / "out"
+    (tmp_path / "words.md").write_text("no plan")
+    assert main(["study", "scale", str(plan), str(tmp_path / "words.md"), "--out", str(out)]) == 2
+    assert "mecanum study scale: floor plan" in capsys.readouterr().err
+    assert not out.exists()
     assert main(["study", "scale", str(plan), "--agent", "brisk", "--out", str(tmp_path)]) == 2
     assert "brisk-tour" in capsys.readouterr().err
