@@ -142,7 +142,7 @@ class CompressedEkfSlam(EkfSlam):
         """Take another region where the robot has left this one, or sees farther than it was made for."""
         margin = self.config.margin_m
         self._reach = max(reach, 0.95 * self._reach)
-        if self.landmark_count <= self.config.whole_up_to and not len(self._far):
+        if self._book.count <= self.config.whole_up_to and not len(self._far):
             return
         beyond = reach > self._made_for + margin and len(self._far) > 0
         moved = math.hypot(self._x[0] - self._centre[0], self._x[1] - self._centre[1])
@@ -272,11 +272,6 @@ class CompressedEkfSlam(EkfSlam):
         change, others = self._change(), np.empty((len(far), 2, 2))
         _far_blocks(self._map_p, change.left, change.right, far, others)
         return np.concatenate([covs, others])
-
-    @property
-    def landmark_count(self) -> int:
-        """Number of landmarks in the map."""
-        return self._book.count + len(self._far)
 
     @property
     def _marks(self) -> Array:

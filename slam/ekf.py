@@ -18,22 +18,23 @@ from slam.gaussian.beliefs import GaussianBackend
 from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
-from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, told_by, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.geometry import wrap_scalar
+from slam.graph.places import Places
 from slam.health.relocalisation import Place, Relocaliser
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
-from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, LAST_SEEN, TO, count_recent, match_and_recall
+from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.seen_from import LEAST_NAT, Loose, seen_from
+from slam.landmarks.seen_from import seen_from
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
-from slam.types import LINE, Array, Observations, Odometry, Scan
+from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
 
@@ -68,7 +69,7 @@ class EkfSlam(GaussianBackend):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
-        self._loose = Loose()
+        self._places = Places(self.config.lidar_offset_m, self.config.features.range_sigma_m)
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
 
@@ -199,17 +200,14 @@ class EkfSlam(GaussianBackend):
     def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""
         config, book = self.config, self._book
-        rows = np.flatnonzero(match < 0)
-        more = np.empty(len(rows), np.int64)
-        old = agreeing(
+        rows, closing = np.flatnonzero(match < 0), np.full(len(match), UNMATCHED)
+        more = closing[rows]
+        if agreeing(
             self._x, self._p, config.lidar_offset_m, z[rows], book.marks, book.now, config.loop_sigma_m,
             config.landmarks.new_distance_m, self._max_turn, more,
-        )  # fmt: skip
-        if old == 0:
-            return
-        closing = np.full(len(match), UNMATCHED)
-        closing[rows] = more
-        self._accept_also(z, match, closing)
+        ):  # fmt: skip
+            closing[rows] = more
+            self._accept_also(z, match, closing)
 
     def _rescue(self, z: Array, match: NDArray[np.int64]) -> None:
         """Match and correct by what left its gate, now that the others have put the pose right."""
@@ -280,35 +278,45 @@ class EkfSlam(GaussianBackend):
 
     def _hold_by_map(self, scan: Scan) -> None:
         """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
-        recovery, book = self.recovery, self._book
+        recovery = self.recovery
         if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
             if recovery.opposed(self.grid, self._x[:3], scan):
                 place = self._place_beside(scan)
                 if not recovery.opposed(self.grid, place.pose, scan):
                     self._correct_by_map(place, JOINT_LIMITS)
-        elif self._spinning.touching or not self.config.lines:
-            self._loose.held()
-        elif self._loose.due(self.nis_dof // 2, scan, book.marks[:, LAST_SEEN], book.now):
-            place = self._place_beside(scan)
-            if place.good:
-                self._correct_by_map(place, JOINT_LIMITS, LEAST_NAT)
+        elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
+            self._hold_by_place(scan)
+
+    def _hold_by_place(self, scan: Scan) -> None:
+        """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""
+        x, book, places = self._x[: self._n], self._book, self._places
+        ends = places.ends(scan, self.extractor)
+        seen, away = places.seen(x, book.marks, ends)
+        fits = seen is not None and self._correct_aside(*seen, JOINT_LIMITS)
+        if places.wanted(away, fits=fits):
+            for z in places.make(book.next_id, ends):
+                self._add(z, None)
+
+    def _places_beside(self) -> Indices:
+        return self._places.beside(self._x[: self._n], self._book.marks)
 
     def _place_beside(self, scan: Scan) -> Place:
         """Return where beside the believed pose a scan fits the drawn map best."""
         c = self.config
         return Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, self._x[:3].copy())
 
-    def _correct_by_map(self, place: Place, limits: Array, least_nat: float = 0.0) -> None:
-        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen.
+    def _correct_by_map(self, place: Place, limits: Array) -> None:
+        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
+        offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
+        self._correct_aside(*seen_from(self._x, self._book.marks, offset, place.pose, cov), limits)
 
-        Nothing is done where it would tell less of them than ``least_nat``.
-        """
-        kept, cov = (self.nis, self.nis_dof), place.cov + found_cov()
-        offset, work = self.config.lidar_offset_m, (self._h, self._w, self._s)
-        z, match = seen_from(self._x, self._book.marks, offset, place.pose, cov)
-        if not least_nat or told_by(self._x, self._p, self._n, z, match, offset, *work) >= least_nat:
-            self._correct(z, match, limits)
+    def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:
+        """Correct by what no feature of the scan shows, nor counts to its NIS; tell whether it stands."""
+        kept = self.nis, self.nis_dof
+        self._correct(z, match, limits)
+        stands = self.nis_dof > 0
         self.nis, self.nis_dof = kept
+        return stands
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
         """Correct by a match, curved walls made straight; tell whether it stands, as its joint NIS may be refused.
@@ -368,12 +376,9 @@ class EkfSlam(GaussianBackend):
         self._book.drop(row)
 
     def _enlarge(self) -> None:
-        n, size = self._n, 2 * len(self._x)
-        x, p = np.zeros(size), aligned_zeros(size, size)
-        x[:n], p[:n, :n] = self._x[:n], self._p[:n, :n]
-        self._x, self._p = x, p
-        self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, size)
-        self._beside.enlarge(size)
+        self._x, self._p = joint.enlarged(self._x, self._p, self._n)
+        self._h, self._w, self._s = work_space(MAX_OBSERVATIONS, len(self._x))
+        self._beside.enlarge(len(self._x))
 
     def _foreseen(self, scan: Scan) -> Array:
         return self._x

@@ -15,7 +15,7 @@ from slam.landmarks.book import LandmarkBook, LandmarkPolicy
 from slam.landmarks.known_ids import KnownIds
 from slam.landmarks.spinning_wheels import SpinningWheels, touches
 from slam.motion import OdometryNoise, Twist
-from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
+from slam.types import LINE, VIRTUAL, Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["LARGEST_ID", "LandmarkBackend", "observation_rows"]
 
@@ -83,20 +83,28 @@ class LandmarkBackend(Backend):
     @property
     def landmark_count(self) -> int:
         """Number of confirmed landmarks, walls included."""
-        return self._book.count
+        return int(np.count_nonzero(self._marks[:, 0] != VIRTUAL))
 
     def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
         """Return per point landmark how often it was seen and its direction in the belief's frame [rad]."""
         marks = self._marks
-        marks = marks[marks[:, 0] != LINE]
+        marks = marks[marks[:, 0] < LINE]
         return marks[:, 2].astype(np.int64), np.where(marks[:, 0] == 0, np.nan, marks[:, 1])
 
     def _keep(self, sensor_pose: Array, scan: Scan) -> None:
         rows, ids, marks = self._book.just_seen(self._points)
+        beside = self._places_beside()
+        if len(beside):
+            rows, ids = np.append(rows, beside), np.append(ids, self._book.ids[beside])
+            marks = np.vstack([marks, np.column_stack([self._points[beside], np.zeros(len(beside))])])
         self.key_scans.keep(
             sensor_pose, scan, self.extractor.surface, ids, marks, self._cov_with(rows), *self._map_points(),
             ahead_m=self.config.lidar_offset_m, variance=self._end_variance(),
         )  # fmt: skip
+
+    def _places_beside(self) -> Indices:
+        """Return the book's rows of virtual points that tell of this pose, where landmarks do not."""
+        return np.zeros(0, np.int64)
 
     @abc.abstractmethod
     def _cov_with(self, rows: NDArray[np.int64]) -> Array:

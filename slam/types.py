@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "CONCAVE", "CONVEX", "LINE", "Array", "Cells", "Floats", "Indices", "Observations", "Odometry", "Scan",
-    "Sighting",
+    "CONCAVE", "CONVEX", "LINE", "VIRTUAL", "Array", "Cells", "Floats", "Indices", "Observations", "Odometry",
+    "Scan", "Sighting",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -29,6 +29,8 @@ CONCAVE = -1
 """A corner of the free space itself: where two walls of a room meet."""
 LINE = 2
 """A straight wall, not a point: its two coordinates are α [rad] and r [m], x cos α + y sin α = r."""
+VIRTUAL = 3
+"""A point that no scan shows: with its twin it stands for a place, see :mod:`slam.graph.places`."""
 
 
 # Named tuples where each step makes a new one: a frozen dataclass takes 0.5 µs longer to build.

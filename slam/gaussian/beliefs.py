@@ -17,7 +17,7 @@ from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.settings import EkfConfig
 from slam.landmark_backend import LandmarkBackend
 from slam.metrics.measures import nees_pose
-from slam.types import LINE, Array
+from slam.types import LINE, VIRTUAL, Array
 
 __all__ = ["GaussianBackend"]
 
@@ -56,7 +56,7 @@ class GaussianBackend(LandmarkBackend):
     @property
     def joint_cov(self) -> Array:
         """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, walls included."""
-        return self._covariance(np.arange(len(self._ids)))
+        return self._covariance(np.flatnonzero(self._marks[:, 0] != VIRTUAL))
 
     def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         """Return the covariance of the robot and some landmarks."""
@@ -92,8 +92,8 @@ class GaussianBackend(LandmarkBackend):
 
     def _points_and_walls(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the rows of both among all landmarks."""
-        walls = self._marks[:, 0] == LINE
-        return np.flatnonzero(~walls), np.flatnonzero(walls)
+        kinds = self._marks[:, 0]
+        return np.flatnonzero(kinds < LINE), np.flatnonzero(kinds == LINE)
 
     def _landmarks(self) -> dict[str, Any]:
         """Return what the belief says of landmarks, but for their covariance."""

@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.gaussian.lanes import aligned_zeros
 from slam.geometry import wrap_scalar
 from slam.landmarks.joint_compatibility import insert_nearest
 from slam.types import LINE, Array
@@ -21,6 +22,7 @@ __all__ = [
     "ANYWHERE_COV",
     "OBSERVED_LIMIT",
     "add_landmark",
+    "enlarged",
     "landmark_by_pose",
     "leave_out",
     "line_ends",
@@ -150,7 +152,7 @@ def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -
     nearest, distance = np.empty(out.shape[0], np.int64), np.empty(out.shape[0])
     filled = 0
     for i in range(marks.shape[0]):
-        if marks[i, 0] == LINE:
+        if marks[i, 0] >= LINE:
             continue
         dx, dy = x[3 + 2 * i] - x[0], x[4 + 2 * i] - x[1]
         filled = insert_nearest(i, dx * dx + dy * dy, nearest, distance, filled)
@@ -179,6 +181,14 @@ def with_robot(p: Array, landmarks: NDArray[np.int64]) -> Array:
     out = np.empty((len(rows), len(rows)))
     read_block(p, rows, out)
     return out
+
+
+def enlarged(x: Array, p: Array, n: int) -> tuple[Array, Array]:
+    """Return state and covariance, of which ``n`` states are in use, with twice the room."""
+    size = 2 * len(x)
+    more, wider = np.zeros(size), aligned_zeros(size, size)
+    more[:n], wider[:n, :n] = x[:n], p[:n, :n]
+    return more, wider
 
 
 def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:

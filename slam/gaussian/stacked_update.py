@@ -21,7 +21,7 @@ from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
 from slam.types import LINE, Array
 
-__all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "told_by", "whiten", "work_space"]
+__all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "work_space"]
 
 SPARE_ROWS = 6
 """Rows of w beyond the observations', for what a filter may want to subtract beside Wᵀ W."""
@@ -61,20 +61,6 @@ def stacked_update(
     if rows > 0:
         downdate(p, n, w, w, rows, 0)
     return rows, nis
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def told_by(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
-) -> float:
-    """Return what an update would tell of the state [nat], ½ log (det S / det R); arguments as there."""
-    twice = 0.0
-    for a in range(whiten(x, p, n, z, match, offset, h, w, s)):
-        twice -= 2.0 * math.log(s[a, a])
-    for k in range(z.shape[0]):
-        if match[k] >= 0:
-            twice -= math.log(z[k, 2] * z[k, 4] - z[k, 3] * z[k, 3])
-    return 0.5 * twice
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -143,7 +143,7 @@ def _alike(
     kind: float, turn: float, end: float, of_kind: float, direction: float, of_end: float, max_turn: float
 ) -> bool:
     """Do what :func:`alike` does; a call that hands on rows of arrays takes 30 ns."""
-    if kind == LINE or of_kind == LINE or (kind != 0.0 and of_kind != 0.0):
+    if kind == LINE or of_kind >= LINE or (kind != 0.0 and of_kind != 0.0):
         return (
             kind == of_kind and (kind == LINE or end == of_end) and abs(wrap_scalar(turn - direction)) <= max_turn
         )

@@ -16,13 +16,15 @@ from numpy.typing import NDArray
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.settings import Config, Count, Gap, NotNegative
-from slam.types import LINE, Array, Scan
+from slam.types import LINE, VIRTUAL, Array, Scan
 
 __all__ = [
-    "KIND", "LAST_SEEN", "MARKS", "RECENT", "LandmarkBook", "LandmarkPolicy", "count_recent", "match_and_recall",
+    "FROM_MARK", "KIND", "LAST_SEEN", "MARKS", "RECENT", "LandmarkBook", "LandmarkPolicy", "count_recent",
+    "match_and_recall",
 ]  # fmt: skip
 
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
+FROM_MARK = 6  # column of ``marks``: where a wall begins, a point's end of a surface, a virtual point's place
 
 MARKS = 11  # columns of ``marks``, one row a landmark; the last three are those of slam.landmarks.curved_walls
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, LAST_SEEN, _FROM, _TO = range(8)
@@ -91,6 +93,11 @@ class LandmarkBook:
         """Ids ``(n,)``; an id is never used twice. A view."""
         return self._ids[: self.count]
 
+    @property
+    def next_id(self) -> int:
+        """The id of the next landmark that gets its own."""
+        return self._next_id
+
     def row(self, landmark_id: int) -> int:
         """Return the row of a landmark, or -1."""
         if 0 <= landmark_id < len(self.row_of_id):
@@ -117,7 +124,8 @@ class LandmarkBook:
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, self._now, *extent, *bend)
+        seen = -math.inf if kind == VIRTUAL else self._now
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -336,7 +344,7 @@ def _look_through(
     full = beams >= circle
     doubtful = False
     for i in range(marks.shape[0]):
-        if marks[i, LAST_SEEN] == now or marks[i, _KIND] == LINE:
+        if marks[i, LAST_SEEN] == now or marks[i, _KIND] >= LINE:
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy
