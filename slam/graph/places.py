@@ -10,6 +10,7 @@ Autonomous Systems 55, 2007). In a cave with a beam every three degrees there is
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -78,6 +79,12 @@ class Places:
         self._view_rad = 2.0 * math.pi
         self._last = np.full(3, 1e6)  # where a scan was last held against a place
 
+    def __deepcopy__(self, _: object) -> Places:
+        """Return a copy with the same places: what one holds is replaced, not changed."""
+        other = copy.copy(self)
+        other._places = dict(self._places)
+        return other
+
     @property
     def needed(self) -> bool:
         """Whether landmarks have been too few lately to hold the pose."""
@@ -98,8 +105,8 @@ class Places:
     def seen(self, x: Array, marks: Array, ends: BeamEnds) -> tuple[tuple[Array, Indices] | None, float]:
         """Return what a scan says of the nearest place, and how far that is away [m]: infinity without one.
 
-        That is observation rows ``(2, 12)`` of its points, and which landmarks they are; None where the scan does
-        not fit the place. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 11)`` the landmarks' marks.
+        What it says is observation rows ``(2, 12)`` of the place's points, and which landmarks they are; None
+        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 11)`` the landmarks' marks.
         """
         match, away = self._near(x, marks)
         if away >= _NEAR_M:
@@ -193,7 +200,8 @@ def _rows_of(cov: Array, number: int, offset: float) -> Array:
     """Return observation rows of a new place's points, the place being known to ``cov`` in the robot's frame."""
     z = np.zeros((2, 12))
     z[:, KIND], z[:, EDGE] = VIRTUAL, number
-    for k, a in enumerate((_LEVER_M, -_LEVER_M)):
+    lever = max(_LEVER_M, 2.0 * abs(offset))  # the sensor is at neither of them
+    for k, a in enumerate((lever, -lever)):
         rho = abs(a - offset)
         j = np.array([[1.0, 0.0, 0.0], [0.0, 1.0 / rho, a / rho]]) * math.copysign(1.0, a)
         r = 2.0 * j @ cov @ j.T

@@ -77,6 +77,14 @@ def test_a_place_s_points_are_three_metres_ahead_and_behind() -> None:
     assert all(np.linalg.eigvalsh(cov).min() > 0.0 for cov in covs)
 
 
+def test_a_sensor_three_metres_ahead_sees_both_points_from_afar() -> None:
+    extractor, places = FeatureExtractor(FeatureConfig()), Places(3.0, SIGMA)
+    scan = scan_from(np.zeros(3), np.random.default_rng(0))
+    extractor.extract(scan)
+    rows = places.make(0, places.ends(scan, extractor))
+    assert rows.shape == (2, 12) and np.isfinite(rows).all() and (rows[:, 0] >= 3.0).all()
+
+
 def test_a_scan_tells_where_the_place_is_as_surely_as_it_says() -> None:
     """Its error, held against twice the covariance that the two points get, and never surer than the truth."""
     nees, errors = [], []
