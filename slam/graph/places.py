@@ -52,20 +52,22 @@ class _Place:
     surfaces: SurfaceMap  # in the place's frame
     common_var: Array  # (patches,) [m²]: see slam.graph.patches.Patch
 
-    def with_patches(self, patches: list[Patch], at: Array) -> _Place:
-        """Return the place with more, which a scan shows from a pose ``(3,)`` in the place's frame."""
-        old, turn, first = self.surfaces, rotation(float(at[2])).T, len(self.common_var)
-        numbers = [np.full(len(patch.points), first + k) for k, patch in enumerate(patches)]
-        surfaces = SurfaceMap(
-            np.concatenate([old.points, *(patch.points @ turn + at[:2] for patch in patches)]),
-            np.concatenate([old.normals, *(patch.normals @ turn for patch in patches)]),
-            np.concatenate([old.reach, *(patch.reach for patch in patches)]),
-            np.concatenate([old.patch, *numbers]),
-        )
-        return _Place(surfaces, np.append(self.common_var, [patch.common_var for patch in patches]))
 
-
-_NOWHERE = _Place(SurfaceMap(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64)), np.zeros(0))
+def _with_patches(old: _Place | None, patches: list[Patch], at: Array) -> _Place:
+    """Return a place with more patches, which a scan shows from a pose ``(3,)`` in its frame; or a new one."""
+    turn, first = rotation(float(at[2])).T, 0 if old is None else len(old.common_var)
+    points = [patch.points @ turn + at[:2] for patch in patches]
+    normals, reach = [patch.normals @ turn for patch in patches], [patch.reach for patch in patches]
+    numbers = [np.full(len(patch.points), first + k) for k, patch in enumerate(patches)]
+    common = np.array([patch.common_var for patch in patches])
+    if old is not None:
+        had = old.surfaces
+        points, normals, reach = [had.points, *points], [had.normals, *normals], [had.reach, *reach]
+        numbers, common = [had.patch, *numbers], np.append(old.common_var, common)
+    surfaces = SurfaceMap(
+        np.concatenate(points), np.concatenate(normals), np.concatenate(reach), np.concatenate(numbers)
+    )
+    return _Place(surfaces, common)
 
 
 class Places:
@@ -139,7 +141,7 @@ class Places:
         cov = np.linalg.inv(np.sum([np.eye(3) * 1e-6, *(patch.info for patch in patches)], axis=0))
         if cov[0, 0] + cov[1, 1] > _LEAST_M**2 or cov[2, 2] > _LEAST_RAD**2:
             return np.zeros((0, 12))
-        self._places[number] = _NOWHERE.with_patches(patches, np.zeros(3))
+        self._places[number] = _with_patches(None, patches, np.zeros(3))
         return _rows_of(cov, number, self._offset_m)
 
     def beside(self, x: Array, marks: Array) -> Indices:
@@ -178,7 +180,7 @@ class Places:
     def _grow(self, number: int, ends: BeamEnds, new: NDArray[np.bool_], at: Array) -> None:
         """Add to a place what these beams ``(n,)`` of a scan from ``at`` ``(3,)`` in its frame show besides."""
         if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
-            self._places[number] = self._places[number].with_patches(patches, at)
+            self._places[number] = _with_patches(self._places[number], patches, at)
 
 
 def _seen_by(x: Array, match: Indices, pose: Array, cov: Array, offset: float) -> Array:
