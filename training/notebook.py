@@ -11,12 +11,9 @@ from typing import Any
 from mecanum_env.config import Steps
 from slam.files import quoted
 from slam.settings import PositiveShare, Seed, checked, require
-from training.episodes import explore as single
-from training.episodes import team as several
-from training.episodes.recording import Recorder, TeamRecorder
+from training.episodes.team import read_team
 from training.runs.errors import BadInput
-from training.views.episode_files import write_episode
-from training.views.team_files import write_team_episode
+from training.views.team_files import kind_of
 
 __all__ = ["Explored", "explore"]
 
@@ -91,20 +88,18 @@ def explore(
         "coverage_target": checked("coverage_target", PositiveShare | None, coverage_target),
     }  # fmt: skip
     try:
-        team = several.read_team(
+        team = read_team(
             given["config"], robots=robots, communication=communication, range_m=range_m, starts=starts,
             unknown_starts=checked("unknown_starts", bool, unknown_starts),
             joint_belief=checked("joint_belief", bool, joint_belief),
         )  # fmt: skip
-        alone = team.robots == 1
-        episode: Any = single.prepare(**given) if alone else several.prepare(team, **given)
+        kind = kind_of(team)
+        episode = kind.prepare(**given)
     except BadInput as error:
         raise ValueError(str(error)) from error
-    recorder = Recorder() if alone else TeamRecorder()
-    run: Any = single.run if alone else several.run
-    write: Any = write_episode if alone else write_team_episode
-    run(episode, lambda **_: None, [recorder])
-    return Explored(metrics=write(episode, recorder.recording()), out=given["out"])
+    recorder = kind.recorder()
+    kind.run(episode, lambda **_: None, [recorder])
+    return Explored(metrics=kind.write(episode, recorder.recording()), out=given["out"])
 
 
 def _path(name: str, given: str | Path | None) -> Path | None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slam.backend import SurfaceBackend
 from slam.geometry import about_z, compose, relative, symmetric, wrap
 from slam.graph.atlas import Atlas
-from slam.graph.matching import Alignment, Links, align, links
+from slam.graph.matching import Alignment, Links, align, lasting, links
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
@@ -202,13 +202,10 @@ class GraphSlam(SurfaceBackend):
         return bool(left.min() < 2.0)
 
     def _lasting(self) -> float:
-        """Return by how much the model's error counts more because it is still that of the key scan before.
-
-        It changes with the place that a surface is seen from: looking twice from one place tells no more of it.
-        """
+        """Return what :func:`.matching.lasting` does of the way since the last key scan."""
         x, y, theta = self._motion.tolist()
-        apart = math.hypot(x, y) / self.config.key_m + abs(theta) / self.config.key_rad
-        return min(max(1.0 / max(apart, 1e-3), 1.0), _STILL)
+        config = self.config
+        return lasting(math.hypot(x, y), theta, key_m=config.key_m, key_rad=config.key_rad, most=_STILL)
 
     def _moved_on(self, share: float) -> bool:
         """Tell whether it is time for a key scan: sooner where much is new, as in a door."""

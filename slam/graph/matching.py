@@ -19,7 +19,7 @@ from slam.geometry import wrap_scalar
 from slam.graph.surfaces import BeamEnds
 from slam.types import Array
 
-__all__ = ["Alignment", "Links", "SurfaceMap", "align", "links"]
+__all__ = ["Alignment", "Links", "SurfaceMap", "align", "lasting", "links"]
 
 Ints = NDArray[np.int64]
 
@@ -112,6 +112,15 @@ def links(
     )  # fmt: skip
     seen = np.flatnonzero(beams > 0)
     return Links(seen, relative[seen], info[seen], gradient[seen])
+
+
+def lasting(way_m: float, turn_rad: float, *, key_m: float, key_rad: float, most: float) -> float:
+    """Return by how much the model's error counts more because it is still that of a scan so far away.
+
+    It changes with the place that a surface is seen from: looking twice from one place tells no more of it.
+    """
+    apart = way_m / key_m + abs(turn_rad) / key_rad
+    return min(max(1.0 / max(apart, 1e-3), 1.0), most)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureExtractor
 from slam.geometry import about_z, compose, inverse, rotation, wrap, wrap_scalar
-from slam.graph.matching import SurfaceMap, align, links
+from slam.graph.matching import SurfaceMap, align, lasting, links
 from slam.graph.patches import ModelError, Patch, new_patches
 from slam.graph.surfaces import BeamEnds, beam_ends
-from slam.landmarks.association import predicted
 from slam.landmarks.book import EDGE, FROM_MARK, KIND
+from slam.landmarks.seen_from import sightings
 from slam.types import VIRTUAL, Array, Indices, Scan
 
 __all__ = ["Places"]
@@ -126,7 +126,8 @@ class Places:
         if cov[0, 0] + cov[1, 1] < _GROW_M**2 and cov[2, 2] < _GROW_RAD**2:
             self._grow(number, ends, found.beside < 0, at)
         turn = about_z(float(frame[2]))
-        return (_seen_by(x, match, compose(frame, at), turn @ cov @ turn.T, self._offset_m), match), away
+        fit, cov = compose(frame, at), turn @ cov @ turn.T
+        return (sightings(x, marks, match, self._offset_m, fit, cov), match), away
 
     def wanted(self, away: float, *, fits: bool) -> bool:
         """Tell whether to make a place so far from the nearest one, which a scan has just fitted or not."""
@@ -150,14 +151,10 @@ class Places:
         return match if away < _NEAR_M else match[:0]
 
     def _lasting(self, pose: Array) -> float:
-        """Return by how much what surfaces leave out counts more, as it is still that of the scan held last.
-
-        It changes with the place that a surface is seen from: looking twice from one pose tells no more of it.
-        """
+        """Return what :func:`.matching.lasting` does of the way since a scan was last held against a place."""
         dx, dy, turn = (pose - self._last).tolist()
         self._last = pose.copy()
-        apart = math.hypot(dx, dy) / _LASTS_M + abs(wrap_scalar(turn)) / _LASTS_RAD
-        return min(max(1.0 / max(apart, 1e-3), 1.0), _STILL)
+        return lasting(math.hypot(dx, dy), wrap_scalar(turn), key_m=_LASTS_M, key_rad=_LASTS_RAD, most=_STILL)
 
     def _near(self, x: Array, marks: Array) -> tuple[Indices, float]:
         """Return the rows of the nearest place's points, ahead and behind, and how far it is [m]."""
@@ -181,21 +178,6 @@ class Places:
         """Add to a place what these beams ``(n,)`` of a scan from ``at`` ``(3,)`` in its frame show besides."""
         if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
             self._places[number] = _with_patches(self._places[number], patches, at)
-
-
-def _seen_by(x: Array, match: Indices, pose: Array, cov: Array, offset: float) -> Array:
-    """Return observation rows ``(2, 12)`` of a place's points from a pose ``(3,)`` known to ``cov`` ``(3, 3)``.
-
-    Both err with the one pose: twice its covariance each is no smaller than the true one of both.
-    """
-    z, h, there = np.zeros((len(match), 12)), np.zeros((2, 5)), x.copy()
-    there[:3] = pose
-    for k, row in enumerate(match.tolist()):
-        z[k, KIND] = VIRTUAL
-        z[k, :2] = predicted(there, row, VIRTUAL, offset, h)
-        r = len(match) * h[:, :3] @ cov @ h[:, :3].T
-        z[k, 2:5] = r[0, 0], r[0, 1], r[1, 1]
-    return z
 
 
 def _rows_of(cov: Array, number: int, offset: float) -> Array:

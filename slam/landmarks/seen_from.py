@@ -15,7 +15,7 @@ from slam.landmarks.association import predicted
 from slam.landmarks.book import KIND, LAST_SEEN
 from slam.types import VIRTUAL, Array, Indices
 
-__all__ = ["seen_from"]
+__all__ = ["seen_from", "sightings"]
 
 _SIGHTINGS = 3  # two points or walls say where the robot is; one more, should two walls be parallel
 
@@ -34,6 +34,14 @@ def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) ->
     """
     real = np.flatnonzero(marks[:, 0] != VIRTUAL)
     match = real[np.argsort(-marks[real, LAST_SEEN], kind="stable")[:_SIGHTINGS]]
+    return sightings(x, marks, match, offset, pose, cov), match
+
+
+def sightings(x: Array, marks: Array, match: Indices, offset: float, pose: Array, cov: Array) -> Array:
+    """Return observation rows ``(k, 12)`` of landmarks ``(k,)`` as they are seen from a pose known to ``cov``.
+
+    The other arguments are those of :func:`seen_from`. All err with the one pose.
+    """
     z, h, there = np.zeros((len(match), 12)), np.zeros((2, 5)), x.copy()
     there[:3] = pose
     for k, row in enumerate(match.tolist()):
@@ -41,4 +49,4 @@ def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) ->
         z[k, :2] = predicted(there, row, z[k, KIND], offset, h)
         r = len(match) * h[:, :3] @ cov @ h[:, :3].T
         z[k, 2:5] = r[0, 0], r[0, 1], r[1, 1]
-    return z, match
+    return z

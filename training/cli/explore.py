@@ -82,11 +82,10 @@ def explore(
     }  # fmt: skip
     from training.episodes import explore as single
     from training.episodes import team as several
-    from training.episodes.recording import Recorder, TeamRecorder
     from training.runs.signals import interrupt_flag
-    from training.views.episode_files import Saver, check_extras, write_episode
+    from training.views.episode_files import Saver, check_extras
     from training.views.film import filmed
-    from training.views.team_files import write_team_episode
+    from training.views.team_files import kind_of
 
     team = several.read_team(
         config, robots=robots, communication=communication, range_m=range_m, starts=starts,
@@ -98,13 +97,11 @@ def explore(
         if wanted and not alone:
             raise BadInput(f"{name} is for one robot; leave it out")
     check_extras(extras)
-    episode: Any = single.prepare(**given) if alone else several.prepare(team, **given)
-    recorder = Recorder() if alone else TeamRecorder()
-    run: Any = single.run if alone else several.run
-    write: Any = write_episode if alone else write_team_episode
+    kind = kind_of(team)
+    episode, recorder = kind.prepare(**given), kind.recorder()
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
-        witnesses: list[Any] = [recorder, Saver(episode, lambda: write(episode, recorder.recording()))]
+        witnesses: list[Any] = [recorder, Saver(episode, lambda: kind.write(episode, recorder.recording()))]
         film = None
         if "video" in extras:
             film = stack.enter_context(filmed(out, episode.config, substeps=video_substeps, team=not alone))
@@ -115,11 +112,11 @@ def explore(
                 where = f"step {steps} of at most {max_steps}, {100 * coverage:.1f} % mapped at {time_s:.0f} s"
                 shown.show(coverage, where)
 
-            run(episode, progress, witnesses)
+            kind.run(episode, progress, witnesses)
         path = film.finish() if film is not None else None
         if path is None and film is not None:
             extras.remove("video")
-        metrics = write(episode, recorder.recording(), extras=extras, film=path)
+        metrics = kind.write(episode, recorder.recording(), extras=extras, film=path)
     if as_json:
         print(json.dumps(metrics, ensure_ascii=False))
     else:

@@ -2,26 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
+from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.picture import render_team
 from slam.accounts.landmarks import write_landmarks
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
+from training.episodes import explore as single
+from training.episodes import team as several
 from training.episodes.explore import ENDINGS
-from training.episodes.recording import Recording
+from training.episodes.recording import Recorder, Recording, TeamRecorder
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
 from training.runs.running import write_json
-from training.views.episode_files import config_text, episode_folder, place_of, who_of
+from training.views.episode_files import config_text, episode_folder, place_of, who_of, write_episode
 from training.views.team_page import team_page
 
-__all__ = ["write_team_episode"]
+__all__ = ["Kind", "kind_of", "write_team_episode"]
+
+
+class Kind(NamedTuple):
+    """How an episode of one robot, or of several, is prepared, run, recorded and written."""
+
+    prepare: Callable[..., Any]
+    run: Callable[..., None]
+    recorder: Callable[[], Any]
+    write: Callable[..., dict[str, Any]]
+
+
+def kind_of(team: TeamConfig) -> Kind:
+    """Return the kind of episode that a team makes; one robot is none."""
+    if team.robots == 1:
+        return Kind(single.prepare, single.run, Recorder, write_episode)
+    return Kind(partial(several.prepare, team), several.run, TeamRecorder, write_team_episode)
 
 
 def write_team_episode(
