@@ -10,6 +10,10 @@ SEED ?= 0
 OUT ?= out/explore
 WORKERS ?= 2
 AGENTS := nearest-frontier,cost-utility,next-best-view,rrt,tour,brisk-tour,active,explore-and-return,random,ppo-frontier,ppo
+# A file's tests run in one process: two would compile its kernels at the same time.
+TESTED := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+# Seconds. A test that waits for ever fails by name and the others go on; the first ones may compile for minutes.
+PATIENCE := 1200
 API_TESTS := $(wildcard tests/mecanum_env/test_env*.py) tests/mecanum_env/vector
 
 # The libraries' own threads only get in each other's way here: tests run in processes of their own.
@@ -78,19 +82,18 @@ lint: $(VENV)/test.stamp ## ruff
 types: $(VENV)/test.stamp ## mypy
 	$(BIN)/mypy
 
-# A file's tests run in one process: two would compile its kernels at the same time.
 pytest: $(VENV)/test.stamp ## the tests
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest $(TESTED) --timeout $(PATIENCE)
 
 # The oldest Gymnasium that is supported, laid over the other: RLlib pins it.
 other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -c \
 		"import gymnasium; assert gymnasium.__version__ == '$(OTHER_GYMNASIUM)', gymnasium.__version__"
-	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(API_TESTS)
+	PYTHONPATH=$(CURDIR)/$(OTHER) $(BIN)/python -m pytest $(TESTED) --timeout $(PATIENCE) $(API_TESTS)
 
 # After the tests: it takes over the kernels that they have compiled.
 package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and exploring
-	$(BIN)/python -m pytest -m release tests/test_release.py
+	$(BIN)/python -m pytest --timeout $(PATIENCE) -m release tests/test_release.py
 
 rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in CI: large)
 	$(RLLIB)/bin/python -m pytest tests/examples -k rllib
@@ -100,7 +103,7 @@ online: $(VENV)/test.stamp ## the tests of --wandb and hf://, offline all the sa
 	$(BIN)/python -m pytest tests/agents/learned/test_hub.py tests/training/learning/test_follow.py
 
 monte-carlo: $(VENV)/test.stamp ## the long statistical runs
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m monte_carlo
+	$(BIN)/python -m pytest $(TESTED) -m monte_carlo
 
 evaluate: $(VENV)/core.stamp ## the table of docs/studies/estimators.md: 300 episodes on the test seeds
 	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate

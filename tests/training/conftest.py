@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import socket
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
 BROWSER, DRIVER = (shutil.which(name) for name in ("chromium", "chromedriver"))
+_PATIENCE_S = 180.0
 
 
 @pytest.fixture(scope="session")
@@ -24,6 +26,12 @@ def browser() -> Iterator[Any]:
     ):  # fmt: skip
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    # Selenium waits for ever for a browser that has stopped to answer, unless sockets have a bound as it begins.
+    before = socket.getdefaulttimeout()
+    socket.setdefaulttimeout(_PATIENCE_S)
+    try:
+        driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    finally:
+        socket.setdefaulttimeout(before)
     yield driver
     driver.quit()
