@@ -256,8 +256,10 @@ class CompressedEkfSlam(EkfSlam):
     def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
         if not len(self._far):
             return super()._covariance(landmarks)
-        rows = state_rows(np.concatenate([self._near, self._far])[landmarks], robot=True)
-        p = _enlarged(self._map_p, max(int(rows.max()) + 1, len(self._map_p)))
+        places = np.concatenate([self._near, self._far])
+        rows = state_rows(places[landmarks], robot=True)
+        # Room for all that is written, which may be more than what is asked for.
+        p = _enlarged(self._map_p, max(int(state_rows(places, robot=True).max()) + 1, len(self._map_p)))
         self._write(p, self._change())
         out = np.empty((len(rows), len(rows)))
         read_block(p, rows, out)

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 import slam
+import slam.compressed as compressed_
 from slam import Observations
 from slam.backend import Backend
 from slam.compressed import CompressedEkfSlam
+from slam.landmarks.book import KIND
+from slam.types import VIRTUAL
 from tests.slam.simulated import drive, observe_landmarks, room_scan
 
 OFFSET = 0.2
@@ -112,6 +115,19 @@ def test_a_landmark_from_outside_the_region_is_taken_in() -> None:
     )
     for backend in (full, compressed):
         backend.observe(far)
+    compare(full.belief, compressed.belief)
+
+
+def test_what_is_not_asked_for_has_room_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Virtual points are in the map and in no belief: the newest landmarks may be such (docs/reference/ekf.md)."""
+    monkeypatch.setattr(compressed_, "_write_rows", compressed_._write_rows.py_func)  # which looks at bounds
+    full, compressed = slam.make("ekf"), slam.make("compressed-ekf")
+    *_, _ = through_the_grove(grove(3), (full, compressed), 3, 100)
+    assert isinstance(compressed, CompressedEkfSlam) and len(compressed._far)
+    point = np.zeros(12)
+    point[[0, KIND]], point[[2, 4]] = (2.0, VIRTUAL), 1e-4
+    while int(compressed._near.max()) <= len(compressed._map_x) // 2:
+        compressed._add(point, None)
     compare(full.belief, compressed.belief)
 
 
