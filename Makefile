@@ -25,7 +25,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install explore test lint types pytest other-gymnasium package rllib online monte-carlo evaluate benchmark docs speed clean
+.PHONY: help install explore test lint types pytest other-gymnasium package bounds rllib online monte-carlo evaluate benchmark docs speed clean
 
 help: ## show this help
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-16s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -94,6 +94,10 @@ other-gymnasium: $(OTHER).stamp ## the Gymnasium API tests on the oldest version
 # After the tests: it takes over the kernels that they have compiled.
 package: $(VENV)/test.stamp ## the wheel: built, looked at, installed alone, and exploring
 	$(BIN)/python -m pytest --timeout $(PATIENCE) -m release tests/test_release.py
+
+# Compiled kernels look at no bounds: what lies outside of an array is read and written without a word.
+bounds: $(VENV)/test.stamp ## the tests, in kernels that look at the bounds of arrays (not in CI: they are compiled anew)
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(CURDIR)/$(VENV)/bounds $(BIN)/python -m pytest $(TESTED) --timeout $(PATIENCE)
 
 rllib: $(RLLIB).stamp ## the RLlib example, in an environment of its own (not in CI: large)
 	$(RLLIB)/bin/python -m pytest tests/examples -k rllib

@@ -29,6 +29,7 @@ UNKNOWN_BYTE = 128
 # which gives way to what was.
 _RANK = np.maximum(PROBABILITY_BYTE, 1)
 _RANK[0] = 0
+_ALL_BUT_ROUNDING = np.float32(1.0 - 2.0**-21)
 _TWIST_LIMIT = 2.0
 _COV_LIMIT = 1e6  # m², m·rad, rad²: Gymnasium asks for finite bounds
 
@@ -105,8 +106,8 @@ def observe(
     seen: dict[str, Any] = _blank(len(scan.ranges), config.max_landmarks_observed) if out is None else out
     _fill(
         seen["map_local"], seen["map_global"], seen["scan"], seen["pose"], seen["pose_cov"], seen["twist"],
-        seen["progress"], seen["health"], grid.log_odds, grid.visited, row0, col0, grid.resolution,
-        grid.overview_sums, grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov,
+        seen["progress"], seen["health"], grid.cells, grid.trail, *grid.log_odds.shape, row0, col0,
+        grid.resolution, grid.overview_sums, grid.overview_block, scan.ranges, scan.range_max, pose, pose_cov,
         vx / robot.max_speed_m_s, vy / robot.max_speed_m_s, omega / robot.max_turn_rate_rad_s, time_used,
         grid.known_area_m2, backend.health,
     )  # fmt: skip
@@ -134,7 +135,7 @@ def draw_maps(grid: OccupancyGrid, pose: Array) -> Observation:
     row0, col0 = grid.lattice_origin
     _fill(
         out["map_local"], out["map_global"], out["scan"], out["pose"], out["pose_cov"], out["twist"],
-        out["progress"], out["health"], grid.log_odds, grid.visited, row0, col0, grid.resolution,
+        out["progress"], out["health"], grid.cells, grid.trail, *grid.log_odds.shape, row0, col0, grid.resolution,
         grid.overview_sums, grid.overview_block, np.empty(0), 1.0, np.asarray(pose, dtype=np.float64),
         np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     )  # fmt: skip
@@ -145,15 +146,15 @@ def draw_maps(grid: OccupancyGrid, pose: Array) -> Observation:
 def _fill(
     map_local: NDArray[np.uint8], map_global: NDArray[np.uint8], scan_out: NDArray[np.float32],
     pose_out: NDArray[np.float32], cov_out: NDArray[np.float32], twist_out: NDArray[np.float32],
-    progress_out: NDArray[np.float32], health_out: NDArray[np.float32], log_odds: NDArray[np.int8],
-    trail: NDArray[np.uint8], row0: int, col0: int, resolution: float, overview: NDArray[np.int32], block: int,
-    ranges: Array, range_max: float, pose: Array, cov: Array, vx: float, vy: float, omega: float,
-    time_used: float, known_area_m2: float, health: float,
+    progress_out: NDArray[np.float32], health_out: NDArray[np.float32], cells: NDArray[np.uint8],
+    trail: NDArray[np.uint8], rows: int, cols: int, row0: int, col0: int, resolution: float,
+    overview: NDArray[np.int32], block: int, ranges: Array, range_max: float, pose: Array, cov: Array, vx: float,
+    vy: float, omega: float, time_used: float, known_area_m2: float, health: float,
 ) -> None:  # fmt: skip
     """Fill everything but the landmarks, in one call."""
     centre_x, centre_y, half = _map_frame(row0, col0, overview.shape[1], overview.shape[2], block, resolution)
     x, y = (pose[0] - centre_x) / half, (pose[1] - centre_y) / half
-    _fill_local(map_local, log_odds, trail, row0, col0, resolution, pose[0], pose[1], pose[2])
+    _fill_local(map_local, cells, trail, rows, cols, row0, col0, resolution, pose[0], pose[1], pose[2])
     _fill_global(map_global, overview, block, x, y)
     for i in range(ranges.shape[0]):
         # A lost beam says as little as one that nothing returned: 1.
@@ -180,15 +181,15 @@ def _within(value: float, limit: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_local(
-    out: NDArray[np.uint8], log_odds: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int,
-    resolution: float, x: float, y: float, theta: float,
+    out: NDArray[np.uint8], cells: NDArray[np.uint8], trail: NDArray[np.uint8], rows: int, cols: int, row0: int,
+    col0: int, resolution: float, x: float, y: float, theta: float,
 ) -> None:  # fmt: skip
     """Fill the robot-centred map: row 0 is farthest ahead, column 0 farthest to the left.
 
     A pixel takes the more occupied of two points in it, a quarter pixel from its middle on one diagonal, and its
     neighbours on the other: so a wall one cell thick does not slip through, whichever way it runs.
 
-    ``log_odds`` and ``visited`` are a grid's own arrays: behind their last cell is another that is zero.
+    ``cells`` and ``trail`` are a grid's, of so many rows and columns: behind the last is another that is zero.
     """
     size = out.shape[1]
     step = LOCAL_CELL_M / resolution
@@ -203,14 +204,13 @@ def _fill_local(
         for odd in range(2):
             one_way = (odd + j) & 1 == 1
             offset[odd, 0, j], offset[odd, 1, j] = ax if one_way else bx, ay if one_way else by
-    cells, trail = log_odds.view(np.uint8).ravel(), visited.ravel()
     first, second, middle = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     probability_out, observed_out, trail_out = out[0].ravel(), out[1].ravel(), out[2].ravel()
     for i in range(size):
         x0 = np.float32(x / resolution - col0 + c * (half - i) - s * half)
         y0 = np.float32(y / resolution - row0 + s * (half - i) + c * half)
         # A row's indices first, in a loop that vectorises, then the look-ups, which cannot.
-        find_row_cells(x0, y0, along, offset[i & 1], log_odds.shape, first, second, middle)
+        find_row_cells(x0, y0, along, offset[i & 1], rows, cols, first, second, middle)
         # Unsigned indices: others are tested for being negative.
         for j in range(np.uint64(size)):
             pixel = np.uint64(i * size) + j
@@ -228,7 +228,7 @@ def _fill_local(
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # else it does not vectorise
 def find_row_cells(
     x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32],
-    shape: tuple[int, int], first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
+    rows: int, cols: int, first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Write which cells of a grid a row of pixels looks at; all numbers are in cells.
 
@@ -240,17 +240,17 @@ def find_row_cells(
         ``(2, n)``: how far to the right (x) and down (y) of it the others are; neither turns back.
     offset
         ``(2, n)``: from each pixel's middle to the first of its two points; the second lies opposite.
-    shape
-        Rows and columns.
+    rows, cols
+        Of the grid.
     first, second, middle
         ``(n,)``, filled: indices of the cells under either point and the middle, counted row by row; one beyond
         the last cell for a pixel that may reach over an edge.
     """
-    rows, cols = shape
     right, down, to_x, to_y = along[0], along[1], offset[0], offset[1]
     n = right.shape[0]
     low_x, low_y = max(abs(to_x[0]), abs(to_x[1])), max(abs(to_y[0]), abs(to_y[1]))
-    high_x, high_y = np.float32(cols) - low_x, np.float32(rows) - low_y
+    # Less what the sums below may be rounded up by, which would be a row beyond the last.
+    high_x, high_y = np.float32(cols) * _ALL_BUT_ROUNDING - low_x, np.float32(rows) * _ALL_BUT_ROUNDING - low_y
     x1, y1 = x0 + right[n - 1], y0 - down[n - 1]
     width, nowhere = np.int32(cols), np.int32(rows * cols)
     if min(x0, x1) >= low_x and max(x0, x1) < high_x and min(y0, y1) >= low_y and max(y0, y1) < high_y:

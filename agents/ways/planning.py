@@ -253,7 +253,7 @@ def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
 def _segment(
     a: Array, b: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
 ) -> tuple[float, float]:
-    """Price of the straight line a–b (inf where it leaves passable cells) and its smallest clearance."""
+    """Price of the straight line a–b (inf where it leaves passable cells, or the map) and its least clearance."""
     length = math.hypot(b[0] - a[0], b[1] - a[1])
     count = max(1, math.ceil(length / (0.5 * resolution)))
     total, nearest = 0.0, np.inf
@@ -261,7 +261,8 @@ def _segment(
         share = i / count
         col = math.floor((a[0] + share * (b[0] - a[0]) - origin[0]) / resolution)
         row = math.floor((a[1] + share * (b[1] - a[1]) - origin[1]) / resolution)
-        if weight[row, col] <= 0.0:
+        inside = 0 <= row < weight.shape[0] and 0 <= col < weight.shape[1]
+        if not inside or weight[row, col] <= 0.0:
             return np.inf, 0.0
         # Trapezoidal rule: the ends count half.
         total += weight[row, col] * (0.5 if i == 0 or i == count else 1.0)
@@ -284,7 +285,7 @@ def _cut_straight(
     i = 0
     while i < n - 1:
         last = min(i + span, n - 1)
-        so_far[i], lowest[i] = 0.0, wall[0, 0]
+        so_far[i], lowest[i] = 0.0, np.inf
         for j in range(i + 1, last + 1):
             price, nearest = _segment(points[j - 1], points[j], weight, wall, resolution, origin)
             so_far[j] = so_far[j - 1] + price

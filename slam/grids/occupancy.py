@@ -63,6 +63,8 @@ class OccupancyGrid:
         ``(rows, cols)``, in units of 0.05 nat.
     visited : NDArray[np.uint8]
         ``(rows, cols)``, 1 where the robot's body has been.
+    cells, trail : NDArray[np.uint8]
+        Either one's bytes ``(rows · cols + spare,)``, row by row: kernels may read some that are zero behind them.
     known_cells : int
         Number of cells ever observed.
     entropy_bit : float
@@ -83,8 +85,7 @@ class OccupancyGrid:
         self.resolution = float(resolution)
         self._col0 = self._row0 = -_CHUNK  # lattice index of cell (0, 0) …
         self._col1 = self._row1 = _CHUNK  # … and of the one beyond the last
-        shape = (2 * _CHUNK, 2 * _CHUNK)
-        self.log_odds, self.visited = _blank(shape).view(np.int8), _blank(shape)
+        self._lay_out(2 * _CHUNK, 2 * _CHUNK)
         self.known_cells = 0
         self.entropy_bit = 0.0
         self.revision = self.drawings = 0
@@ -94,11 +95,20 @@ class OccupancyGrid:
         self._lidar: tuple[int, float, float, float] | None = None
         self._build_overview()
 
+    def _lay_out(self, rows: int, cols: int) -> None:
+        """Take new planes, all unknown."""
+        self.cells, self.trail = (np.zeros(rows * cols + WINDOW, np.uint8) for _ in range(2))
+        self.log_odds = self.cells[:-WINDOW].view(np.int8).reshape(rows, cols)
+        self.visited = self.trail[:-WINDOW].reshape(rows, cols)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what holds the planes' bytes once more."""
+        return {name: value for name, value in self.__dict__.items() if name not in ("cells", "trail")}
+
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make a copy or a pickle whole: its planes came without the bytes behind them."""
+        """Make a copy or a pickle whole: its planes came each by itself."""
         self.__dict__.update(state)
-        self.log_odds = _blank(self.shape).view(np.int8)
-        self.visited = _blank(self.shape)
+        self._lay_out(*self.shape)
         self.log_odds[:], self.visited[:] = state["log_odds"], state["visited"]
 
     @classmethod
@@ -287,7 +297,7 @@ class OccupancyGrid:
             grown[: self._change_count] = self._changes[: self._change_count]
             self._changes = grown
         self._change_count, known, entropy = draw(
-            mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.log_odds, self.visited, self._row0,
+            mask, beams, surface, mask_row, mask_col, r0, c0, r1, c1, self.cells, self.visited, self._row0,
             self._col0, self.overview_sums, self._overview_shift, self._changes, self._change_count,
             body_y - self._row0, body_x - self._col0, radius, self._dense, GAP_M / resolution,
         )  # fmt: skip
@@ -350,15 +360,14 @@ class OccupancyGrid:
             old if wanted <= old else (-(-wanted // _CHUNK) + _SPARE) * _CHUNK
             for wanted, old in ((row1, self._row1), (col1, self._col1))
         )  # fmt: skip
-        r, c = self._row0 - new_row0, self._col0 - new_col0
-        shape = (new_row1 - new_row0, new_col1 - new_col0)
-        log_odds, visited = _blank(shape).view(np.int8), _blank(shape)
-        log_odds[r : r + rows, c : c + cols] = self.log_odds
-        visited[r : r + rows, c : c + cols] = self.visited
-        drawn = np.zeros((shape[0] // _CHUNK, shape[1] // _CHUNK), np.int64)
+        r, c, log_odds, visited = self._row0 - new_row0, self._col0 - new_col0, self.log_odds, self.visited
+        self._lay_out(new_row1 - new_row0, new_col1 - new_col0)
+        self.log_odds[r : r + rows, c : c + cols] = log_odds
+        self.visited[r : r + rows, c : c + cols] = visited
+        drawn = np.zeros((self.shape[0] // _CHUNK, self.shape[1] // _CHUNK), np.int64)
         r, c, (rows, cols) = r // _CHUNK, c // _CHUNK, self._drawn.shape
         drawn[r : r + rows, c : c + cols] = self._drawn
-        self.log_odds, self.visited, self._drawn = log_odds, visited, drawn
+        self._drawn = drawn
         self._row0, self._col0, self._row1, self._col1 = new_row0, new_col0, new_row1, new_col1
         self._build_overview()
 
@@ -384,12 +393,6 @@ class OccupancyGrid:
         self.overview_block, self._overview_shift = block, block.bit_length() - 1
         self.overview_sums = np.zeros((3, rows // block, cols // block), np.int32)
         sum_blocks(self.log_odds, self.visited, self._overview_shift, self.overview_sums)
-
-
-def _blank(shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a plane of zeros with some more behind it, which kernels may read: see ``_take_unsettled``."""
-    size = shape[0] * shape[1]
-    return np.zeros(size + WINDOW, np.uint8)[:size].reshape(shape)
 
 
 def _box_of(x: float, y: float, radius: float) -> tuple[int, int, int, int]:

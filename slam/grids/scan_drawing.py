@@ -120,8 +120,8 @@ def _step_of(marks: np.uint64, cells: np.uint64, k: int) -> np.uint64:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _take_unsettled(
-    mask: NDArray[np.uint8], cells: NDArray[np.uint8], down: int, ahead: int, top: int, left: int, bottom: int,
-    right: int,
+    mask: NDArray[np.uint8], cells: NDArray[np.uint8], width: int, down: int, ahead: int, top: int, left: int,
+    bottom: int, right: int,
 ) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:  # fmt: skip
     """Wipe a box of the mask; return its windows with marks that change a cell, and which words these are.
 
@@ -130,8 +130,8 @@ def _take_unsettled(
     Most of a known map is settled: its cells are at the limit that a scan pushes them to. Nothing here branches
     on what a cell holds, which the processor would guess wrongly along every rim.
 
-    A window may reach beyond the box: the mask is wide enough for it and bears no marks there, and
-    :data:`WINDOW` bytes to spare follow the grid.
+    A window may reach beyond the box: the mask is wide enough for it and bears no marks there, and of the cells,
+    ``width`` to a row of the grid, there are :data:`WINDOW` to spare at their end.
     """
     u = np.uint64  # as indices, others are tested for being negative
     words_each = u(WINDOW // WORD)
@@ -142,9 +142,10 @@ def _take_unsettled(
     for i in range(u(top), u(bottom + 1)):
         for j in range(u(left), u(right + 1), u(WINDOW)):
             row, col = i + u(down), j + u(ahead)
+            first = row * u(width) + col
             any_unsettled = False
             for k in range(u(WINDOW)):
-                mark, cell = mask[i, j + k], cells[row, col + k]
+                mark, cell = mask[i, j + k], cells[first + k]
                 unsettled = (
                     ((mark == IN_FREE) & (cell != _SURELY_FREE))
                     | ((mark == IN_SURFACE) & (cell != _SURELY_OCCUPIED))
@@ -168,8 +169,8 @@ def _take_unsettled(
 @njit(cache=True, nogil=True, error_model="numpy")
 def fuse(
     mask: NDArray[np.uint8], mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
-    log_odds: NDArray[np.int8], lattice_row: int, lattice_col: int, overview: NDArray[np.int32], shift: int,
-    changes: NDArray[np.int32], count: int,
+    cells: NDArray[np.uint8], width: int, lattice_row: int, lattice_col: int, overview: NDArray[np.int32],
+    shift: int, changes: NDArray[np.int32], count: int,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Add the box [top, bottom] × [left, right] of a scan's mask to the grid and wipe it.
 
@@ -178,27 +179,28 @@ def fuse(
     """
     u = np.uint64  # as indices, others are tested for being negative
     words_each = u(WINDOW // WORD)
-    words = log_odds.view(np.uint64)
+    words, words_a_row = cells.view(np.uint64), u(width // WORD)
     windows, todo = _take_unsettled(
-        mask, log_odds.view(np.uint8), mask_row - lattice_row, mask_col - lattice_col, top, left, bottom, right
+        mask, cells, width, mask_row - lattice_row, mask_col - lattice_col, top, left, bottom, right
     )
-    width = min(1 << shift, WORD)  # cells of a word within one block of the overview
+    together = (1 << shift) >= WORD  # the cells of a word are in one block of the overview
     known = entropy = 0
     for t in range(u(todo.shape[0])):
         window, word = u(todo[t]) // words_each, u(todo[t]) % words_each
         marks, row = windows[window, word], windows[window, words_each]
         col = windows[window, words_each + u(1)] + u(WORD) * word
-        before, after = words[row, col // u(WORD)], u(0)
+        at = row * words_a_row + col // u(WORD)
+        before, after = words[at], u(0)
         gain = 0
         for k in range(WORD):
             step = _step_of(marks, before, k)
             after |= u(_NEXT[step]) << u(8 * k)
             gain += _GAIN[step]
-        words[row, col // u(WORD)] = after
+        words[at] = after
         known += (gain >> _KNOWN_AT) & _COUNT
         entropy += gain >> _ENTROPY_AT
         r = row >> u(shift)
-        if width == WORD:
+        if together:
             overview[0, r, col >> u(shift)] += (gain >> _KNOWN_AT) & _COUNT
             overview[1, r, col >> u(shift)] += (gain & _PROBABILITY) - WORD * _BIAS
         else:
@@ -222,7 +224,7 @@ def fuse(
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw(
     mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
-    left: int, bottom: int, right: int, log_odds: NDArray[np.int8], visited: NDArray[np.uint8], lattice_row: int,
+    left: int, bottom: int, right: int, cells: NDArray[np.uint8], visited: NDArray[np.uint8], lattice_row: int,
     lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
     x: float, radius: float, dense: float, gap: float,
 ) -> tuple[int, int, float]:  # fmt: skip
@@ -233,8 +235,8 @@ def draw(
     mark_surfaces(mask, beams, surface, dense, gap)
     mark_disc(visited, overview, shift, y, x, radius)
     return fuse(
-        mask, mask_row, mask_col, top, left, bottom, right, log_odds, lattice_row, lattice_col, overview, shift,
-        changes, count,
+        mask, mask_row, mask_col, top, left, bottom, right, cells, visited.shape[1], lattice_row, lattice_col,
+        overview, shift, changes, count,
     )  # fmt: skip
 
 

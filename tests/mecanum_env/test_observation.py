@@ -34,7 +34,7 @@ def test_local_map_against_the_simple_version(pose: tuple[float, float, float], 
     grid = room_grid(resolution)
     x, y, theta = pose
     out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
-    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, resolution, x, y, theta)
+    _fill_local(out, grid.cells, grid.trail, *grid.shape, *grid.lattice_origin, resolution, x, y, theta)
     c, s = math.cos(theta), math.sin(theta)
     differing = 0
     for i in range(0, MAP_SIZE, 3):
@@ -96,7 +96,7 @@ def test_local_map_equals_one_made_a_whole_picture_at_a_time(
     grid.log_odds[speckled] = rng.integers(-39, 71, np.count_nonzero(speckled))
     grid.visited[:] = rng.random(grid.shape) < 0.3
     out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
-    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, resolution, *pose)
+    _fill_local(out, grid.cells, grid.trail, *grid.shape, *grid.lattice_origin, resolution, *pose)
     probability, trail = local_map_simply(grid, resolution, *pose)
     np.testing.assert_array_equal(out[0], probability)
     np.testing.assert_array_equal(out[1] == 255, probability != UNKNOWN_BYTE)
@@ -108,7 +108,7 @@ def test_the_local_map_is_heading_up() -> None:
     pose = np.array([2.0, 2.5, math.pi / 2])  # facing +y: the wall ahead is 2.5 m away, the left one 2 m
     grid.integrate(pose, room_scan(pose))
     out = np.empty((3, MAP_SIZE, MAP_SIZE), np.uint8)
-    _fill_local(out, grid.log_odds, grid.visited, *grid.lattice_origin, 0.05, *pose)
+    _fill_local(out, grid.cells, grid.trail, *grid.shape, *grid.lattice_origin, 0.05, *pose)
     middle = MAP_SIZE // 2
     assert np.argmax(out[0, :middle, middle] > 170) in (6, 7)  # 2.5 m ahead is row 32 - 25
     assert np.flatnonzero(out[0, middle, :middle] > 170)[-1] in (11, 12)  # 2 m to the left is column 32 - 20
@@ -144,7 +144,7 @@ def test_a_row_of_pixels_looks_at_the_cells_under_it_and_at_none_beyond_the_edge
         sides = np.array([[c - s, c + s], [s + c, s - c]], np.float32) / 4
         offset = np.ascontiguousarray(np.tile(sides, n // 2))
         found = np.empty((3, n), np.int32)
-        find_row_cells(x0, y0, along, offset, shape, *found)
+        find_row_cells(x0, y0, along, offset, *shape, *found)
         # One pixel after the other, each asked whether it may reach over an edge.
         x, y = x0 + along[0], y0 - along[1]
         low_x, low_y = np.abs(sides).max(axis=1)
@@ -154,3 +154,14 @@ def test_a_row_of_pixels_looks_at_the_cells_under_it_and_at_none_beyond_the_edge
             np.testing.assert_array_equal(got, np.where(inside, row * shape[1] + col, shape[0] * shape[1]))
         within += bool(inside.all())
     assert 20 < within < 280  # both ways were gone
+
+
+def test_no_sum_is_rounded_up_to_a_row_beyond_the_last() -> None:
+    rng, n, shape = np.random.default_rng(0), MAP_SIZE, (220, 260)
+    for theta in rng.uniform(-math.pi, math.pi, 2000):
+        c, s = np.float32(2.0 * math.cos(theta)), np.float32(2.0 * math.sin(theta))
+        sides = np.array([[c - s, c + s], [s + c, s - c]], np.float32) / 4
+        offset, found = np.ascontiguousarray(np.tile(sides, n // 2)), np.empty((3, n), np.int32)
+        y0 = np.nextafter(np.float32(shape[0]) - np.abs(sides[1]).max(), np.float32(0.0))
+        find_row_cells(np.float32(100.0), y0, np.zeros((2, n), np.float32), offset, *shape, *found)
+        assert found.max() <= shape[0] * shape[1]

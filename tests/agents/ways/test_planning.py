@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from agents.driving.safety import local_map
 from agents.ways import cost_map as cost_maps
 from agents.ways.cost_map import CostMap, PlannerConfig, comfortable_clearance, tight_clearance
-from agents.ways.planning import resample, shortest_path, travel_costs
+from agents.ways.planning import _segment, resample, shortest_path, travel_costs
 from mecanum_env.config import RobotConfig
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, half_known, room, two_rooms
@@ -120,6 +120,14 @@ def test_walls_push_the_path_away():
     inner = weights[weights > 0]
     assert (np.diff(inner[: len(inner) // 2]) <= 1e-6).all()
     assert inner[0] == pytest.approx(1.0 + 1.0 + 3.0, abs=1.0)
+
+
+def test_a_line_that_leaves_the_map_has_no_price():
+    """A belief may put the robot outside of it: Numba wraps indices below zero, and reads on past the end."""
+    weight, inside = np.ones((6, 8), np.float32), np.array([0.4, 0.3])
+    for outside in ([-0.3, 0.3], [0.4, -0.3], [0.9, 0.3], [0.4, 0.7]):
+        for a, b in ((inside, np.array(outside)), (np.array(outside), inside)):
+            assert _segment(a, b, weight, weight, 0.1, np.zeros(2)) == (np.inf, 0.0)
 
 
 def test_unknown_is_never_crossed():

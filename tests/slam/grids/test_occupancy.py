@@ -115,8 +115,8 @@ def test_fusing_a_mask_follows_the_rule_of_one_cell(seed: int, side: int, share:
     changes = np.zeros((marks.size + 1, 4), np.int32)
     lattice_row, lattice_col = grid.lattice_origin
     count, known, entropy = fuse(
-        mask, lattice_row + row, lattice_col + col, top, left, bottom, right, grid.log_odds, lattice_row,
-        lattice_col, grid.overview_sums, grid._overview_shift, changes, 0,
+        mask, lattice_row + row, lattice_col + col, top, left, bottom, right, grid.cells, grid.shape[1],
+        lattice_row, lattice_col, grid.overview_sums, grid._overview_shift, changes, 0,
     )  # fmt: skip
 
     after = np.where(marks == IN_FREE, np.maximum(before + MISS, MIN_LOG_ODDS), before)
@@ -229,11 +229,8 @@ def test_a_copy_goes_its_own_way_and_has_the_bytes_that_kernels_read_behind_the_
     copied.integrate(pose, room_scan(pose), body=(3.0, 2.0, 0.25))
     np.testing.assert_array_equal(grid.log_odds, before)
     assert copied.visited.any() and not grid.visited.any()
-    for plane in (copied.log_odds, copied.visited):
-        owner = plane
-        while owner.base is not None:
-            owner = owner.base
-        assert owner.nbytes >= plane.nbytes + WINDOW
+    for plane, row in ((copied.log_odds, copied.cells), (copied.visited, copied.trail)):
+        assert np.shares_memory(plane, row) and row.nbytes >= plane.nbytes + WINDOW
 
 
 def test_growing_keeps_every_cell_where_it_was() -> None:

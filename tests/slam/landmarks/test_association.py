@@ -15,6 +15,7 @@ from slam import Observations, Odometry
 from slam.gaussian.stacked_update import NO_LIMITS
 from slam.geometry import compose, inverse, wrap
 from slam.landmarks.association import IGNORED, nearest_neighbour, predicted
+from slam.landmarks.book import MARKS
 from slam.landmarks.joint_compatibility import JOINT_GATES, joint_compatibility
 from tests.slam.numerics import random_covariance
 from tests.slam.simulated import circle_twist, drive, observe_landmarks, room_scan
@@ -70,7 +71,7 @@ def test_joint_compatibility_finds_the_best_set_of_all(seed: int) -> None:
     z = np.array([observe(x, int(i), sigma=0.02) for i in rng.integers(0, 4, 3)])
     z[:, :2] += rng.normal(0, 0.08, (3, 2))
     match = np.zeros(3, np.int64)
-    distance = joint_compatibility(x, np.triu(p), OFFSET, z, np.zeros((4, 2)), 0.2, 0.6, match)
+    distance = joint_compatibility(x, np.triu(p), OFFSET, z, np.zeros((4, MARKS)), 0.2, 0.6, match)
     pairs = [(k, int(i)) for k, i in enumerate(match) if i >= 0]
     count, nearest = exhaustive(x, p, z, 4)
     assert len(pairs) == count
@@ -88,7 +89,7 @@ def test_joint_compatibility_holds_where_nearest_neighbour_is_fooled() -> None:
     truth[1] = 0.12
     z = np.array([observe(truth, i, sigma=0.01) for i in (1, 2, 3, 4)])
     nearest, joint = np.zeros(4, np.int64), np.zeros(4, np.int64)
-    marks = np.zeros((5, 2))
+    marks = np.zeros((5, MARKS))
     nearest_neighbour(x, p, OFFSET, z, marks, JOINT_GATES[1], 0.1, 0.6, False, nearest, np.zeros(4))
     joint_compatibility(x, p, OFFSET, z, marks, 0.1, 0.6, joint)
     assert nearest[:3].tolist() == [0, 1, 2]
@@ -101,7 +102,7 @@ def test_what_could_be_a_landmark_but_is_not_jointly_is_not_new() -> None:
     z = np.array([observe(x, i, sigma=0.002) for i in range(3)])
     z[2, 0] += 0.1  # within the pose's own gate, not together with the other two
     match = np.zeros(3, np.int64)
-    joint_compatibility(x, p, OFFSET, z, np.zeros((3, 2)), 0.1, 0.6, match)
+    joint_compatibility(x, p, OFFSET, z, np.zeros((3, MARKS)), 0.1, 0.6, match)
     assert match.tolist() == [0, 1, IGNORED]
 
 
