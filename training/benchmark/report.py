@@ -146,14 +146,18 @@ def _teams(report: Report, suite: str) -> str:
     scalings = report.scalings(suite)
     if not scalings:
         return ""
-    legend = "".join(f"<span>{_key(k)}{name_html(s.name)}</span>" for k, s in enumerate(scalings))
+    charts = ""
+    for how in dict.fromkeys(s.communication for s in scalings):
+        part = [s for s in scalings if s.communication == how]
+        legend = "".join(f"<span>{_key(k)}{name_html(s.agent)}</span>" for k, s in enumerate(part))
+        charts += f"<h4>Who hears whom: {escape(how)}</h4>" if how else ""
+        charts += f'<nav>{legend}</nav><div class="charts">{scaling_charts(part)}</div>'
     return (
         "<h3>Several robots</h3>"
         '<p class="soft">Time until the team has mapped 95 %, with its interval; thin and dashed, what there '
         "would be if so many robots were so many times as fast. Against one robot: on the same episodes. A "
         "contact of two robots counts for both. NEES / 3 is over all robots.</p>"
-        f'<nav>{legend}</nav><div class="charts">{scaling_charts(scalings)}</div>'
-        + tables.html(scaling_table(scalings))
+        + charts + tables.html(scaling_table(scalings))
     )
 
 

@@ -24,7 +24,8 @@ _SHOWN = ("reached_95", "ate_rmse_m")
 class Scaling:
     """One agent's figures in one suite, by rising number of robots."""
 
-    name: str  # the agent, with its backend and communication where there are several
+    agent: str  # with its backend where there are several
+    communication: str  # where there are several models of it
     robots: tuple[int, ...]
     episodes: tuple[int, ...]
     time: tuple[Interval, ...]  # to 95 % of the team [s]
@@ -32,6 +33,11 @@ class Scaling:
     touching: tuple[Interval, ...]  # contacts of robots with each other, each counted for both, a 100 m driven
     others: tuple[dict[str, Interval], ...]  # of _SHOWN, by the metrics' keys
     nees: tuple[float | None, ...]  # NEES / 3 over all robots and seconds
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+        return f"{self.agent}, {self.communication}" if self.communication else self.agent
 
 
 def scaling_of(groups: Sequence[Group], *, suite: str) -> list[Scaling]:
@@ -43,16 +49,16 @@ def scaling_of(groups: Sequence[Group], *, suite: str) -> list[Scaling]:
     for agent, slam, how in ways:
         line = [g for g in own if (g.agent, g.slam) == (agent, slam) and g.communication in ("", how)]
         line.sort(key=lambda group: group.robots)
-        name = agent + (f"@{slam}" if several[0] else "") + (f", {how}" if several[1] else "")
-        found.append(_scaling(name, line))
+        found.append(_scaling(f"{agent}@{slam}" if several[0] else agent, how if several[1] else "", line))
     return found
 
 
-def _scaling(name: str, line: Sequence[Group]) -> Scaling:
+def _scaling(agent: str, communication: str, line: Sequence[Group]) -> Scaling:
     alone = next((group for group in line if group.robots == 1), None)
     every = [figures(group) for group in line]
     return Scaling(
-        name=name,
+        agent=agent,
+        communication=communication,
         robots=tuple(group.robots for group in line),
         episodes=tuple(len(group.rows) for group in line),
         time=tuple(found[_TIME].centre for found in every),

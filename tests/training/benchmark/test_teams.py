@@ -153,11 +153,11 @@ def test_teams_are_added_to_single_robots_and_the_command_goes_on(
 # ---- figures ---------------------------------------------------------------------------------------------------
 
 
-def team_group(robots: int, times: list[float | None], *, contacts: int = 0) -> Group:
+def team_group(robots: int, times: list[float | None], *, contacts: int = 0, hears: str = "range") -> Group:
     """Return a made-up group, its paths 30 m long."""
     n = len(times)
     group = made_up_group("a", time_to_95_s=times, robot_collisions=[contacts] * n)
-    keys = tuple((*key[:5], robots, "range") if robots > 1 else key for key in group.keys)
+    keys = tuple((*key[:5], robots, hears) if robots > 1 else key for key in group.keys)
     rows = tuple(
         episode(key, time_to_95_s=t, robot_collisions=contacts, limit_s=300.0)
         for key, t in zip(keys, times, strict=True)
@@ -199,9 +199,20 @@ def test_tables_and_page_show_them() -> None:
     assert "teams" not in as_json(alone) and "Several robots" not in page(alone, config_text="")
 
 
+def test_each_model_of_communication_has_charts_of_its_own() -> None:
+    groups = [team_group(1, [200.0] * 4)]
+    groups += [
+        team_group(n, [200.0 / n + k for k in range(4)], hears=how) for how in ("none", "walls") for n in (2, 3)
+    ]
+    report = Report.of(groups, baseline=None, config={"agents": ["a"], "split": "test"})
+    shown = page(report, config_text="")
+    assert re.findall("Who hears whom: ([a-z]+)", shown) == ["none", "walls"]
+    assert shown.count("<h4>") == 2 and "a, walls ×3" in shown
+
+
 def test_charts_keep_many_lines_within_and_need_one_robot_for_gains() -> None:
     (line,) = scaling_of([team_group(n, [200.0 / n + k for k in range(4)]) for n in (2, 3)], suite="rooms")
-    chart = scaling_charts([replace(line, name=f"team {k}") for k in range(40)])
+    chart = scaling_charts([replace(line, agent=f"team {k}") for k in range(40)])
     assert chart.count("<svg") == 1 and "times as fast" not in chart
     dots = [float(x) for x in re.findall(r'<circle[^>]* cx="([^"]*)"', chart)]
     assert len(dots) == 80 and min(dots) > 44.0 and max(dots) < 468.0  # of the axes
