@@ -33,6 +33,7 @@ class Scaling:
     touching: tuple[Interval, ...]  # contacts of robots with each other, each counted for both, a 100 m driven
     others: tuple[dict[str, Interval], ...]  # of _SHOWN, by the metrics' keys
     nees: tuple[float | None, ...]  # NEES / 3 over all robots and seconds
+    nees_each: tuple[tuple[float, ...], ...]  # the same of each robot, in their order
 
     @property
     def name(self) -> str:
@@ -68,7 +69,13 @@ def _scaling(agent: str, communication: str, line: Sequence[Group]) -> Scaling:
         touching=tuple(map(_touching, line)),
         others=tuple({key: found[key].centre for key in _SHOWN} for found in every),
         nees=tuple(group.consistency()["nees_over_3_mean"] for group in line),
+        nees_each=tuple(map(_nees_each, line)),
     )
+
+
+def _nees_each(group: Group) -> tuple[float, ...]:
+    every = np.hstack([row.nees.reshape(group.robots, -1) for row in group.rows]).astype(np.float64)
+    return tuple(float(own[np.isfinite(own)].mean()) / 3.0 if np.isfinite(own).any() else np.nan for own in every)
 
 
 def _touching(group: Group) -> Interval:
@@ -96,10 +103,11 @@ def scaling_table(scalings: Sequence[Scaling]) -> Table:
                 *(figure(BY_KEY[key], s.others[k][key]) for key in _SHOWN),
                 figure(_TOUCHING, s.touching[k]),
                 Cell("–" if nees is None else f"{nees:.2f}"),
+                Cell(", ".join(f"{own:.2f}" for own in s.nees_each[k])),
             )))  # fmt: skip
     head = (
         "agent × robots", "episodes", "time to 95 % [s]", "against one robot", "reached 95 % [%]", "ATE [cm]",
-        f"{_TOUCHING.label} [{_TOUCHING.unit}]", "NEES / 3",
+        f"{_TOUCHING.label} [{_TOUCHING.unit}]", "NEES / 3", "each robot's",
     )  # fmt: skip
     return Table(head, tuple(rows))
 
@@ -110,7 +118,8 @@ def scalings_as_json(scalings: Sequence[Scaling]) -> list[dict[str, Any]]:
         {
             "name": s.name, "robots": robots, "episodes": s.episodes[k], "time_to_95_s": s.time[k].as_json(),
             "ratio_to_one": s.ratio[k].as_json(), "robot_collisions_per_100_m": s.touching[k].as_json(),
-            "nees_over_3": plain(s.nees[k]), **{key: found.as_json() for key, found in s.others[k].items()},
+            "nees_over_3": plain(s.nees[k]), "nees_over_3_each": [plain(own) for own in s.nees_each[k]],
+            **{key: found.as_json() for key, found in s.others[k].items()},
         }
         for s in scalings
         for k, robots in enumerate(s.robots)

@@ -180,6 +180,7 @@ def test_figures_by_the_number_of_robots() -> None:
     assert found.touching[1].value == pytest.approx(20.0)
     # Each robot is a run of its own.
     assert found.nees == (pytest.approx(1.0 / 3.0), pytest.approx(1.0))
+    assert found.nees_each == (pytest.approx((1.0 / 3.0,)), pytest.approx((1.0 / 3.0, 1.0, 5.0 / 3.0)))
     assert three.consistency()["nees_band_95"][1] < alone.consistency()["nees_band_95"][1]
     assert scaling_of([alone], suite="rooms") == []
 
