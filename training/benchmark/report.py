@@ -14,7 +14,15 @@ from slam.formats import atomic_write
 from training.benchmark import tables
 from training.benchmark.episode import EpisodeRow, Key
 from training.benchmark.output import Entry, Report, centres
-from training.benchmark.report_charts import COLOURS, Along, band, coverage_chart, extent, scaling_charts
+from training.benchmark.report_charts import (
+    COLOURS,
+    Along,
+    band,
+    coverage_chart,
+    extent,
+    scaling_charts,
+    team_chart,
+)
 from training.benchmark.team_figures import scaling_table
 from training.episodes.explore import ENDINGS
 from training.figures.page import html_page, name_html, text_html
@@ -35,10 +43,13 @@ that a search found. Regret is what a time is more than the least of all in the 
 
 
 def write_report(out: Path, report: Report) -> None:
-    """Write ``report.html`` beside the tables; it shows the ``config.toml`` that is there."""
+    """Write ``report.html`` beside the tables, with the ``config.toml`` there is, and of teams ``teams.png``."""
     config = out / "config.toml"
     text = config.read_text("utf-8") if config.exists() else ""
     atomic_write(out / FILE, page(report, config_text=text))
+    if report.has_teams:
+        scalings = {suite: report.scalings(suite) for suite in report.suites()}
+        atomic_write(out / "teams.png", team_chart(scalings))
 
 
 def page(report: Report, *, config_text: str) -> str:
@@ -157,7 +168,8 @@ def _teams(report: Report, suite: str) -> str:
         '<p class="soft">Time until the team has mapped 95 %, with its interval; thin and dashed, what there '
         "would be if so many robots were so many times as fast. Against one robot: on the same episodes. A "
         "contact of two robots counts for both. NEES / 3 is over all robots.</p>"
-        + charts + tables.html(scaling_table(scalings))
+        + charts
+        + tables.html(scaling_table(scalings))
     )
 
 

@@ -1,10 +1,14 @@
-"""Coverage curves over many episodes, and what more robots bring, as SVG that takes its colours from the page."""
+"""Coverage curves over many episodes, and what more robots bring, as SVG that takes its colours from the page.
+
+The latter also as a picture of all suites and models of communication.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -13,10 +17,11 @@ from matplotlib.ticker import MaxNLocator
 from slam.types import Array
 from training.benchmark.figures import Group
 from training.benchmark.team_figures import Scaling
+from training.figures import charts
 from training.figures.page import name_html
 from training.figures.statistics import Interval
 
-__all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts"]
+__all__ = ["COLOURS", "Band", "band", "coverage_chart", "extent", "scaling_charts", "team_chart"]
 
 Along = Literal["time_s", "path_length_m"]
 Line = tuple[str, list[tuple[int, Interval]]]  # name, and its figure for each number of robots
@@ -30,7 +35,12 @@ _LABELS = {"time_s": "time [s]", "path_length_m": "way [m]"}
 _WIDTH, _HEIGHT = 480, 300
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 24, 40  # margins
 _MOST = 1.6  # times the highest figure: what lies beyond is cut off
+_PANEL, _ROOM_ABOVE = (240, 260), 1.25  # of the picture: a chart's size [px]; room above the slowest robot alone
 _APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px] …
+_PANEL, _ROOM_ABOVE = (
+    (240, 260),
+    1.25,
+)  # [px] a chart of the picture; how far it goes beyond the slowest robot alone
 _SPREAD = 44.0  # … less, where there are many of them: so wide are all together [px]
 
 
@@ -200,3 +210,41 @@ def _scaling_chart(lines: Sequence[Line], label: str, ideal: Callable[[float, in
             x, y = at(n, f.value, k)
             parts.append(f'<circle class="{kind} dot" cx="{x}" cy="{y}" r="2.5"/>')
     return _chart(f"{label} against the number of robots: {names}", parts, up=label, along="robots")
+
+
+def team_chart(suites: Mapping[str, Sequence[Scaling]]) -> bytes:
+    """Return a PNG: time to 95 % against the number of robots, a row a suite, a column a model of communication.
+
+    There is no point where some of the episodes did not reach 95 %.
+    """
+    models = list(dict.fromkeys(s.communication for scalings in suites.values() for s in scalings))
+    agents = list(dict.fromkeys(s.agent for scalings in suites.values() for s in scalings))
+    size = max(_PANEL[0] * len(models) + 60, 520), _PANEL[1] * len(suites) + 90
+    figure, every = charts.chart(len(suites), len(models), size=size)
+    for axes, ((suite, scalings), how) in zip(every, product(suites.items(), models), strict=True):
+        counts = sorted({n for s in scalings for n in s.robots})
+        alone = [s.time[0].value for s in scalings if s.robots[0] == 1]
+        for s in scalings:
+            if s.communication == how:
+                k = agents.index(s.agent)
+                every_n = zip(s.robots, s.time, s.others, strict=True)
+                there = [(n, time.value) for n, time, also in every_n if also["reached_95"].value >= 1.0]
+                axes.plot(
+                    [n for n, _ in there], [t for _, t in there], "--o" if k >= len(charts.COLOURS) else "-o",
+                    color=charts.COLOURS[k % len(charts.COLOURS)], markersize=3.5, label=s.agent,
+                )  # fmt: skip
+        if alone:
+            fastest = min(alone)
+            axes.plot(
+                counts, [fastest / n for n in counts], ":", color=charts.INK, label="so many times as fast as one"
+            )
+            axes.set_ylim(0.0, _ROOM_ABOVE * max(alone))
+        axes.set_xticks(counts)
+        if how == models[0]:
+            axes.set_ylabel(f"{suite}\ntime to 95 % [s]")
+        if suite == next(iter(suites)):
+            axes.set_title(how, loc="left", fontweight="bold")
+        if suite == list(suites)[-1]:
+            axes.set_xlabel("robots")
+    figure.legend(*every[0].get_legend_handles_labels(), loc="outside lower center", ncol=5, frameon=False)
+    return charts.png(figure)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import Report, as_json, markdown, table
 from training.benchmark.report import page
-from training.benchmark.report_charts import COLOURS, scaling_charts
+from training.benchmark.report_charts import COLOURS, scaling_charts, team_chart
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import teams_of
 from training.benchmark.team_episode import TeamJob, run_job
@@ -146,6 +147,7 @@ def test_teams_are_added_to_single_robots_and_the_command_goes_on(
         len(rows[0].split(",")) - 2 - len(single.splitlines()[0].split(","))
     )
     assert "Several robots" in (out / "report.html").read_text("utf-8")
+    assert (out / "teams.png").stat().st_size > 5000
     assert main(small(out, "--robots", "2", "--communication", "range", "--range", "3")) == 2
     assert "other code, configuration or plans" in capsys.readouterr().err
 
@@ -209,6 +211,15 @@ def test_each_model_of_communication_has_charts_of_its_own() -> None:
     shown = page(report, config_text="")
     assert re.findall("Who hears whom: ([a-z]+)", shown) == ["none", "walls"]
     assert shown.count("<h4>") == 2 and "a, walls ×3" in shown
+
+
+def test_a_picture_has_a_chart_for_each_suite_and_model() -> None:
+    groups = [team_group(n, [200.0 / n] * 3 + [None if n == 3 else 60.0], hears="walls") for n in (1, 2, 3)]
+    lines = scaling_of(groups, suite="rooms")
+    suites = {"rooms": lines, "others": [replace(line, communication="none") for line in lines]}
+    found = cv2.imdecode(np.frombuffer(team_chart(suites), np.uint8), cv2.IMREAD_COLOR)
+    assert found.shape == (610, 540, 3) and found.std() > 10.0
+    assert team_chart(suites) == team_chart(suites)
 
 
 def test_charts_keep_many_lines_within_and_need_one_robot_for_gains() -> None:
