@@ -45,6 +45,7 @@ class CornerConfig(Config):
     off_m: Length = 0.05  # from the wall …
     beyond_m: Length = 0.15  # … and past what was seen of it
     gate: Annotated[float, Within("(0, 1)")] = 0.997  # probability of χ² of the distance from the wall
+    jamb_m: Length = 0.4  # … or a convex corner's, where no other is: of 54,000 this takes 6 true and 5 false ones
     crossing_rad: Angle = 0.96  # least angle between two walls that make a corner
     reach_m: Length = 0.06  # from a convex corner to what was seen of its walls; 5 of 6 farther off were false
     # The end of a surface lies between two beams: a uniform error, of a twelfth of the squared spacing. The filter
@@ -102,19 +103,24 @@ def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array
     off, along = account.points @ normals.T - r, account.points @ tangents.T
     bisectors = np.column_stack([np.cos(account.directions), np.sin(account.directions)])
     likely = (np.abs(off) < config.off_m) & (bisectors @ normals.T < -_FACING)  # not so where it is not known
-    likely &= np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1)) < config.beyond_m
+    beyond = np.maximum(ends.min(axis=1) - along, along - ends.max(axis=1))
+    likely &= beyond < max(config.beyond_m, config.jamb_m)
     points, gate = account.points.copy(), chi2_quantile(config.gate, 1)
     blocks: Blocks = {}
     apart: list[tuple[int, Array]] = []
     for u in range(n):
-        walls = [
+        every = [
             j for j in np.flatnonzero(likely[u]).tolist() if off[u, j] ** 2 < gate * _variance(account, cov, u, j)
         ]
+        walls = [j for j in every if beyond[u, j] < config.beyond_m]
         if not walls:
+            if account.kinds[u] == CONVEX and every:
+                apart += _gaps(account.points[u], u, _nearest(every, beyond[u]), tangents, ends, config)
             continue
         walls.sort(key=lambda j: abs(off[u, j]))
         first = walls[0]
-        across = [j for j in walls if abs(normals[j] @ tangents[first]) > math.sin(config.crossing_rad)]
+        crossing = [j for j in every if abs(normals[j] @ tangents[first]) > math.sin(config.crossing_rad)]
+        across = [j for j in walls if j in crossing]
         if across:  # N x = r
             made_by = [first, across[0]]
             gains = np.linalg.inv(normals[made_by])
@@ -128,12 +134,27 @@ def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array
         if not across:
             blocks[u, n + first][:, 0] -= tangents[first] * off[u, first]
         if account.kinds[u] == CONVEX:
-            for j in made_by:
-                at = points[u] @ tangents[j]
-                gap = np.clip(at, *np.sort(ends[j])) - at
-                if abs(gap) > config.reach_m:
-                    apart.append((u, gap * tangents[j]))
+            # Where none of those that are across reaches it, one that ends before may have made it.
+            made_by += [] if across else _nearest(crossing, beyond[u])
+            apart += _gaps(points[u], u, made_by, tangents, ends, config)
     return points, blocks, apart
+
+
+def _nearest(walls: list[int], beyond: Array) -> list[int]:
+    return sorted(walls, key=lambda j: float(beyond[j]))[:1]
+
+
+def _gaps(
+    point: Array, u: int, walls: list[int], tangents: Array, ends: Array, config: CornerConfig
+) -> list[tuple[int, Array]]:
+    """Return by how much ``(2,)`` [m] walls end before a corner, where that is more than a trifle."""
+    found = []
+    for j in walls:
+        at = point @ tangents[j]
+        gap = np.clip(at, *np.sort(ends[j])) - at
+        if abs(gap) > config.reach_m:
+            found.append((u, gap * tangents[j]))
+    return found
 
 
 def _go_over(cov: Array, blocks: Blocks) -> None:

@@ -67,6 +67,21 @@ def test_a_convex_corner_that_a_wall_does_not_reach_is_off_along_it(kind: int, g
     np.testing.assert_allclose(excess, wanted, atol=1e-12)
 
 
+@pytest.mark.parametrize("also_short", [False, True])
+@pytest.mark.parametrize(("kind", "gap_m"), [(CONVEX, 0.35), (CONVEX, 0.45), (CONCAVE, 0.35)])
+def test_so_is_one_whose_wall_ends_far_before_where_no_other_wall_makes_it(
+    kind: int, gap_m: float, also_short: bool
+) -> None:
+    """The wall along y ends before; the other reaches it, or ends still farther from it."""
+    told = account(some_cov(4), (kind, CONVEX, CONVEX))
+    ends = ENDS - np.array([[0.0, 0.0, 0.0, gap_m], [1.0 if also_short else 0.0, 0.0, 0.0, 0.0]])
+    excess = settled(replace(told, wall_ends=ends), AS_TOLD).cov[4, 4]
+    excess -= settled(replace(told, wall_ends=ends), replace(AS_TOLD, jamb_m=AS_TOLD.beyond_m)).cov[4, 4]
+    at_y = CROSSING[1] if also_short else 2.0  # as it is told, or on the other wall
+    wanted = (at_y - (2.0 - gap_m)) ** 2 if kind == CONVEX and gap_m < AS_TOLD.jamb_m else 0.0
+    assert excess == pytest.approx(wanted, abs=1e-9)
+
+
 def test_an_end_is_off_by_what_lasts_and_a_share_of_the_rest() -> None:
     cov = np.diag(np.r_[np.full(3, 1e-6), [0.04, 1e-6, 1e-6, 1e-8, 0.01, 1e-6], np.full(4, 1e-6)])
     config = CornerConfig(end_share=0.005, end_sigma_m=0.0075, gate=0.001)  # a gate that no wall passes
