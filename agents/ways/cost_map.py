@@ -209,6 +209,8 @@ class CostMaps:
         self._box, self._levels = self._kept.box, levels
         for part in parts:
             part = part.within(inside)
+            if part.empty:  # of the outermost ring alone, where another robot was beyond the edge
+                continue
             _weigh_cells(
                 blocks.classes, blocks.clearance, _near_unknown(blocks.classes, part, near), part, levels,
                 config.near_cost, config.tight_cost, self._weight,

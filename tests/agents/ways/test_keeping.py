@@ -63,3 +63,11 @@ def test_what_is_not_in_a_box_is_in_bands_that_do_not_overlap():
             expected[inner.moved(5, 5).slices] = 0
         np.testing.assert_array_equal(marks, expected)
         assert Box.of(expected > 0) == NOTHING or outer.around(Box.of(expected > 0).moved(-5, -5)) == outer
+
+
+def test_another_robot_beyond_the_edge_leaves_nothing_to_weigh() -> None:
+    walk, maps = Walk(3), CostMaps(PlannerConfig(), ROBOT)
+    belief = walk.belief()
+    maps.of(belief)
+    maps._passing.append(Box(0, 3, 1, 6))  # in the outermost ring, which is unknown
+    assert_same(maps.of(belief), build(belief, PlannerConfig(), ROBOT))
