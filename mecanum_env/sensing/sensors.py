@@ -66,6 +66,32 @@ def _noisy_sweep(
     _sweep(segments, circles, pose, directions, limits, noise[0], noise[1], out)
 
 
+@njit(cache=True, nogil=True)
+def _without(
+    bodies: Array, segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, ranges: Array,
+    seen: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Write NaN for the ranges of beams that come back from bodies, and tell of which bodies some do."""
+    offset, angle_min, angle_increment, range_max = limits[0], limits[1], limits[2], limits[3]
+    x, y, theta = pose[0] + offset * math.cos(pose[2]), pose[1] + offset * math.sin(pose[2]), pose[2]
+    beams, nearest = np.empty((len(bodies), ranges.shape[0])), np.full(ranges.shape[0], np.inf)
+    for k in range(len(bodies)):
+        cast_rays(
+            bodies[k], circles[:0], x, y, theta, directions, angle_min, angle_increment, range_max, beams[k]
+        )  # fmt: skip
+        for i in range(ranges.shape[0]):
+            nearest[i] = min(nearest[i], beams[k, i])
+    if nearest.min() == np.inf:
+        return
+    surfaces = np.empty(ranges.shape[0])
+    cast_rays(segments, circles, x, y, theta, directions, angle_min, angle_increment, range_max, surfaces)
+    for i in range(ranges.shape[0]):
+        if nearest[i] < surfaces[i]:
+            ranges[i] = np.nan
+            for k in range(len(bodies)):
+                seen[k] |= beams[k, i] == nearest[i]
+
+
 class Lidar:
     """A planar lidar at A, ``offset_m`` ahead of the robot's centre (docs/reference/sensors.md).
 
@@ -120,6 +146,26 @@ class Lidar:
             normals, uniforms = rng.standard_normal(self._beams), rng.random(self._beams)
             _sweep(segments, circles, pose, self._directions, self._limits, normals, uniforms, ranges)
         return Scan(ranges, *self._of_scan)
+
+    def without(
+        self, bodies: Array, segments: Array, circles: Array, pose: Array, scan: Scan
+    ) -> tuple[Scan, NDArray[np.bool_]]:
+        """Return a scan with NaN for each beam that a body sent back, and of which bodies ``(n,)`` there are such.
+
+        Parameters
+        ----------
+        bodies
+            The sides of bodies ``(n, sides, 4)`` in the world frame [m], all of one number of sides.
+        segments, circles
+            As in :meth:`true_ranges`: what stands before a body hides it.
+        pose
+            ``(3,)`` that the scan was taken from.
+        scan
+            Of :meth:`scan`, with the bodies among its surfaces. It stays as it is.
+        """
+        ranges, seen = scan.ranges.copy(), np.zeros(len(bodies), np.bool_)
+        _without(bodies, segments, circles, pose, self._directions, self._limits, ranges, seen)
+        return (scan._replace(ranges=ranges) if seen.any() else scan), seen
 
 
 def creep(robot: RobotConfig, noise: NoiseConfig) -> Array:

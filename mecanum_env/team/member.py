@@ -27,7 +27,6 @@ from slam.types import Array, Scan, Sighting
 
 __all__ = ["Member", "member_observation_space"]
 
-_NO_CIRCLES = np.zeros((0, 3))
 _LEAST_SIGMA = 1e-4  # [m, rad]: never exactly zero
 _FAR = 1e3  # [m, s] bound of what is observed of teammates
 
@@ -76,6 +75,9 @@ class Member(ExploreEnv):
         single = cast("spaces.Dict", self.observation_space)
         self.observation_space = cast("Any", member_observation_space(single, team.robots))
         self.sightings: tuple[Sighting, ...] = ()
+        self._sighting_sigmas = team.sighting.sigmas
+        self._sighting_cov = np.diag(np.square(self._sighting_sigmas))
+        self._sighting_cov.flags.writeable = False  # every sighting has it
         self.outlines = np.zeros((team.robots, 4, 4))  # of all bodies, as of now: see Fleet.outlines
 
     # ---- an episode ----------------------------------------------------------------------------------------
@@ -163,25 +165,19 @@ class Member(ExploreEnv):
         self._surfaces[len(plan.segments) :] = outlines.reshape(-1, 4)
         scan = self.lidar.scan(self._surfaces, plan.circles, pose, self._sensor_rng)
         noise = self._sighting_rng.standard_normal((len(self._others), 3))  # whatever there is to see
-        self.sightings = ()
-        ranges = np.array([self.lidar.true_ranges(sides, _NO_CIRCLES, pose) for sides in outlines])
-        nearest = ranges.min(axis=0)
-        if not np.isfinite(nearest).any():
-            return scan, scan
-        returned = nearest < self.lidar.true_ranges(plan.segments, plan.circles, pose)
-        seen = ((ranges == nearest) & returned).any(axis=1)
+        mapped, seen = self.lidar.without(outlines, plan.segments, plan.circles, pose, scan)
         self.sightings = tuple(self._sight(k, noise[i]) for i, k in enumerate(self._others) if seen[i])
-        return scan, scan._replace(ranges=np.where(returned, np.nan, scan.ranges))
+        return scan, mapped
 
     def _sight(self, other: int, noise: Array) -> Sighting:
         """Measure another robot: range, bearing and relative heading."""
         x, y, theta = self.truth.world.pose.tolist()
-        ox, oy, otheta = self._fleet.worlds[other].pose.tolist()
-        exact = np.hypot(ox - x, oy - y), np.arctan2(oy - y, ox - x) - theta, otheta - theta
-        sigmas = self._team.sighting.sigmas
-        measured = np.array(exact) + sigmas * noise
-        measured[1:] = [wrap_scalar(float(angle)) for angle in measured[1:]]
-        return Sighting(other, measured, np.diag(sigmas**2))
+        other_x, other_y, other_theta = self._fleet.worlds[other].pose.tolist()
+        dx, dy = other_x - x, other_y - y
+        exact = math.hypot(dx, dy), math.atan2(dy, dx) - theta, other_theta - theta
+        measured = np.array(exact) + self._sighting_sigmas * noise
+        measured[1:] = wrap_scalar(float(measured[1])), wrap_scalar(float(measured[2]))
+        return Sighting(other, measured, self._sighting_cov)
 
     def _observed_teammates(self) -> NDArray[np.float32]:
         out = np.zeros((self._team.robots - 1, 6), np.float32)

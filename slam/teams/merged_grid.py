@@ -16,7 +16,7 @@ from slam.types import Array
 
 __all__ = ["Chart", "MergedGrid"]
 
-_BLOCK = 64  # cells that are looked at together
+_GIVEN_WORDS = 2  # of the sum of two bytes a cell, in the length of a word of cells
 _Box = tuple[int, int, int, int]  # lattice rows and columns: first, first, beyond the last, beyond the last
 
 
@@ -69,12 +69,11 @@ class MergedGrid(OccupancyGrid):
         given = np.zeros(self.shape, np.int16)
         for chart, frame in charts.values():
             self._add(given, chart, frame)
-        rows, cols = (np.flatnonzero((given != self._given).any(axis=k)) for k in (1, 0))
-        self._given = given
-        if len(rows):
-            row0, col0 = self.lattice_origin
-            box = (row0 + rows[0], col0 + cols[0], row0 + rows[-1] + 1, col0 + cols[-1] + 1)
-            self._merge(*(int(v) for v in box), all_of_it=True)
+        row0, col0 = self.lattice_origin
+        first_row, first_col, last_row, last_col = _differing(given, self._given)
+        self._given, before = given, self._given
+        if first_row <= last_row:
+            self._merge(row0 + first_row, col0 + first_col, row0 + last_row + 1, col0 + last_col + WORD, before)
 
     def follow(self) -> None:
         """Take over what was drawn into the own grid since the last time."""
@@ -86,7 +85,7 @@ class MergedGrid(OccupancyGrid):
         row, col = own.lattice_origin
         box = row + r0, col + c0, row + r1, col + c1
         self._grow(*box)
-        self._merge(*box)
+        self._merge(*box, self._given)
 
     def _moved(self, plane: NDArray[Any], lattice_origin: tuple[int, int]) -> NDArray[Any]:
         """Return a plane of this grid, as it was before it grew, in its present shape."""
@@ -110,17 +109,16 @@ class MergedGrid(OccupancyGrid):
         cells = chart.cells
         if frame is not None:
             cells = _turned(chart, frame, self.resolution, (row0, col0), window.shape)
-        observed = (window != 0) | (cells != 0)
         window += cells
-        window[observed & (window == 0)] = -1
+        window[(window == 0) & (cells != 0)] = -1
 
-    def _merge(self, row0: int, col0: int, row1: int, col1: int, *, all_of_it: bool = False) -> None:
-        """Sum up own and given cells in a box of the lattice."""
+    def _merge(self, row0: int, col0: int, row1: int, col1: int, before: NDArray[np.int16]) -> None:
+        """Sum up own and given cells in a box of the lattice; ``before`` is what was given the last time."""
         own, r, c = self._own, *self.lattice_origin
         known, entropy = _sum(
-            own.log_odds, own.visited, own.lattice_origin[0] - r, own.lattice_origin[1] - c, self._given,
+            own.log_odds, own.visited, own.lattice_origin[0] - r, own.lattice_origin[1] - c, self._given, before,
             self._taken, self.log_odds, self.visited, row0 - r, col0 - c, row1 - r, col1 - c, self.overview_sums,
-            self._overview_shift, all_of_it,
+            self._overview_shift,
         )  # fmt: skip
         self.known_cells += known
         self.entropy_bit += entropy
@@ -154,53 +152,69 @@ def _turned(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _differing(plane: NDArray[np.int16], other: NDArray[np.int16]) -> tuple[int, int, int, int]:
+    """Return the first row, the first column of a word, and the last ones, of the box where two planes differ."""
+    words, others = plane.view(np.uint64), other.view(np.uint64)
+    first_row, last_row, first, last = plane.shape[0], -1, words.shape[1], -1
+    for i in range(words.shape[0]):
+        for j in range(words.shape[1]):
+            if words[i, j] != others[i, j]:
+                first_row, last_row = min(first_row, i), i
+                first, last = min(first, j), max(last, j)
+    return first_row, first // _GIVEN_WORDS * WORD, last_row, last // _GIVEN_WORDS * WORD
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sum(
     own: NDArray[np.int8], own_visited: NDArray[np.uint8], down: int, ahead: int, given: NDArray[np.int16],
-    taken: NDArray[np.int8], cells: NDArray[np.int8], visited: NDArray[np.uint8], row0: int, col0: int, row1: int,
-    col1: int, overview: NDArray[np.int32], shift: int, all_of_it: bool,
+    before: NDArray[np.int16], taken: NDArray[np.int8], cells: NDArray[np.int8], visited: NDArray[np.uint8],
+    row0: int, col0: int, row1: int, col1: int, overview: NDArray[np.int32], shift: int,
 ) -> tuple[int, float]:  # fmt: skip
     """Write own + given cells of a box; return by how much the known cells and the entropy went up.
 
-    ``down`` and ``ahead``: rows and columns from the first cell here to that of the own grid. ``taken`` is what
-    of the own grid is in here: where it is the same still, nothing is done, unless it shall be ``all_of_it``; else
-    the box's columns begin and end at multiples of a word.
+    ``down`` and ``ahead``: rows and columns from the first cell here to that of the own grid. Where nothing is
+    given but what was ``before``, and the own grid is as it was ``taken``, nothing is done: words of cells are
+    compared at once. So columns of boxes and of grids begin and end at multiples of a word.
     """
     own_words, taken_words = own.view(np.uint64), taken.view(np.uint64)
     own_trail, trail = own_visited.view(np.uint64), visited.view(np.uint64)
+    given_words, before_words = given.view(np.uint64), before.view(np.uint64)
     known, entropy = 0, 0.0
     for i in range(row0, row1):
         own_i = i - down
         inside = 0 <= own_i < own.shape[0]
-        first, last = max(ahead, 0), min(ahead + own.shape[1], cells.shape[1]) if inside else 0
-        for begin in range(col0, col1, _BLOCK):
-            end = min(begin + _BLOCK, col1)
-            changed = all_of_it
-            if not all_of_it:  # a box of whole chunks: words of cells compare at once
-                for j in range(max(begin, first) // WORD, min(end, last) // WORD):
-                    changed |= own_words[own_i, j - ahead // WORD] != taken_words[i, j]
-                    changed |= own_trail[own_i, j - ahead // WORD] != trail[i, j]
+        first, last = max(ahead, 0) // WORD, min(ahead + own.shape[1], cells.shape[1]) // WORD if inside else 0
+        for word in range(col0 // WORD, col1 // WORD):
+            mine_too = first <= word < last
+            changed = False
+            for k in range(_GIVEN_WORDS * word, _GIVEN_WORDS * (word + 1)):
+                changed |= given_words[i, k] != before_words[i, k]
+            if mine_too:
+                own_word = word - ahead // WORD
+                changed |= own_words[own_i, own_word] != taken_words[i, word]
+                changed |= own_trail[own_i, own_word] != trail[i, word]
             if not changed:
                 continue
-            for j in range(begin, end):
+            for j in range(word * WORD, (word + 1) * WORD):
                 mine = np.int64(0)
                 block_i, block_j = i >> shift, j >> shift
-                if first <= j < last:
+                if mine_too:
                     mine = np.int64(own[own_i, j - ahead])
                     taken[i, j] = mine
                     overview[2, block_i, block_j] += np.int64(own_visited[own_i, j - ahead]) - visited[i, j]
                     visited[i, j] = own_visited[own_i, j - ahead]
                 total = mine + given[i, j]
-                if total == 0 and (mine != 0 or given[i, j] != 0):
+                if total == 0 and mine != 0:
                     total = -1
                 total = min(max(total, MIN_LOG_ODDS), MAX_LOG_ODDS)
-                before = np.int64(cells[i, j])
-                if total != before:
+                then = np.int64(cells[i, j])
+                if total != then:
                     cells[i, j] = total
                     overview[1, block_i, block_j] += (PROBABILITY_BYTE[total & 255] if total != 0 else 0) - (
-                        PROBABILITY_BYTE[before & 255] if before != 0 else 0
+                        PROBABILITY_BYTE[then & 255] if then != 0 else 0
                     )
-                    entropy += ENTROPY_BIT[total & 255] - ENTROPY_BIT[before & 255]
-                    gained = (total != 0) - (before != 0)
+                    entropy += ENTROPY_BIT[total & 255] - ENTROPY_BIT[then & 255]
+                    gained = (total != 0) - (then != 0)
                     overview[0, block_i, block_j] += gained
                     known += gained
     return known, entropy

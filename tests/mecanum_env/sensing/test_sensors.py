@@ -280,6 +280,28 @@ def test_scans_are_fresh_arrays() -> None:
     np.testing.assert_array_equal(first, copy)
 
 
+@given(st.integers(0, 10**6))
+def test_what_bodies_sent_back_is_left_out_of_a_scan(seed: int) -> None:
+    """A room with a pillar and a screen, and bodies in it: some in front, some hidden, some behind one another."""
+    rng = np.random.default_rng(seed)
+    lidar, disc = Lidar(LidarConfig(beams=180), EXACT), np.array([[3.2, 3.0, 0.3]])
+    screen = np.vstack([SQUARE, [[1.0, 2.0, 2.0, 3.0]]])
+    at, turn = rng.uniform(0.3, 3.7, (3, 1, 2)), rng.uniform(-math.pi, math.pi, (3, 1))
+    angles = turn + np.array([[0.6, 2.5, 3.7, 5.7]])
+    corners = at + 0.25 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    bodies = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=-1)
+    pose = np.array([*rng.uniform(0.2, 3.8, 2), rng.uniform(-math.pi, math.pi)])
+    scan = lidar.scan(np.vstack([screen, bodies.reshape(-1, 4)]), disc, pose, rng)
+    mapped, seen = lidar.without(bodies, screen, disc, pose, scan)
+    walls = lidar.true_ranges(screen, disc, pose)
+    each = np.array([lidar.true_ranges(body, NO_CIRCLES, pose) for body in bodies])
+    nearest = each.min(axis=0)
+    gone = nearest < walls
+    np.testing.assert_array_equal(mapped.ranges, np.where(gone, np.nan, scan.ranges))
+    np.testing.assert_array_equal(seen, [((row == nearest) & gone).any() for row in each])
+    assert mapped is scan if not gone.any() else mapped.ranges is not scan.ranges
+
+
 @pytest.mark.parametrize("name", ["youbot", "cavity"])
 def test_pressed_against_a_wall_the_lidar_reads_the_robots_half_width(name: str) -> None:
     robot = ROBOT_PRESETS[name]
