@@ -149,8 +149,8 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
     for name, against in found.items():
         cells = []
         for key in AGAINST:
-            share = _plain(_share(against[key].probability))
-            note = "" if math.isnan(against[key].probability.value) else f"better in {share}"
+            share = against[key].probability
+            note = "" if math.isnan(share.value) else _plain(_share(share))
             cells.append(change(BY_KEY[key], against[key].ratio, note))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))

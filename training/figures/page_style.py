@@ -30,6 +30,7 @@ thead th { color: var(--soft); font-weight: 600; vertical-align: bottom; white-s
 th:first-child { text-align: left; position: sticky; left: 0; background: var(--page) }
 tbody th { font-weight: 600; max-width: 24rem; overflow: hidden; text-overflow: ellipsis }
 h1, h2, h3, p, nav, summary, figcaption { overflow-wrap: anywhere }
+td.words { text-align: left; white-space: normal }
 td small { display: block; color: var(--soft); font-size: .78rem }
 .better { color: var(--good); font-weight: 600 } .worse { color: var(--bad); font-weight: 600 }
 .best { font-weight: 700 }

@@ -87,7 +87,7 @@ def _robots_table(robots: Sequence[Mapping[str, Any]]) -> str:
     """Return a row a robot, with its colour before its name."""
     head = "".join(f"<th>{escape(heading)}</th>" for heading in ("", *(heading for heading, *_ in _COLUMNS)))
     rows = "".join(
-        f'<tr><th><span class="key robot-{k}"></span>robot {k}</th>'
+        f'<tr><th><span class="key robot-{k}"></span>robot&nbsp;{k}</th>'
         + "".join(f"<td>{number(robot[name], factor, digits)}</td>" for _, name, factor, digits in _COLUMNS)
         + "</tr>"
         for k, robot in enumerate(robots)

@@ -31,8 +31,9 @@ def page(parts: Mapping[str, tuple[Part, Summary]]) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     top = "".join(f"<th>{escape(word)}</th>" for word in head)
-    lines = "".join(
-        f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(word)}</td>' for word in row[1:])}</tr>"
-        for row in rows
-    )
+    lines = "".join(f"<tr><th>{escape(row[0])}</th>{''.join(map(_cell, row[1:]))}</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>'
+
+
+def _cell(text: str) -> str:
+    return f"<td{' class=words' if text[:1].isalpha() else ''}>{escape(text)}</td>"

@@ -74,6 +74,7 @@ async function openViews(header, { data, robots }, redraw) {
   const sums = new OffscreenCanvas(1, 1);
   function maps(c, shown, k) {
     const canvas = canvases[1], n = shown.length;
+    if (!canvas.width || !canvas.height) return; // in a frame that is not shown yet
     Object.assign(sums, { width: canvas.width, height: canvas.height });
     const s = sums.getContext("2d");
     s.setTransform(c.getTransform());
