@@ -87,9 +87,10 @@ class Knowledge:
         """Take note of where the others were measured to be."""
         pose = self._backend.pose
         self._sightings = sightings
-        for robot, (distance, bearing, turn), _ in sightings:
-            seen = np.array([distance * math.cos(bearing), distance * math.sin(bearing), turn])
-            self._seen[robot] = time_s, compose(pose, seen)
+        for robot, measured, _ in sightings:
+            distance, bearing, turn = measured.tolist()
+            seen = distance * math.cos(bearing), distance * math.sin(bearing), turn
+            self._seen[robot] = time_s, compose(pose, np.array(seen))
 
     def merge(self, time_s: float) -> None:
         """Put the charts that were heard into the map, as far as it is known where they lie."""
@@ -126,12 +127,12 @@ class Knowledge:
         found = []
         for robot in range(self._team.robots):
             report, seen = self.heard.get(robot), self._seen.get(robot)
-            frame = np.zeros(3) if self._frames is None else self._frames.of(robot)
-            placed = report is not None and frame is not None
+            frame = None if self._frames is None else self._frames.of(robot)
+            placed = report is not None and (self._frames is None or frame is not None)
             goal = None
-            if report is not None and frame is not None:
+            if report is not None and placed:
                 pose, when, goal = report.pose, report.time_s, report.goal
-                if self._frames is not None:
+                if frame is not None:
                     pose = compose(frame, pose)
                     goal = None if goal is None else transform_points(frame, goal[None])[0]
             if seen is not None and (not placed or seen[0] >= when or time_s - seen[0] <= _IN_SIGHT_S):

@@ -75,7 +75,7 @@ class Member(ExploreEnv):
         single = cast("spaces.Dict", self.observation_space)
         self.observation_space = cast("Any", member_observation_space(single, team.robots))
         self.sightings: tuple[Sighting, ...] = ()
-        self._sighting_sigmas = team.sighting.sigmas
+        self._sighting_sigmas = team.sighting.sigmas.tolist()
         self._sighting_cov = np.diag(np.square(self._sighting_sigmas))
         self._sighting_cov.flags.writeable = False  # every sighting has it
         self.outlines = np.zeros((team.robots, 4, 4))  # of all bodies, as of now: see Fleet.outlines
@@ -164,33 +164,33 @@ class Member(ExploreEnv):
         outlines = self.outlines[self._others]
         self._surfaces[len(plan.segments) :] = outlines.reshape(-1, 4)
         scan = self.lidar.scan(self._surfaces, plan.circles, pose, self._sensor_rng)
-        noise = self._sighting_rng.standard_normal((len(self._others), 3))  # whatever there is to see
+        noise = self._sighting_rng.standard_normal((len(self._others), 3)).tolist()  # whatever there is to see
         mapped, seen = self.lidar.without(outlines, plan.segments, plan.circles, pose, scan)
         self.sightings = tuple(self._sight(k, noise[i]) for i, k in enumerate(self._others) if seen[i])
         return scan, mapped
 
-    def _sight(self, other: int, noise: Array) -> Sighting:
+    def _sight(self, other: int, noise: list[float]) -> Sighting:
         """Measure another robot: range, bearing and relative heading."""
         x, y, theta = self.truth.world.pose.tolist()
         other_x, other_y, other_theta = self._fleet.worlds[other].pose.tolist()
         dx, dy = other_x - x, other_y - y
-        exact = math.hypot(dx, dy), math.atan2(dy, dx) - theta, other_theta - theta
-        measured = np.array(exact) + self._sighting_sigmas * noise
-        measured[1:] = wrap_scalar(float(measured[1])), wrap_scalar(float(measured[2]))
+        off = [sigma * by for sigma, by in zip(self._sighting_sigmas, noise, strict=True)]
+        bearing = wrap_scalar(math.atan2(dy, dx) - theta + off[1])
+        measured = np.array([math.hypot(dx, dy) + off[0], bearing, wrap_scalar(other_theta - theta + off[2])])
         return Sighting(other, measured, self._sighting_cov)
 
     def _observed_teammates(self) -> NDArray[np.float32]:
-        out = np.zeros((self._team.robots - 1, 6), np.float32)
+        rows = [[0.0] * 6] * (self._team.robots - 1)
         x, y, theta = self._pose.tolist()
         c, s = math.cos(theta), math.sin(theta)
         for robot, pose, age_s, *_ in self._teammates():
             mate_x, mate_y, mate_theta = pose.tolist()
             dx, dy, turn = mate_x - x, mate_y - y, mate_theta - theta
             ahead, aside = (min(max(v, -_FAR), _FAR) for v in (c * dx + s * dy, c * dy - s * dx))
-            out[robot - (robot > self.number)] = (
+            rows[robot - (robot > self.number)] = [
                 1.0, ahead, aside, math.cos(turn), math.sin(turn), min(age_s, _FAR)
-            )  # fmt: skip
-        return out
+            ]  # fmt: skip
+        return np.array(rows, np.float32)
 
     def _teammates(self) -> tuple[Teammate, ...]:
         return self.knowledge.teammates(self._steps * self.config.step_s)
