@@ -77,8 +77,8 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
     """
     cov, information = account.cov.copy(), account.cov.copy()
     np.fill_diagonal(information, np.diag(cov) + _NOTHING)
-    # In place, as in a building a matrix has hundreds of megabytes; transposed, as BLAS counts.
-    information = inv(information.T, overwrite_a=True, check_finite=False).T
+    # Not in place: SciPy 1.17 then writes to nowhere where rounding has left a negative eigenvalue.
+    information = np.ascontiguousarray(inv(information, check_finite=False))
     for u in np.flatnonzero(account.kinds == CONVEX):
         at = slice(3 + 2 * u, 5 + 2 * u)
         variances, axes = np.linalg.eigh(np.linalg.inv(information[at, at]))
@@ -87,6 +87,7 @@ def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
             axis = axes[:, 1]
             cov[at, at] -= less * np.outer(axis, axis)
             column = information[:, at] @ axis
+            # In place, as in a building a matrix has hundreds of megabytes; transposed, as BLAS counts.
             dger(less / (1.0 - less * (axis @ column[at])), column, column, a=information.T, overwrite_a=True)
     return cov
 

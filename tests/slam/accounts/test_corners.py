@@ -98,6 +98,14 @@ def test_a_covariance_stays_one_and_no_larger(seed: int, sigma: float) -> None:
     assert np.linalg.eigvalsh(told.cov - found.cov).min() > -1e-9 * sigma**2
 
 
+def test_a_covariance_that_rounding_has_left_with_a_negative_eigenvalue() -> None:
+    """SciPy 1.17 inverts such a matrix in place by a segmentation fault."""
+    values, axes = np.linalg.eigh(some_cov(3))
+    values[0] = -1e-10
+    cov = (axes * values) @ axes.T
+    assert np.isfinite(settled(account(0.5 * (cov + cov.T))).cov).all()
+
+
 def test_an_account_without_corners_is_itself() -> None:
     none = replace(
         account(some_cov(0)), points=np.zeros((0, 2)), point_ids=np.zeros(0, np.int64), kinds=np.zeros(0, np.int8),
