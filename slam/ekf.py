@@ -25,6 +25,7 @@ from slam.health.relocalisation import Place, Relocaliser
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
+from slam.landmarks.contradicted import DOUBT, doubt
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
@@ -319,21 +320,18 @@ class EkfSlam(GaussianBackend):
         return stands
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
-        """Correct by a match, curved walls made straight; tell whether it stands, as its joint NIS may be refused.
-
-        The innovations are shown to who has asked.
-        """
+        """Correct by a match, curved walls made straight; tell whether it stands: its joint NIS may be refused."""
         offset, marks = self.config.lidar_offset_m, self._book.marks
-        given = z
+        given, doubts = z.copy(), marks[:, DOUBT].copy()
         if self.config.lines:
-            given = z.copy()
             straighten(self._x, offset, z, match, marks, self._curved)
+            doubt(self._x, self._p, offset, z, match, marks)
         if self.witness is not None:
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
         self._correct(z, match, limits)
         stands = self.nis_dof > 0 or self.nis == 0.0
         if not stands:
-            z[:] = given
+            z[:], marks[:, DOUBT] = given, doubts
             forget(z, match, marks)
         return stands
 

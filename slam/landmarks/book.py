@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
+from slam.landmarks.contradicted import DOUBT
 from slam.settings import Config, Count, Gap, NotNegative
 from slam.types import LINE, VIRTUAL, Array, Scan
 
@@ -26,7 +27,7 @@ __all__ = [
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 FROM_MARK = 6  # column of ``marks``: where a wall begins, a point's end of a surface, a virtual point's place
 
-MARKS = 11  # columns of ``marks``, one row a landmark; the last three are those of slam.landmarks.curved_walls
+MARKS = 12  # columns of ``marks``, one row a landmark; the last four are of walls: curved_walls, contradicted
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, LAST_SEEN, _FROM, _TO = range(8)
 RECENT = 3  # updates, of which a landmark was in one: it is missed where it is not seen again
 _SAME_TURN = 0.6  # [rad] between two sightings of one landmark
@@ -50,6 +51,7 @@ class LandmarkPolicy(Config):
     drop_after: Count = 15  # contradictions more than sightings
     overlook_after: Count = 25  # dropped when overlooked, in plain view, more often than this …
     overlook_ratio: NotNegative = 5.0  # … and this many times the sightings
+    contradicted_after: NotNegative = 14.0  # of a wall: see slam.landmarks.contradicted
     clear_margin_m: Gap = 0.3  # a beam that goes this far beyond a landmark contradicts it
 
 
@@ -70,16 +72,17 @@ class LandmarkBook:
         self._limits = np.array([
             p.tentative_gate_m, p.confirm_after, p.edge_confirm_after, p.edge_baseline_m, p.forget_after,
             p.clear_margin_m, p.drop_after, p.overlook_after, p.overlook_ratio, p.new_distance_m,
+            p.contradicted_after,
         ])  # fmt: skip
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 11)``.
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 12)``.
 
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
-        surface it is, as the observation does. The last three are of a wall's curvature: the information of its
-        measurements, the same times what they measured, and where along the wall it is tangent to its line.
-        A view.
+        surface it is, as the observation does. Then, of a wall's curvature, the information of its measurements,
+        the same times what they measured, and where along the wall it is tangent to its line; and how far its
+        sightings contradict it. A view.
         """
         return self._marks[: self.count]
 
@@ -100,9 +103,7 @@ class LandmarkBook:
 
     def row(self, landmark_id: int) -> int:
         """Return the row of a landmark, or -1."""
-        if 0 <= landmark_id < len(self.row_of_id):
-            return int(self.row_of_id[landmark_id])
-        return -1
+        return int(self.row_of_id[landmark_id]) if 0 <= landmark_id < len(self.row_of_id) else -1
 
     def add(
         self,
@@ -113,10 +114,7 @@ class LandmarkBook:
         extent: tuple[float, float] = (0.0, 0.0),
         bend: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
-        """Append a landmark; without a known id it gets the next one.
-
-        ``extent`` is from and to, ``bend`` what is known of a wall's curvature, see ``marks``.
-        """
+        """Append a landmark; without a known id it gets the next one. ``extent`` and ``bend``: see ``marks``."""
         new_id = self._next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
@@ -125,7 +123,7 @@ class LandmarkBook:
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
         seen = -math.inf if kind == VIRTUAL else self._now
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend, 0.0)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -140,7 +138,7 @@ class LandmarkBook:
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
     def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
-        """Have these landmarks ``(n,)``, with these marks ``(n, 11)``, instead of those it has."""
+        """Have these landmarks ``(n,)``, with these marks ``(n, 12)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
         self._make_room(count)
@@ -173,7 +171,8 @@ class LandmarkBook:
     ) -> tuple[list[int], list[int]]:  # fmt: skip
         """Count sightings; return the observations that are new landmarks by now, and rows to drop, highest first.
 
-        Dropped are, where there is a scan, landmarks that its beams keep passing through, or never show. Add what
+        Dropped are, where there is a scan, points that its beams keep passing through, or never show; and walls
+        that their sightings contradict. Add what
         is new first or last: it was just seen. With ``at_once``, what is seen where features meet is a landmark at
         its first sighting. ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their
         landmarks.
@@ -192,7 +191,8 @@ class LandmarkBook:
         p, marks = self.policy, self.marks
         passed = marks[:, _MISSED] - marks[:, _SEEN] > p.drop_after
         overlooked = marks[:, _UNSEEN] > p.overlook_after + p.overlook_ratio * marks[:, _SEEN]
-        return [int(i) for i in np.flatnonzero(passed | overlooked)[::-1]]
+        contradicted = marks[:, DOUBT] > p.contradicted_after
+        return [int(i) for i in np.flatnonzero(passed | overlooked | contradicted)[::-1]]
 
 
 @njit(cache=True, nogil=True)
@@ -335,7 +335,7 @@ def _look_through(
     x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
     limits: Array,
 ) -> bool:  # fmt: skip
-    """Count, for each landmark near by, whether three beams pass it or one ends at it; tell if any is doubtful."""
+    """Count, for each point near by, whether three beams pass it or one ends at it; tell of any doubt."""
     margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
     c, s = math.cos(x[2]), math.sin(x[2])
     sx, sy = x[0] + offset * c, x[1] + offset * s
@@ -344,6 +344,7 @@ def _look_through(
     full = beams >= circle
     doubtful = False
     for i in range(marks.shape[0]):
+        doubtful |= marks[i, DOUBT] > limits[10]
         if marks[i, LAST_SEEN] == now or marks[i, _KIND] >= LINE:
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
