@@ -321,16 +321,16 @@ class EkfSlam(GaussianBackend):
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
         """Correct by a match, curved walls made straight; tell whether it stands: its joint NIS may be refused."""
-        offset, marks = self.config.lidar_offset_m, self._book.marks
-        given, doubts = z.copy(), marks[:, DOUBT].copy()
-        if self.config.lines:
+        offset, marks, lines = self.config.lidar_offset_m, self._book.marks, self.config.lines
+        if lines:
+            given = z.copy()
             straighten(self._x, offset, z, match, marks, self._curved)
-            doubt(self._x, self._p, offset, z, match, marks)
+            doubts = doubt(self._x, self._p, offset, z, match, marks)
         if self.witness is not None:
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
         self._correct(z, match, limits)
         stands = self.nis_dof > 0 or self.nis == 0.0
-        if not stands:
+        if lines and not stands:
             z[:], marks[:, DOUBT] = given, doubts
             forget(z, match, marks)
         return stands

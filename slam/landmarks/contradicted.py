@@ -26,8 +26,8 @@ _MOST = 10.0  # half a NIS, of one sighting: a single one says little
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def doubt(x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array) -> None:
-    """Take the NIS of each wall that is seen to its sum.
+def doubt(x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array) -> Array:
+    """Take the NIS of each wall that is seen to its sum; return all sums ``(n,)`` as they were before.
 
     Parameters
     ----------
@@ -36,8 +36,9 @@ def doubt(x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64],
     marks
         Of all landmarks ``(n, 12)``: :class:`slam.landmarks.book.LandmarkBook`.
     """
-    h = np.empty((2, 5))
+    h, before = np.empty((2, 5)), marks[:, DOUBT].copy()
     for k in range(z.shape[0]):
         if match[k] >= 0 and z[k, 5] == LINE:
             half = min(0.5 * gated_distance(x, p, match[k], offset, z[k], h), _MOST)
             marks[match[k], DOUBT] = max(marks[match[k], DOUBT] + half - _ALLOWED, 0.0)
+    return before
