@@ -50,7 +50,7 @@ class OdometryNoise(Config):
     turn_floor_rad_s: Annotated[float, Within("[0, 100]")] = 0.003
     turn_share_rad_m: Annotated[float, Within("[0, 100]")] = 0.03
     grip_m_s2: Positive = 1.5  # change of the wheels' speed over time from which they slip
-    slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may have slipped
+    slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may slip where nobody tells
     slide_m_s2: Positive = 1.5  # by which the floor lets the body follow wheels that slip
     # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: graph-slam
     # learns it (slam.odometry.mount). 0: that is where it sits.
@@ -62,11 +62,11 @@ class OdometryNoise(Config):
     ) -> tuple[float, float]:
         """Return the variance of either linear component [m²/s²] and of the turn rate [rad²/s²].
 
-        ``slip`` [m/s, rad/s] is by how much the wheels may outrun the body. Wheels that slip along do not do so
-        all alike, which turns the body.
+        ``slip`` [m/s, rad/s] is 1σ of what the wheels slip, along and in turning. Wheels that slip along do not do
+        so all alike, which turns the body.
         """
         speed = math.sqrt(vx * vx + vy * vy + (self.lever_m * omega) ** 2)
-        along, turning = self.slip_share * slip[0], self.slip_share * slip[1]
+        along, turning = slip
         return (
             (self.speed_floor_m_s + self.speed_share * speed) ** 2 + along**2,
             (self.turn_floor_rad_s + self.turn_share_rad_m * speed) ** 2
@@ -101,7 +101,7 @@ class OdometryNoise(Config):
         )
 
     def slip(self, body: Twist, wheels: Twist, dt: float) -> tuple[tuple[float, float], Twist]:
-        """Return how much faster [m/s, rad/s] wheels may turn than the body moves after ``dt`` [s], and its twist.
+        """Return 1σ of what wheels slip [m/s, rad/s], ``dt`` [s] after a step, and the body's twist then.
 
         ``body`` is the twist that the floor had passed on before. It follows that of the wheels by ``slide_m_s2``
         at most: on a slippery floor, where they stop too fast, it slides on after they stand. Wheels that jerk
@@ -109,7 +109,8 @@ class OdometryNoise(Config):
         """
         x, y, w = wheels[0] - body[0], wheels[1] - body[1], wheels[2] - body[2]
         change = math.sqrt(x * x + y * y + (self.lever_m * w) ** 2)
-        slip = max(change - self.grip_m_s2 * dt, 0.0)  # which may all be along, or all in turning
+        # Which may all be along, or all in turning.
+        slip = self.slip_share * max(change - self.grip_m_s2 * dt, 0.0)
         left = max(1.0 - self.slide_m_s2 * dt / change, 0.0) if change > 0.0 else 0.0
         return (slip, slip / self.lever_m), (wheels[0] - left * x, wheels[1] - left * y, wheels[2] - left * w)
 

@@ -39,7 +39,7 @@ class Odometry(NamedTuple):
 
     twist: Array | tuple[float, float, float]  # (3,) vx [m/s], vy [m/s], ω [rad/s] in the body frame
     dt: float  # [s]
-    slip: tuple[float, float] | None = None  # [m/s, rad/s] by which the wheels may outrun the body; None: not told
+    slip: tuple[float, float] | None = None  # [m/s, rad/s] 1σ of what the wheels slip; None: not told
 
     @property
     def numbers(self) -> tuple[float, float, float]:

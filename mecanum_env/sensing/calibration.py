@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
-from mecanum_env.sensing.slip import grip_m_s2
+from mecanum_env.sensing.slip import grip_m_s2, patch_friction
 from slam.motion import LastingErrors, OdometryNoise
 from slam.settings import to_mapping
 
@@ -45,7 +45,7 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
         turn_floor_rad_s=_FLOOR_M_S / robot.lever_m,
         speed_share=per_wheel,
         turn_share_rad_m=math.hypot(per_wheel, base) / robot.lever_m,
-        slide_m_s2=grip_m_s2(noise),
+        slide_m_s2=grip_m_s2(patch_friction(noise)),
         lasting=LastingErrors(
             radius_sigma=noise.radius_error / math.sqrt(3.0),
             lever_sigma=noise.base_error / math.sqrt(3.0),

@@ -40,7 +40,7 @@ class Drives:
 
     measured: Array  # (episodes, steps, 3) body twist by the wheels: m/s, m/s, rad/s
     true: Array  # (episodes, steps, 3) the twist that leads from each true pose to the next
-    slips: Array  # (episodes, steps, 2) by which the wheels may have outrun the body: m/s, rad/s
+    slips: Array  # (episodes, steps, 2) 1σ of what the wheels slipped: m/s, rad/s
     dt: float  # [s]
 
     @property

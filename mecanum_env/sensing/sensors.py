@@ -16,19 +16,20 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
 from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
-from mecanum_env.sensing.slip import expected_share, follow, traction_constants
+from mecanum_env.sensing.slip import add_up, follow, patch_friction, spread, traction_constants
 from slam.odometry.filters import OdometryFilter
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
 
 # What encoders remember of the step before, and what stays the same: one array each, since arguments take time.
-_LAST_TWIST, _BODY, _SPEEDS = slice(0, 3), slice(3, 6), slice(6, 10)
-_SIGMA, _ROLLING, _RADIUS, _SHARE = range(4)
-_CREEP, _TRACTION, _FORWARD = slice(4, 7), slice(7, 11), slice(11, 23)
+_LAST_TWIST, _SPEEDS = slice(0, 3), slice(3, 7)
+_BODY, _BODY_ON_PATCH, _SLID = slice(7, 10), slice(10, 13), slice(13, 16)
+_SIGMA, _ROLLING, _RADIUS, _PATCHES, _SPREAD = range(5)
+_CREEP, _FLOOR, _PATCH, _FORWARD = slice(5, 8), slice(8, 12), slice(12, 16), slice(16, 28)
 
-_ON_AND_OFF = 0.5  # share of what slips along that turns a body which may stand with one side on a patch
-_CREEP_ERROR = 0.6  # share of the creep that may be slip, for all that is taken out of it: measured
+_ON_AND_OFF = 0.7  # share of what slips along that turns a body which may stand with one side on a patch
+_CREEP_ERROR = 0.33  # σ of the creep, of which the mean is taken out: measured
 
 
 @njit(cache=True, nogil=True)
@@ -204,10 +205,11 @@ class WheelEncoders:
 
     def __init__(self, robot: RobotConfig, noise: NoiseConfig, rng: np.random.Generator) -> None:
         self._fixed = np.concatenate([
-            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m, expected_share(noise)], creep(robot, noise),
-            traction_constants(robot, noise), forward_matrix(robot).ravel(),
+            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m, noise.patch_share, spread(noise)],
+            creep(robot, noise), traction_constants(robot, noise.friction),
+            traction_constants(robot, patch_friction(noise)), forward_matrix(robot).ravel(),
         ])  # fmt: skip
-        self._last = np.zeros(10)  # see _LAST_TWIST and those after it
+        self._last = np.zeros(16)  # see _LAST_TWIST and those after it
         u = rng.uniform(-1.0, 1.0, size=5)
         self.true_radii: Array = robot.wheel_radius_m * (1.0 + noise.radius_error * u[:4])
         self.true_lever = float(robot.lever_m * (1.0 + noise.base_error * u[4]))
@@ -252,40 +254,51 @@ def _read_encoders(
 ) -> tuple[float, float]:
     """Write the body's twist: that of the wheels, less what is lost to slip in the mean and to creep.
 
-    Each wheel's measured rotation is the true one times 1 + σ normal. Returned is by how much the wheels may have
-    outrun the body [m/s, rad/s].
+    Each wheel's measured rotation is the true one times 1 + σ normal. Returned is 1σ of what slips beside that
+    [m/s, rad/s].
     """
-    last, body, before = memory[_LAST_TWIST], memory[_BODY], memory[_SPEEDS]
-    creep, forward, traction, count = fixed[_CREEP], fixed[_FORWARD], fixed[_TRACTION], readings.shape[0]
+    last, before, slid = memory[_LAST_TWIST], memory[_SPEEDS], memory[_SLID]
+    creep, forward, count, patches = fixed[_CREEP], fixed[_FORWARD], readings.shape[0], fixed[_PATCHES]
     scale, measured = np.empty(4), np.empty(4)
+    wheels, creeps, may = np.empty(3), np.empty(3), np.empty(3)
     for k in range(4):
         scale[k] = 1.0 + fixed[_SIGMA] * normals[k]
     for i in range(3):
         total = 0.0
         for k in range(4):
             total += forward[4 * i + k] * (readings[count - 1, k] * scale[k])
-        twist[i] = fixed[_ROLLING] / dt * total
-    lost, to_speed = np.zeros(3), fixed[_ROLLING] * fixed[_RADIUS] * count / dt
+        wheels[i] = fixed[_ROLLING] / dt * total
+    lost, lost_on_patch, to_speed = np.zeros(3), np.zeros(3), fixed[_ROLLING] * fixed[_RADIUS] * count / dt
+    slips, slips_on_patch = 0, 0
     for step in range(count):
         for k in range(4):
             turned = readings[step, k] - (readings[step - 1, k] if step else 0.0)
             measured[k] = to_speed * scale[k] * turned
-        follow(body, before, measured, dt / count, traction, lost)
+        slips += follow(memory[_BODY], before, measured, dt / count, fixed[_FLOOR], lost)
+        if patches > 0.0:
+            slips_on_patch += follow(
+                memory[_BODY_ON_PATCH], before, measured, dt / count, fixed[_PATCH], lost_on_patch
+            )
         for k in range(4):
             before[k] = measured[k]
-    vx, vy, omega = twist[0], twist[1], twist[2]
-    # The acceleration of a body whose axes turn with it.
-    ahead = creep[0] * ((vx - last[0]) / dt - omega * vy)
-    aside = creep[1] * ((vy - last[1]) / dt + omega * vx)
-    turning = creep[2] * ((omega - last[2]) / dt)
-    twist[0], twist[1], twist[2] = vx - ahead, vy - aside, omega - turning
+    lever = fixed[_FLOOR][3]
+    lost[2] /= lever
+    lost_on_patch[2] /= lever
+    # Wheels that grip creep: by the acceleration of a body whose axes turn with it.
+    vx, vy, omega = wheels[0], wheels[1], wheels[2]
+    creeps[0] = creep[0] * ((vx - last[0]) / dt - omega * vy)
+    creeps[1] = creep[1] * ((vy - last[1]) / dt + omega * vx)
+    creeps[2] = creep[2] * ((omega - last[2]) / dt)
     last[0], last[1], last[2] = vx, vy, omega
-    share = fixed[_SHARE]
-    along, turned = share * math.hypot(lost[0], lost[1]) / dt, share * abs(lost[2]) / (dt * traction[3])
-    if share < 1.0:  # some wheels on a patch, some beside it
-        turned = math.hypot(turned, _ON_AND_OFF * along / traction[3])
-    # Wheels creep or slip, and what a body is pulled by while they slip holds the creep.
-    return max(along, _CREEP_ERROR * math.hypot(ahead, aside)), max(turned, _CREEP_ERROR * abs(turning))
+    grips = 1.0 - ((1.0 - patches) * slips + patches * slips_on_patch) / count
+    for i in range(3):
+        expected = (1.0 - patches) * lost[i] + patches * lost_on_patch[i]
+        twist[i] = wheels[i] - grips * creeps[i] - expected / dt
+        may[i] = fixed[_SPREAD] * (lost_on_patch[i] - lost[i] if patches > 0.0 else lost[i])
+    along, turned = add_up(slid, may, dt, slips + slips_on_patch > 0)
+    turned = math.hypot(turned, _ON_AND_OFF * along / lever)
+    crept, twisted = _CREEP_ERROR * math.hypot(creeps[0], creeps[1]), _CREEP_ERROR * abs(creeps[2])
+    return max(along / dt, crept), max(turned / dt, twisted)
 
 
 @njit(cache=True, nogil=True)
