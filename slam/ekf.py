@@ -14,14 +14,15 @@ from numpy.typing import NDArray
 
 from slam.backend import found_cov
 from slam.gaussian import joint_gaussian as joint
-from slam.gaussian.beliefs import GaussianBackend
 from slam.gaussian.companions import Companions
 from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
-from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, whiten_difference, work_space
+from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
+from slam.graph.held_by_map import HeldByMap
 from slam.graph.places import Places
-from slam.health.relocalisation import Place, Relocaliser
+from slam.health.relocalisation import Place
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
@@ -31,18 +32,18 @@ from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
 from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
-from slam.landmarks.seen_from import seen_from
+from slam.landmarks.right_angles import find_square
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
-from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
+from slam.types import LINE, Array, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
 
 _WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 
 
-class EkfSlam(GaussianBackend):
+class EkfSlam(HeldByMap):
     """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``."""
 
     config: EkfConfig
@@ -126,6 +127,22 @@ class EkfSlam(GaussianBackend):
                 self._spinning.untold = self._may_slip_along and not told
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
+        if self.config.lines and self.config.right_angle_sigma_rad > 0.0:
+            self._square()
+
+    def _square(self) -> None:
+        """Hold walls against the direction of the others (:mod:`slam.landmarks.right_angles`)."""
+        book, sigma = self._book, self.config.right_angle_sigma_rad
+        while (found := find_square(self._x, self._p, book.marks, book.now, sigma, self._curved))[0] >= 0:
+            i, j = 3 + 2 * found[0], 3 + 2 * found[1]
+            whiten_difference(self._p, self._n, i, j, -found[2], sigma * sigma, self._w, self._s)
+            self._correct_difference(i, j)
+
+    def _correct_difference(self, i: int, j: int) -> None:
+        """Correct by what :func:`slam.gaussian.stacked_update.whiten_difference` left of states i and j."""
+        add_combination(self._x, self._n, self._s[:2, 2], self._w)
+        downdate(self._p, self._n, self._w, self._w, 2, 0)
+        self._beside.correct_difference(self._n, i, j, self._w, self._s)
 
     def observe(self, observations: Observations) -> None:
         """Correct by observations without a scan; known ids are believed up to ``known_gate``, new ones added."""
@@ -276,48 +293,6 @@ class EkfSlam(GaussianBackend):
         self._correct(z, match)
         self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
-
-    def _hold_by_map(self, scan: Scan) -> None:
-        """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
-        recovery = self.recovery
-        if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
-            if recovery.opposed(self.grid, self._x[:3], scan):
-                place = self._place_beside(scan)
-                if not recovery.opposed(self.grid, place.pose, scan):
-                    self._correct_by_map(place, JOINT_LIMITS)
-        elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
-            self._hold_by_place(scan)
-
-    def _hold_by_place(self, scan: Scan) -> None:
-        """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""
-        x, book, places = self._x[: self._n], self._book, self._places
-        ends = places.ends(scan, self.extractor)
-        seen, away = places.seen(x, book.marks, ends)
-        fits = seen is not None and self._correct_aside(*seen, JOINT_LIMITS)
-        if places.wanted(away, fits=fits):
-            for z in places.make(book.next_id, ends):
-                self._add(z, None)
-
-    def _places_beside(self) -> Indices:
-        return self._places.beside(self._x[: self._n], self._book.marks)
-
-    def _place_beside(self, scan: Scan) -> Place:
-        """Return where beside the believed pose a scan fits the drawn map best."""
-        c = self.config
-        return Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, self._x[:3].copy())
-
-    def _correct_by_map(self, place: Place, limits: Array) -> None:
-        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
-        offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
-        self._correct_aside(*seen_from(self._x, self._book.marks, offset, place.pose, cov), limits)
-
-    def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:
-        """Correct by what no feature of the scan shows, nor counts to its NIS; tell whether it stands."""
-        kept = self.nis, self.nis_dof
-        self._correct(z, match, limits)
-        stands = self.nis_dof > 0
-        self.nis, self.nis_dof = kept
-        return stands
 
     def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
         """Correct by a match, curved walls made straight; tell whether it stands: its joint NIS may be refused."""

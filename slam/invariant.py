@@ -85,8 +85,16 @@ class InvariantEkfSlam(CompressedEkfSlam):
         )  # fmt: skip
         self._beside.correct(n, match, self._h, w, self._s, self.nis_dof, reset=True)
         if self.nis_dof:
-            _turn_columns(self._beside.cross, n, self._delta)
-            self._turned += float(self._delta[2])
+            self._turn_beside()
+
+    def _correct_difference(self, i: int, j: int) -> None:
+        apply(self._x, self._p, self._n, 2, self._book.marks, self._w, self._s, self._delta)
+        self._beside.correct_difference(self._n, i, j, self._w, self._s, reset=True)
+        self._turn_beside()
+
+    def _turn_beside(self) -> None:
+        _turn_columns(self._beside.cross, self._n, self._delta)
+        self._turned += float(self._delta[2])
 
     def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
         turned = self._turned
@@ -145,11 +153,8 @@ def invariant_update(
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 
-    The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`). The reset P ← P + A Vᵀ
-    + V Aᵀ (docs/reference/invariant.md) goes along with P − Wᵀ W: the rows of ``w`` after W's are, for θ,
-    x and y, A's column and −V's; what of it is by a wall's own α follows. ``marks`` tells walls from points;
-    ``delta`` ``(≥ n,)`` holds after it, where a wall's r stands in the state, what it changes by that α, else 0;
-    ``limits`` are the standard filter's.
+    The gain is the standard filter's (:func:`slam.gaussian.stacked_update.stacked_update`), as are ``limits``; for
+    ``marks``, ``w`` and ``delta`` see :func:`apply`.
     """
     rows = whiten(x, p, n, z, match, offset, h, w, s)
     if rows == 0:
@@ -159,6 +164,19 @@ def invariant_update(
         nis += s[k, rows] * s[k, rows]
     if nis > limits[min(rows // 2, limits.shape[0] - 1)]:
         return 0, nis
+    apply(x, p, n, rows, marks, w, s, delta)
+    return rows, nis
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def apply(x: Array, p: Array, n: int, rows: int, marks: Array, w: Array, s: Array, delta: Array) -> None:
+    """Correct by so many ``rows``, as :func:`slam.gaussian.stacked_update.whiten` left them in ``w`` and ``s``.
+
+    The reset P ← P + A Vᵀ + V Aᵀ (docs/reference/invariant.md) goes along with P − Wᵀ W: the rows of ``w`` after
+    W's are, for θ, x and y, A's column and −V's; what of it is by a wall's own α follows. ``marks`` tells walls
+    from points; ``delta`` ``(≥ n,)`` holds after it, where a wall's r stands in the state, what it changes by that
+    α, else 0.
+    """
     delta[:n] = 0.0
     add_combination(delta, n, s[:rows, rows], w)
     a, minus_v = w[rows : rows + 6 : 2], w[rows + 1 : rows + 6 : 2]
@@ -173,7 +191,6 @@ def invariant_update(
     downdate(p, n, w, w, rows, 3 if walls else 1)
     if walls:
         _turn(p, n, delta)
-    return rows, nis
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

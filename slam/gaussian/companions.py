@@ -86,6 +86,13 @@ class Companions:
         if rows and len(self.mean):
             _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows, self.own, reset)
 
+    def correct_difference(self, n: int, i: int, j: int, w: Array, s: Array, *, reset: bool = False) -> None:
+        """Correct by :func:`slam.gaussian.stacked_update.whiten_difference` of states i and j."""
+        if len(self.mean):
+            self._w[0, : len(self.mean)] = self.cross[:, i] - self.cross[:, j]
+            self._w[1, : len(self.mean)] = 0.0
+            _apply(self.mean, self.cov, self.cross, n, w, s, self._w, 2, self.own, reset)
+
     def add(self, n: int, gr: Array) -> None:
         """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""
         self.cross[:, n : n + 2] = self.cross[:, :3] @ gr.T
@@ -110,7 +117,7 @@ def _correct(
     mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
     we: Array, rows: int, own: int, reset: bool,
 ) -> None:  # fmt: skip
-    """W_e = L⁻¹ H Cᵀ, e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
+    """Correct by an update of landmarks, H being ``h``."""
     states = mean.shape[0]
     a = 0
     for k in range(match.shape[0]):
@@ -123,6 +130,15 @@ def _correct(
                 c = cross[i]
                 we[a + e, i] = g[0] * c[0] + g[1] * c[1] + g[2] * c[2] + g[3] * c[m] + g[4] * c[m + 1]
         a += 2
+    _apply(mean, cov, cross, n, w, s, we, rows, own, reset)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _apply(
+    mean: Array, cov: Array, cross: Array, n: int, w: Array, s: Array, we: Array, rows: int, own: int, reset: bool
+) -> None:
+    """W_e = L⁻¹ H Cᵀ, H Cᵀ standing in ``we``; e += W_eᵀ L⁻¹ ν, C −= W_eᵀ W, E −= W_eᵀ W_e."""
+    states = mean.shape[0]
     solve(s, we, states, rows)
     add_combination(mean, states, s[:rows, rows], we)
     subtract(cross, states, n, we, w, rows)

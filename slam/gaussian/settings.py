@@ -8,7 +8,7 @@ from typing import Annotated
 
 from slam.backend import BackendConfig
 from slam.landmarks.book import LandmarkPolicy
-from slam.settings import OneOf, Positive, Within
+from slam.settings import NotNegative, OneOf, Positive, Within
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig"]
 
@@ -31,6 +31,8 @@ class EkfConfig(BackendConfig):
     # Old landmarks expected no better than to this count only together.
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
     lines: bool = False  # take straight walls for landmarks, too
+    # 1σ of walls' directions about right angles, where most stand so: slam.landmarks.right_angles; 0: left alone.
+    right_angle_sigma_rad: NotNegative = 0.001
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 

@@ -21,7 +21,9 @@ from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
 from slam.types import LINE, Array
 
-__all__ = ["NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "work_space"]
+__all__ = [
+    "NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "whiten_difference", "work_space",
+]  # fmt: skip
 
 SPARE_ROWS = 6
 """Rows of w beyond the observations', for what a filter may want to subtract beside Wᵀ W."""
@@ -104,6 +106,22 @@ def whiten(
     cholesky(s, rows)
     solve(s, w, n, rows)
     return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def whiten_difference(p: Array, n: int, i: int, j: int, nu: float, variance: float, w: Array, s: Array) -> int:
+    """Do :func:`whiten` for one observation, that of x_i − x_j, with its innovation; return the number of rows.
+
+    There are two, of which the second is nought: rows are worked on in pairs.
+    """
+    for k in range(n):
+        w[0, k] = p[min(i, k), max(i, k)] - p[min(j, k), max(j, k)]
+        w[1, k] = 0.0
+    s[0, 0], s[0, 1], s[0, 2] = w[0, i] - w[0, j] + variance, 0.0, nu
+    s[1, 1], s[1, 2] = 1.0, 0.0
+    cholesky(s, 2)
+    solve(s, w, n, 2)
+    return 2
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -27,7 +27,7 @@ __all__ = [
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 FROM_MARK = 6  # column of ``marks``: where a wall begins, a point's end of a surface, a virtual point's place
 
-MARKS = 12  # columns of ``marks``, one row a landmark; the last four are of walls: curved_walls, contradicted
+MARKS = 13  # columns of ``marks``, one row a landmark; the last five are of walls: see curved_walls and on
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, LAST_SEEN, _FROM, _TO = range(8)
 RECENT = 3  # updates, of which a landmark was in one: it is missed where it is not seen again
 _SAME_TURN = 0.6  # [rad] between two sightings of one landmark
@@ -77,12 +77,12 @@ class LandmarkBook:
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 12)``.
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 13)``.
 
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
         surface it is, as the observation does. Then, of a wall's curvature, the information of its measurements,
-        the same times what they measured, and where along the wall it is tangent to its line; and how far its
-        sightings contradict it. A view.
+        the same times what they measured, and where along the wall it is tangent to its line; how far its
+        sightings contradict it; and whether it was held against the direction of others. A view.
         """
         return self._marks[: self.count]
 
@@ -123,7 +123,7 @@ class LandmarkBook:
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
         seen = -math.inf if kind == VIRTUAL else self._now
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend, 0.0)
+        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend, 0.0, 0.0)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -138,7 +138,7 @@ class LandmarkBook:
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
     def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
-        """Have these landmarks ``(n,)``, with these marks ``(n, 12)``, instead of those it has."""
+        """Have these landmarks ``(n,)``, with these marks ``(n, 13)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
         self._make_room(count)

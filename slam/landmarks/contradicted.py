@@ -34,7 +34,7 @@ def doubt(x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64],
     x, p, offset, z, match
         As in :func:`slam.landmarks.association.nearest_neighbour`, before the correction.
     marks
-        Of all landmarks ``(n, 12)``: :class:`slam.landmarks.book.LandmarkBook`.
+        Of all landmarks ``(n, 13)``: :class:`slam.landmarks.book.LandmarkBook`.
     """
     h, before = np.empty((2, 5)), marks[:, DOUBT].copy()
     for k in range(z.shape[0]):

@@ -26,7 +26,7 @@ def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) ->
     Parameters
     ----------
     x, marks
-        The state ``(3 + 2n,)``, and the landmarks' marks ``(n, 12)``: :class:`slam.landmarks.book.LandmarkBook`.
+        The state ``(3 + 2n,)``, and the landmarks' marks ``(n, 13)``: :class:`slam.landmarks.book.LandmarkBook`.
     offset
         The sensor's, ahead of the robot's centre [m].
     pose, cov

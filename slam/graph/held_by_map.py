@@ -1,0 +1,74 @@
+"""Gaussian filters held by the drawn map: where the pose is in doubt, and at places without landmarks."""
+
+from __future__ import annotations
+
+import abc
+
+from slam.backend import found_cov
+from slam.gaussian.beliefs import GaussianBackend
+from slam.gaussian.settings import EkfConfig
+from slam.gaussian.stacked_update import NO_LIMITS
+from slam.graph.places import Places
+from slam.health.relocalisation import Place, Relocaliser
+from slam.landmarks.joint_compatibility import JOINT_LIMITS
+from slam.landmarks.seen_from import seen_from
+from slam.types import Array, Indices, Scan
+
+__all__ = ["HeldByMap"]
+
+
+class HeldByMap(GaussianBackend):
+    """What a filter does where a scan, held against the drawn map, says more than its features do."""
+
+    config: EkfConfig
+    nis: float
+    nis_dof: int
+    _places: Places
+
+    @abc.abstractmethod
+    def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None: ...
+
+    @abc.abstractmethod
+    def _add(self, z: Array, known_id: int | None) -> None: ...
+
+    def _hold_by_map(self, scan: Scan) -> None:
+        """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
+        recovery = self.recovery
+        if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
+            if recovery.opposed(self.grid, self._x[:3], scan):
+                place = self._place_beside(scan)
+                if not recovery.opposed(self.grid, place.pose, scan):
+                    self._correct_by_map(place, JOINT_LIMITS)
+        elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
+            self._hold_by_place(scan)
+
+    def _hold_by_place(self, scan: Scan) -> None:
+        """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""
+        x, book, places = self._x[: self._n], self._book, self._places
+        ends = places.ends(scan, self.extractor)
+        seen, away = places.seen(x, book.marks, ends)
+        fits = seen is not None and self._correct_aside(*seen, JOINT_LIMITS)
+        if places.wanted(away, fits=fits):
+            for z in places.make(book.next_id, ends):
+                self._add(z, None)
+
+    def _places_beside(self) -> Indices:
+        return self._places.beside(self._x[: self._n], self._book.marks)
+
+    def _place_beside(self, scan: Scan) -> Place:
+        """Return where beside the believed pose a scan fits the drawn map best."""
+        c = self.config
+        return Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, self._x[:3].copy())
+
+    def _correct_by_map(self, place: Place, limits: Array) -> None:
+        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
+        offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
+        self._correct_aside(*seen_from(self._x, self._book.marks, offset, place.pose, cov), limits)
+
+    def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:
+        """Correct by what no feature of the scan shows, nor counts to its NIS; tell whether it stands."""
+        kept = self.nis, self.nis_dof
+        self._correct(z, match, limits)
+        stands = self.nis_dof > 0
+        self.nis, self.nis_dof = kept
+        return stands
