@@ -28,7 +28,8 @@ _SIGHTINGS = 10  # of a wall that counts; it is asked about at every so many
 _LENGTH_M, _BEND_RAD = 1.0, 0.002  # at least, and at most
 _KNOWN_RAD, _SURE_RAD = 0.008, 0.003  # 1σ of a direction against the reference, and against those that agree
 _AGREE, _SHARE = 3, 2.0 / 3.0
-_SIGMAS = 3.0
+_SIGMAS = 3.0  # within which others agree
+_FITS = 2.0  # within which it fits the reference: a wall that is left out costs little, one that is askew much
 _RIGHT = 0.5 * math.pi
 
 
@@ -65,7 +66,7 @@ def find_square(x: Array, p: Array, marks: Array, now: int, sigma: float, model:
             reference = k
             continue
         off, variance = _against(x, p, k, reference)
-        if variance < _KNOWN_RAD**2 and off * off < _SIGMAS**2 * (variance + sigma * sigma):
+        if variance < _KNOWN_RAD**2 and off * off < _FITS**2 * (variance + sigma * sigma):
             mark[SQUARE] = 1.0
             return k, reference, off
     return -1, -1, 0.0
