@@ -32,7 +32,7 @@ class EkfConfig(BackendConfig):
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
     lines: bool = False  # take straight walls for landmarks, too
     # 1σ of walls' directions about right angles, where most stand so: slam.landmarks.right_angles; 0: left alone.
-    right_angle_sigma_rad: NotNegative = 0.001
+    right_angle_sigma_rad: NotNegative = 0.0
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 
