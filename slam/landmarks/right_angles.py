@@ -6,9 +6,11 @@ milliradian or two. So each wall is held, once, against one wall of the map: the
 of 90°, up to ``EkfConfig.right_angle_sigma_rad`` (Nguyen, Harati, Siegwart, "A lightweight SLAM algorithm using
 orthogonal planes", IROS 2007, keep nothing but such walls; here the others stay what they are).
 
-The reference may itself be askew by that much, in which case all are, and their covariance does not know: so this is
-off by default (docs/studies/buildings.md). Which walls do is found from the map: a wall that counts is straight, long, seen often, and two thirds of the walls
+Which walls do is found from the map: a wall that counts is straight, long, seen often, and two thirds of the walls
 whose direction against it is well known agree with it, three at least. Where walls bend or stand askew, none does.
+
+The one wall may itself be askew by as much. Then all are, and their covariance does not know: so this is off by
+default (docs/studies/buildings.md, Right angles).
 """
 
 from __future__ import annotations

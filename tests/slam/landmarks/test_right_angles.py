@@ -133,7 +133,9 @@ def test_the_invariant_filter_takes_directions_as_they_are() -> None:
 
 @pytest.mark.parametrize(("rooms", "most"), [("apartment", True), ("cave", False)])
 def test_in_rooms_most_walls_are_held_and_in_caves_none(rooms: str, most: bool) -> None:
-    env = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms, slam_config={"right_angle_sigma_rad": SIGMA})
+    env = gymnasium.make(
+        "mecanum_env/Explore-v0", rooms=rooms, config={"slam_config": {"right_angle_sigma_rad": SIGMA}}
+    )
     world, agent = env.unwrapped, agents.make("brisk-tour")
     observation, _ = env.reset(seed=3)
     agent.reset(world.belief, seed=3)
