@@ -57,5 +57,9 @@ def test_a_row_is_what_an_episode_left(tmp_path: Path) -> None:
     assert np.all(np.diff(row.coverage_by_path) > -0.01)
     picture = cv2.imdecode(np.frombuffer(row.thumbnail, np.uint8), cv2.IMREAD_COLOR)
     assert max(picture.shape) <= 220
-    # The noise has reached the episode. (V knows what slips, which has brought the ratio from above 2 to 1.9.)
-    assert rows["slippery"].metrics["ate_rmse_m"] > 1.5 * row.metrics["ate_rmse_m"]
+    # The noise has reached the episode: the wheels alone tell far less.
+    alone = [
+        run_job(make(suite=name, noise=noise, max_steps=STEPS, slam="odometry")).metrics["ate_rmse_m"]
+        for name, noise in (("rooms", "nominal"), ("rooms-slippery", "slippery"))
+    ]
+    assert alone[1] > 2.0 * alone[0]
