@@ -29,7 +29,6 @@ from slam.gaussian.low_rank import FEWEST_SAMPLES, factor, root_of_loss
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
-from slam.landmarks.right_angles import REFERENCE, SQUARE
 from slam.settings import Gap, Within
 from slam.types import LINE, Array, Observations, Scan
 
@@ -161,7 +160,6 @@ class CompressedEkfSlam(EkfSlam):
         radius = self._radius(distance)
         near = distance < radius
         near |= np.isin(self._map_ids[places], also) | (len(places) <= self.config.whole_up_to)
-        near |= marks[:, SQUARE] == REFERENCE
         self._near, self._far = places[near], places[~near]
         self._book.replace(self._map_ids[self._near], marks[near])
         self._enter()

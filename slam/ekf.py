@@ -77,7 +77,11 @@ class EkfSlam(HeldByMap):
 
     def _companions(self) -> Companions:
         """Return the states beside the map."""
-        return Companions(len(self._match), len(self._x))
+        return Companions(len(self._match), len(self._x), direction=self._squares)
+
+    @property
+    def _squares(self) -> bool:
+        return self.config.lines and self.config.right_angle_sigma_rad > 0.0
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured (docs/reference/ekf.md, Predict)."""
@@ -127,22 +131,31 @@ class EkfSlam(HeldByMap):
                 self._spinning.untold = self._may_slip_along and not told
                 self._spinning.forget_motion()
         self._manage(z, match, scan)
-        if self.config.lines and self.config.right_angle_sigma_rad > 0.0:
+        if self._squares:
             self._square()
 
     def _square(self) -> None:
-        """Hold walls against the direction of the others (:mod:`slam.landmarks.right_angles`)."""
-        book, sigma = self._book, self.config.right_angle_sigma_rad
-        while (found := find_square(self._x, self._p, book.marks, book.now, sigma, self._curved))[0] >= 0:
-            i, j = 3 + 2 * found[0], 3 + 2 * found[1]
-            whiten_difference(self._p, self._n, i, j, -found[2], sigma * sigma, self._w, self._s)
-            self._correct_difference(i, j)
+        """Hold walls against the direction of the building (:mod:`slam.landmarks.right_angles`)."""
+        book, beside, sigma = self._book, self._beside, self.config.right_angle_sigma_rad
+        while True:
+            direction, variance, cross = beside.direction
+            wall, off = find_square(
+                self._x, self._p, book.marks, book.now, sigma, self._curved, direction, variance, cross
+            )
+            if wall < 0:
+                return
+            i = 3 + 2 * wall
+            if variance == 0.0:
+                beside.take_direction(self._x, self._p, self._n, i, sigma * sigma)
+                continue
+            whiten_difference(self._p, self._n, i, cross, variance, -off, sigma * sigma, self._w, self._s)
+            self._correct_direction(i)
 
-    def _correct_difference(self, i: int, j: int) -> None:
-        """Correct by what :func:`slam.gaussian.stacked_update.whiten_difference` left of states i and j."""
+    def _correct_direction(self, i: int) -> None:
+        """Correct by what :func:`slam.gaussian.stacked_update.whiten_difference` left of a wall's direction."""
         add_combination(self._x, self._n, self._s[:2, 2], self._w)
         downdate(self._p, self._n, self._w, self._w, 2, 0)
-        self._beside.correct_difference(self._n, i, j, self._w, self._s)
+        self._beside.correct_direction(self._n, i, self._w, self._s)
 
     def observe(self, observations: Observations) -> None:
         """Correct by observations without a scan; known ids are believed up to ``known_gate``, new ones added."""

@@ -69,7 +69,8 @@ class InvariantEkfSlam(CompressedEkfSlam):
         if noise.lasting is None or not self.config.wheel_states:
             return super()._companions()
         self._noise = noise.white()
-        return WheelErrors(noise.lasting, noise.lever_m, len(self._match), len(self._x))
+        size = len(self._x)
+        return WheelErrors(noise.lasting, noise.lever_m, len(self._match), size, direction=self._squares)
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured, less what they are known to be off by."""
@@ -87,9 +88,9 @@ class InvariantEkfSlam(CompressedEkfSlam):
         if self.nis_dof:
             self._turn_beside()
 
-    def _correct_difference(self, i: int, j: int) -> None:
+    def _correct_direction(self, i: int) -> None:
         apply(self._x, self._p, self._n, 2, self._book.marks, self._w, self._s, self._delta)
-        self._beside.correct_difference(self._n, i, j, self._w, self._s, reset=True)
+        self._beside.correct_direction(self._n, i, self._w, self._s, reset=True)
         self._turn_beside()
 
     def _turn_beside(self) -> None:
@@ -138,8 +139,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
     @property
     def wheel_errors(self) -> tuple[Array, Array] | None:
         """Relative errors of the four radii and the lever ``(5,)`` and their covariance; ``None`` if no states."""
-        own = self._beside.own
-        return (self._beside.mean[:own].copy(), self._beside.cov[:own, :own].copy()) if own else None
+        return self._beside.errors if isinstance(self._beside, WheelErrors) else None
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""

@@ -1,7 +1,7 @@
-"""States beside the map that no scan shows: what lasts of the wheels' errors, and what stands for the far map.
+"""States beside the map: what lasts of the wheels' errors, the building's direction, what stands for the far map.
 
-They are correlated with the robot and every landmark, and with one another. With e their estimates, E their
-covariance and C their cross-covariance with the state, which stand beside x and P:
+No scan shows them, but they are correlated with the robot, every landmark and one another. With e their estimates,
+E their covariance and C their cross-covariance with the state, which stand beside x and P:
 
     predict   C_r ← C_r Fxᵀ
     update    W_e = L⁻¹ H Cᵀ,   e += W_eᵀ L⁻¹ ν,   C −= W_eᵀ W,   E −= W_eᵀ W_e
@@ -27,10 +27,18 @@ __all__ = ["Companions"]
 class Companions:
     """States beside the map; of this class none to begin with, and more where :meth:`join` appends them."""
 
-    def __init__(self, observations: int, size: int, cov: Array | None = None) -> None:
-        """Begin with states of a covariance ``(k, k)``, none if left out; ``size`` is the map's state's."""
-        self.cov = np.zeros((0, 0)) if cov is None else cov  # E; of those appended the upper triangle
-        self.own = len(self.cov)  # those that are there all along, the first ones
+    def __init__(self, observations: int, size: int, cov: Array | None = None, *, direction: bool = False) -> None:
+        """Begin with states of a covariance ``(k, k)``, none if left out; ``size`` is the map's state's.
+
+        With ``direction`` there is one more, the building's direction (:mod:`slam.landmarks.right_angles`): it is
+        not known before :meth:`take_direction`, and has no variance until then.
+        """
+        known = 0 if cov is None else len(cov)
+        self.own = known + direction  # those that are there all along, the first ones
+        self.cov = np.zeros((self.own, self.own))  # E; of those appended the upper triangle
+        if cov is not None:
+            self.cov[:known, :known] = cov
+        self._direction = known
         self.mean = np.zeros(self.own)
         self.cross = aligned_zeros(self.own, size)  # C: of each with the robot and the landmarks
         self._rows = 2 * observations
@@ -86,12 +94,26 @@ class Companions:
         if rows and len(self.mean):
             _correct(self.mean, self.cov, self.cross, n, match, h, w, s, self._w, rows, self.own, reset)
 
-    def correct_difference(self, n: int, i: int, j: int, w: Array, s: Array, *, reset: bool = False) -> None:
-        """Correct by :func:`slam.gaussian.stacked_update.whiten_difference` of states i and j."""
-        if len(self.mean):
-            self._w[0, : len(self.mean)] = self.cross[:, i] - self.cross[:, j]
-            self._w[1, : len(self.mean)] = 0.0
-            _apply(self.mean, self.cov, self.cross, n, w, s, self._w, 2, self.own, reset)
+    @property
+    def direction(self) -> tuple[float, float, Array]:
+        """The building's direction [rad], its variance and its covariance ``(≥ n,)`` with the map's state."""
+        k = self._direction
+        return float(self.mean[k]), float(self.cov[k, k]), self.cross[k]
+
+    def take_direction(self, x: Array, p: Array, n: int, i: int, variance: float) -> None:
+        """Let the building's direction be that of the wall of state i, up to an error of its own of a variance."""
+        k = self._direction
+        self.mean[k] = x[i]
+        self.cross[k, :i], self.cross[k, i:n] = p[:i, i], p[i, i:n]
+        self.cov[k] = self.cov[:, k] = self.cross[:, i]
+        self.cov[k, k] = p[i, i] + variance
+
+    def correct_direction(self, n: int, i: int, w: Array, s: Array, *, reset: bool = False) -> None:
+        """Correct by :func:`slam.gaussian.stacked_update.whiten_difference` of state i and the direction."""
+        states = len(self.mean)
+        self._w[0, :states] = self.cross[:, i] - self.cov[self._direction]
+        self._w[1, :states] = 0.0
+        _apply(self.mean, self.cov, self.cross, n, w, s, self._w, 2, self.own, reset)
 
     def add(self, n: int, gr: Array) -> None:
         """Append a landmark with the Jacobian ``gr`` ``(2, 3)`` by the pose at state ``n``."""

@@ -31,8 +31,8 @@ class EkfConfig(BackendConfig):
     # Old landmarks expected no better than to this count only together.
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
     lines: bool = False  # take straight walls for landmarks, too
-    # 1σ of walls' directions about right angles, where most stand so: slam.landmarks.right_angles; 0: left alone.
-    right_angle_sigma_rad: NotNegative = 0.0
+    # 1σ of walls about the building's direction, if most stand square: slam.landmarks.right_angles; 0: left alone.
+    right_angle_sigma_rad: NotNegative = 0.001
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 

@@ -109,15 +109,18 @@ def whiten(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def whiten_difference(p: Array, n: int, i: int, j: int, nu: float, variance: float, w: Array, s: Array) -> int:
-    """Do :func:`whiten` for one observation, that of x_i − x_j, with its innovation; return the number of rows.
+def whiten_difference(
+    p: Array, n: int, i: int, cross: Array, e_variance: float, nu: float, variance: float, w: Array, s: Array
+) -> int:  # fmt: skip
+    """Do :func:`whiten` for one observation, that of x_i − e, with its innovation; return the number of rows.
 
-    There are two, of which the second is nought: rows are worked on in pairs.
+    e is a state beside the map (:mod:`slam.gaussian.companions`) of a variance, and ``cross`` ``(≥ n,)`` its
+    covariance with the state. There are two rows, of which the second is nought: they are worked on in pairs.
     """
     for k in range(n):
-        w[0, k] = p[min(i, k), max(i, k)] - p[min(j, k), max(j, k)]
+        w[0, k] = p[min(i, k), max(i, k)] - cross[k]
         w[1, k] = 0.0
-    s[0, 0], s[0, 1], s[0, 2] = w[0, i] - w[0, j] + variance, 0.0, nu
+    s[0, 0], s[0, 1], s[0, 2] = w[0, i] - cross[i] + e_variance + variance, 0.0, nu
     s[1, 1], s[1, 2] = 1.0, 0.0
     cholesky(s, 2)
     solve(s, w, n, 2)

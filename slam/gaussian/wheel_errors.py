@@ -36,12 +36,19 @@ _TURN = np.array([-1.0, 1.0, -1.0, 1.0])
 class WheelErrors(Companions):
     """Estimates of the five errors, and how they hang together with everything else."""
 
-    def __init__(self, declared: LastingErrors, lever_m: float, observations: int, size: int) -> None:
+    def __init__(
+        self, declared: LastingErrors, lever_m: float, observations: int, size: int, *, direction: bool = False
+    ) -> None:
         cov = np.diag([declared.radius_sigma**2] * 4 + [declared.lever_sigma**2])
         cov[:4, :4] += declared.difference_sigma**2 * np.outer(_TURN, _TURN)
-        super().__init__(observations, size, cov)
+        super().__init__(observations, size, cov, direction=direction)
         self._lever_m = lever_m
         self._b = np.zeros((3, _STATES))
+
+    @property
+    def errors(self) -> tuple[Array, Array]:
+        """The five errors ``(5,)`` and their covariance."""
+        return self.mean[:_STATES].copy(), self.cov[:_STATES, :_STATES].copy()
 
     def corrected(self, twist: Twist) -> Twist:
         """Return the twist of which the wheels claim ``twist``: body frame, m/s, m/s, rad/s."""

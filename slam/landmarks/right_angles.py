@@ -2,15 +2,14 @@
 
 After some corridors and halls the heading is known to some milliradians from scan to scan, and no scan says more:
 what is mapped there is turned as a whole. But of the walls of real buildings most run in two directions, within a
-milliradian or two. So each wall is held, once, against one wall of the map: their directions differ by a multiple
-of 90°, up to ``EkfConfig.right_angle_sigma_rad`` (Nguyen, Harati, Siegwart, "A lightweight SLAM algorithm using
-orthogonal planes", IROS 2007, keep nothing but such walls; here the others stay what they are).
+milliradian or two. So the building's direction is a state of the filter, beside the map
+(:class:`slam.gaussian.companions.Companions`), and each wall is held against it once: it differs by a multiple of
+90°, up to an error of its own of ``EkfConfig.right_angle_sigma_rad``, and the first is what the direction is known
+from (Nguyen, Harati, Siegwart, "A lightweight SLAM algorithm using orthogonal planes", IROS 2007, keep nothing but
+such walls; here the others stay what they are).
 
 Which walls do is found from the map: a wall that counts is straight, long, seen often, and two thirds of the walls
 whose direction against it is well known agree with it, three at least. Where walls bend or stand askew, none does.
-
-The one wall may itself be askew by as much. Then all are, and their covariance does not know: so this is off by
-default (docs/studies/buildings.md, Right angles).
 """
 
 from __future__ import annotations
@@ -23,24 +22,26 @@ from numba import njit
 from slam.landmarks.curved_walls import curvature
 from slam.types import LINE, Array
 
-__all__ = ["REFERENCE", "SQUARE", "find_square"]
+__all__ = ["SQUARE", "find_square"]
 
-SQUARE = 12  # column of a landmark's marks: 0, or 1 of a wall that was held against the reference
-REFERENCE = 2.0  # … or this, of the reference itself
+SQUARE = 12  # column of a landmark's marks: 0, or 1 of a wall that was held against the building's direction
 _SIGHTINGS = 10  # of a wall that counts; it is asked about at every so many
 _LENGTH_M, _BEND_RAD = 1.0, 0.002  # at least, and at most
-_KNOWN_RAD, _SURE_RAD = 0.008, 0.003  # 1σ of a direction against the reference, and against those that agree
+_KNOWN_RAD, _SURE_RAD = 0.008, 0.003  # 1σ of a wall against the building's direction, and against those that agree
 _AGREE, _SHARE = 3, 2.0 / 3.0
 _SIGMAS = 3.0  # within which others agree
-_FITS = 2.0  # within which it fits the reference: a wall that is left out costs little, one that is askew much
+_FITS = 2.0  # within which it fits the direction: a wall that is left out costs little, one that is askew much
 _RIGHT = 0.5 * math.pi
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def find_square(x: Array, p: Array, marks: Array, now: int, sigma: float, model: Array) -> tuple[int, int, float]:
-    """Return a wall that this update showed and that stands square, the reference, and how far it is off [rad].
+def find_square(
+    x: Array, p: Array, marks: Array, now: int, sigma: float, model: Array, direction: float, variance: float,
+    cross: Array,
+) -> tuple[int, float]:  # fmt: skip
+    """Return a wall that this update showed and that stands square, and how far it is off the direction [rad].
 
-    The wall is marked as square; -1 where there is none. The first such wall becomes the reference.
+    The wall is marked as square; -1 where there is none.
 
     Parameters
     ----------
@@ -51,28 +52,26 @@ def find_square(x: Array, p: Array, marks: Array, now: int, sigma: float, model:
     now
         The number of updates reviewed.
     sigma
-        1σ of a direction about a multiple of 90° from another's [rad].
+        1σ of a wall about a multiple of 90° from the building's direction [rad].
     model
         :func:`slam.landmarks.curved_walls.curvature_model`.
+    direction, variance, cross
+        The building's direction [rad], its variance, 0 if not known, and its covariance ``(≥ n,)`` with ``x``.
     """
-    reference = -1
-    for k in range(marks.shape[0]):
-        if marks[k, SQUARE] == REFERENCE:
-            reference = k
     for k in range(marks.shape[0]):
         mark = marks[k]
         due = mark[5] == now and mark[SQUARE] == 0.0 and mark[2] % _SIGHTINGS == 0.0
         if not due or not _counts(mark, model) or not _majority(x, p, marks, k, sigma, model):
             continue
-        if reference < 0:
-            mark[SQUARE] = REFERENCE
-            reference = k
-            continue
-        off, variance = _against(x, p, k, reference)
-        if variance < _KNOWN_RAD**2 and off * off < _FITS**2 * (variance + sigma * sigma):
+        if variance == 0.0:
             mark[SQUARE] = 1.0
-            return k, reference, off
-    return -1, -1, 0.0
+            return k, 0.0
+        a = 3 + 2 * k
+        off, of_both = _from_square(x[a] - direction), p[a, a] + variance - 2.0 * cross[a]
+        if of_both < _KNOWN_RAD**2 and off * off < _FITS**2 * (of_both + sigma * sigma):
+            mark[SQUARE] = 1.0
+            return k, off
+    return -1, 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -103,6 +102,10 @@ def _majority(x: Array, p: Array, marks: Array, k: int, sigma: float, model: Arr
 def _against(x: Array, p: Array, k: int, j: int) -> tuple[float, float]:
     """Return how far wall k's direction is off a multiple of 90° from wall j's [rad], and its variance."""
     a, b = 3 + 2 * k, 3 + 2 * j
-    off = x[a] - x[b]
-    off -= _RIGHT * np.round(off / _RIGHT)
-    return off, p[a, a] + p[b, b] - 2.0 * p[min(a, b), max(a, b)]
+    return _from_square(x[a] - x[b]), p[a, a] + p[b, b] - 2.0 * p[min(a, b), max(a, b)]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _from_square(angle: float) -> float:
+    """Return what an angle is beyond the nearest multiple of 90° [rad]."""
+    return float(angle - _RIGHT * np.round(angle / _RIGHT))

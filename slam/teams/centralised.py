@@ -91,8 +91,8 @@ class JointEkf:
                 member._apart = apart
             else:
                 member.grid = first.grid
-        first._beside = Companions(len(first._match), len(first._x), others)
-        first._beside.mean[:] = at[1:].ravel()
+        first._beside = Companions(len(first._match), len(first._x), others, direction=first._squares)
+        first._beside.mean[: len(others)] = at[1:].ravel()
         self._active = 0
         self._row = [-3, *range(0, 3 * (many - 1), 3)]  # where a robot stands beside the map; -3 is before it
 

@@ -1,4 +1,4 @@
-"""Walls that stand square are held against one another, and no others."""
+"""Walls that stand square are held against the building's direction, and no others."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from slam.geometry import wrap
 from slam.invariant import apply
 from slam.landmarks.book import MARKS
 from slam.landmarks.curved_walls import curvature_model
-from slam.landmarks.right_angles import REFERENCE, SQUARE, find_square
+from slam.landmarks.right_angles import SQUARE, find_square
 from slam.types import LINE
 
 Array = NDArray[np.float64]
@@ -40,21 +40,27 @@ def room(angles: list[float], *, sigma: float = SURE) -> tuple[Array, Array, Arr
     return x, p, marks
 
 
-def squared(x: Array, p: Array, marks: Array) -> list[tuple[int, int]]:
-    """Return which walls are held against which, one after the other."""
-    out = []
-    while (found := find_square(x, p, marks, NOW, SIGMA, MODEL))[0] >= 0:
-        out.append(found[:2])
-    return out
+def squared(x: Array, p: Array, marks: Array, direction: int = -1) -> list[int]:
+    """Return which walls are held against the direction of one, the first that counts if not told which."""
+    out: list[int] = []
+    while True:
+        known = direction >= 0
+        i = 3 + 2 * max(direction, 0)
+        cross = np.concatenate([p[:i, i], p[i, i:]])
+        wall, _ = find_square(x, p, marks, NOW, SIGMA, MODEL, x[i], (p[i, i] + SIGMA**2) * known, cross * known)
+        if wall < 0:
+            return out
+        out.append(wall)
+        direction = direction if known else wall
 
 
 SQUARE_ROOM = [0.3, 0.3 + 0.5 * math.pi, 0.3 - math.pi, 0.3 - 0.5 * math.pi]
 
 
-def test_walls_of_a_square_room_are_held_against_the_first() -> None:
+def test_walls_of_a_square_room_are_held_once() -> None:
     x, p, marks = room(SQUARE_ROOM)
-    assert squared(x, p, marks) == [(1, 0), (2, 0), (3, 0)]
-    assert marks[:, SQUARE].tolist() == [REFERENCE, 1.0, 1.0, 1.0]
+    assert squared(x, p, marks) == [0, 1, 2, 3]
+    assert marks[:, SQUARE].tolist() == [1.0] * 4
     assert squared(x, p, marks) == []
 
 
@@ -63,7 +69,7 @@ def test_a_wall_askew_is_left_alone_wherever_it_stands(askew: float) -> None:
     for place in range(5):
         angles = [*SQUARE_ROOM, *SQUARE_ROOM]
         angles.insert(place, 0.3 + askew)
-        assert place not in {wall for pair in squared(*room(angles)) for wall in pair}
+        assert place not in squared(*room(angles))
 
 
 @pytest.mark.parametrize("angles", [[0.0, 1.0, 2.1, 0.4, 2.7, -1.2], [k * math.pi / 3 for k in range(6)]])
@@ -75,7 +81,7 @@ def test_what_does_not_count() -> None:
     for column, value in ((0, 0.0), (2, 7.0), (5, NOW - 1.0), (7, 0.5), (BEND + 1, 3e4)):  # 0.03/m over 3 m
         x, p, marks = room([*SQUARE_ROOM, *SQUARE_ROOM])
         marks[4, column] = value
-        assert 4 not in {wall for pair in squared(x, p, marks) for wall in pair}, column
+        assert 4 not in squared(x, p, marks), column
 
 
 def test_a_place_whose_direction_nobody_knows_is_left_alone() -> None:
@@ -83,52 +89,82 @@ def test_a_place_whose_direction_nobody_knows_is_left_alone() -> None:
     for sigma, expected in ((0.005, [4, 5, 6, 7]), (0.02, [])):
         x, p, marks = room([*SQUARE_ROOM, *(a + 0.004 for a in SQUARE_ROOM)])
         marks[:4, 5] = NOW - 10.0
-        marks[0, SQUARE] = REFERENCE
         far = np.arange(11, 19, 2)
         p[np.ix_(far, far)] += np.triu(np.full((4, 4), sigma**2))
-        assert [wall for wall, _ in squared(x, p, marks)] == expected
+        assert squared(x, p, marks, direction=0) == expected
 
 
 @given(st.integers(0, 10**6))
-def test_a_difference_is_a_correction_like_any_other(seed: int) -> None:
-    """Against the plain formulas, states beside the map included."""
+def test_a_wall_held_against_the_direction_is_a_correction_like_any_other(seed: int) -> None:
+    """Against the plain formulas: the direction is one wall's plus an error; then another wall is held to it."""
     rng = np.random.default_rng(seed)
-    n, k = 3 + 2 * int(rng.integers(2, 8)), 3
-    i, j = (3 + 2 * int(v) for v in rng.choice((n - 3) // 2, 2, replace=False))
-    root = rng.standard_normal((n + k, n + k))
-    whole, nu, variance = root @ root.T, float(rng.standard_normal()), 0.5
+    n, others = 3 + 2 * int(rng.integers(2, 8)), int(rng.integers(0, 4))
+    first, i = (3 + 2 * int(v) for v in rng.choice((n - 3) // 2, 2, replace=False))
+    root = rng.standard_normal((n + others, n + others))
+    whole, x, nu, variance = root @ root.T, rng.standard_normal(n), float(rng.standard_normal()), 0.5
     p = aligned_zeros(n, n)
     p[:, :n] = np.triu(whole[:n, :n])
-    beside = Companions(4, n, whole[n:, n:].copy())
-    beside.cross[:, :n] = whole[n:, :n]
-    _, w, s = work_space(4, n)
-    assert whiten_difference(p, n, i, j, nu, variance, w, s) == 2
-    beside.correct_difference(n, i, j, w, s)
-    h = np.zeros(n + k)
-    h[i], h[j] = 1.0, -1.0
+    beside = Companions(4, n, whole[n:, n:].copy(), direction=True)
+    beside.cross[:others, :n] = whole[n:, :n]
+    assert beside.direction[1] == 0.0
+    beside.take_direction(x, p, n, first, variance)
+
+    copy = np.vstack([np.eye(n + others), np.eye(n + others)[first]])
+    whole = copy @ whole @ copy.T
+    whole[-1, -1] += variance
+    assert beside.direction[0] == x[first]
+    np.testing.assert_allclose(beside.cov, whole[n:, n:], atol=1e-9)
+    np.testing.assert_allclose(beside.cross[:, :n], whole[n:, :n], atol=1e-9)
+
+    mean, (_, known, cross), (_, w, s) = beside.mean.copy(), beside.direction, work_space(4, n)
+    assert whiten_difference(p, n, i, cross, known, nu, variance, w, s) == 2
+    beside.correct_direction(n, i, w, s)
+    h = np.zeros(len(whole))
+    h[i], h[-1] = 1.0, -1.0
     gain = whole @ h / (h @ whole @ h + variance)
     after = whole - np.outer(gain, h @ whole)
     np.testing.assert_allclose(w[:2, :n].T @ s[:2, 2], nu * gain[:n], atol=1e-9)
     np.testing.assert_allclose(np.triu(p[:, :n] - w[:2, :n].T @ w[:2, :n]), np.triu(after[:n, :n]), atol=1e-9)
-    np.testing.assert_allclose(beside.mean, nu * gain[n:], atol=1e-9)
+    np.testing.assert_allclose(beside.mean - mean, nu * gain[n:], atol=1e-9)
     np.testing.assert_allclose(beside.cov, after[n:, n:], atol=1e-9)
     np.testing.assert_allclose(beside.cross[:, :n], after[n:, :n], atol=1e-9)
 
 
+def hold_all(askew: Array, sigma: float) -> tuple[Array, Array, float, float]:
+    """Hold walls that are seen to ``sigma`` against the direction; return the state, covariance and direction."""
+    x, p, marks = room([*askew], sigma=sigma)
+    n = len(x)
+    aligned, beside, (_, w, s) = aligned_zeros(n, n), Companions(4, n, direction=True), work_space(4, n)
+    aligned[:, :n] = p
+    beside.take_direction(x, aligned, n, 3, SIGMA**2)
+    for i in range(5, n, 2):
+        direction, variance, cross = beside.direction
+        off = x[i] - direction
+        whiten_difference(aligned, n, i, cross, variance, -off, SIGMA**2, w, s)
+        apply(x, aligned, n, 2, marks, w, s, np.zeros(n))
+        beside.correct_direction(n, i, w, s, reset=True)
+    return x, aligned[:, :n], *beside.direction[:2]
+
+
 def test_the_invariant_filter_takes_directions_as_they_are() -> None:
-    """Angles keep their coordinates, whatever turns with them: what is known of them adds up."""
-    x, p, marks = room(SQUARE_ROOM, sigma=0.01)
-    x[3] += 0.02
-    size = len(x)
-    _, w, s = work_space(4, size)
-    aligned = aligned_zeros(size, size)
-    aligned[:, :size] = p
-    whiten_difference(aligned, size, 3, 7, -0.02, SIGMA**2, w, s)
-    apply(x, aligned, size, 2, marks, w, s, np.zeros(size))
-    before, after = 2 * 0.01**2, aligned[3, 3] + aligned[7, 7] - 2 * aligned[3, 7]
-    assert after == pytest.approx(1.0 / (1.0 / before + 1.0 / SIGMA**2), rel=1e-6)
-    off = float(wrap(np.array([x[3] - x[7] - math.pi]))[0])
-    assert off == pytest.approx(0.02 * SIGMA**2 / (before + SIGMA**2), rel=1e-6)
+    """Angles keep their coordinates, whatever turns with them: what is known of the direction adds up."""
+    askew = np.array([0.02, -0.01, 0.0, 0.005, 0.03])
+    x, p, direction, variance = hold_all(askew, sigma=0.01)
+    assert variance == pytest.approx((0.01**2 + SIGMA**2) / len(askew), rel=1e-6)
+    assert direction == pytest.approx(askew.mean(), rel=1e-6)
+    left = SIGMA**2 / (0.01**2 + SIGMA**2)
+    np.testing.assert_allclose(x[3::2] - direction, left * (askew - direction), rtol=1e-6)
+    np.testing.assert_allclose(np.diag(p)[3::2], 0.01**2 * left + (1.0 - left) ** 2 * variance, rtol=1e-6)
+
+
+def test_the_covariance_knows_of_the_error_that_all_walls_share() -> None:
+    """The first wall's own error is in all that is held against it: their mean has its true variance."""
+    rng, walls, sigma, squares = np.random.default_rng(5), 12, 0.0002, []
+    for _ in range(400):
+        own = SIGMA * rng.standard_normal(walls)  # a building of direction 0
+        _, _, direction, variance = hold_all(own + sigma * rng.standard_normal(walls), sigma)
+        squares.append(direction**2 / variance)
+    assert 0.85 < np.mean(squares) < 1.17
 
 
 @pytest.mark.parametrize(("rooms", "most"), [("apartment", True), ("cave", False)])
