@@ -138,18 +138,19 @@ class EkfSlam(HeldByMap):
         """Hold walls against the direction of the building (:mod:`slam.landmarks.right_angles`)."""
         book, beside, sigma = self._book, self._beside, self.config.right_angle_sigma_rad
         while True:
-            direction, variance, cross = beside.direction
-            wall, off = find_square(
-                self._x, self._p, book.marks, book.now, sigma, self._curved, direction, variance, cross
+            known = beside.direction
+            wall, off, own, first = find_square(
+                self._x, self._p, book.marks, book.now, sigma, self._curved, *known, beside.sure
             )
             if wall < 0:
                 return
             i = 3 + 2 * wall
-            if variance == 0.0:
-                beside.take_direction(self._x, self._p, self._n, i, sigma * sigma)
-                continue
-            whiten_difference(self._p, self._n, i, cross, variance, -off, sigma * sigma, self._w, self._s)
-            self._correct_direction(i)
+            if first:
+                beside.take_direction(self._x, self._p, self._n, i, own * own)
+            else:
+                whiten_difference(self._p, self._n, i, *known[1:], -off, own * own, self._w, self._s)
+                self._correct_direction(i)
+            beside.sure = beside.sure or own == sigma
 
     def _correct_direction(self, i: int) -> None:
         """Correct by what :func:`slam.gaussian.stacked_update.whiten_difference` left of a wall's direction."""

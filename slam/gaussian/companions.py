@@ -39,6 +39,7 @@ class Companions:
         if cov is not None:
             self.cov[:known, :known] = cov
         self._direction = known
+        self.sure = False  # whether most walls of some place told of the direction
         self.mean = np.zeros(self.own)
         self.cross = aligned_zeros(self.own, size)  # C: of each with the robot and the landmarks
         self._rows = 2 * observations

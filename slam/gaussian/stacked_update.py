@@ -110,7 +110,7 @@ def whiten(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def whiten_difference(
-    p: Array, n: int, i: int, cross: Array, e_variance: float, nu: float, variance: float, w: Array, s: Array
+    p: Array, n: int, i: int, e_variance: float, cross: Array, nu: float, variance: float, w: Array, s: Array
 ) -> int:  # fmt: skip
     """Do :func:`whiten` for one observation, that of x_i − e, with its innovation; return the number of rows.
 

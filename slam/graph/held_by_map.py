@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import abc
 
+import numpy as np
+
 from slam.backend import found_cov
 from slam.gaussian.beliefs import GaussianBackend
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS
 from slam.graph.places import Places
 from slam.health.relocalisation import Place, Relocaliser
+from slam.landmarks.book import LAST_SEEN
 from slam.landmarks.joint_compatibility import JOINT_LIMITS
 from slam.landmarks.seen_from import seen_from
-from slam.types import Array, Indices, Scan
+from slam.types import VIRTUAL, Array, Indices, Scan
 
 __all__ = ["HeldByMap"]
+
+_LATELY = 30  # scans
 
 
 class HeldByMap(GaussianBackend):
@@ -35,12 +40,17 @@ class HeldByMap(GaussianBackend):
         """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
         recovery = self.recovery
         if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
-            if recovery.opposed(self.grid, self._x[:3], scan):
+            if self._drawn_of_landmarks() and recovery.opposed(self.grid, self._x[:3], scan):
                 place = self._place_beside(scan)
                 if not recovery.opposed(self.grid, place.pose, scan):
                     self._correct_by_map(place, JOINT_LIMITS)
         elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
             self._hold_by_place(scan)
+
+    def _drawn_of_landmarks(self) -> bool:
+        """Tell whether landmarks were seen lately: what was drawn since then has drifted with the pose."""
+        marks = self._book.marks
+        return bool(np.any((marks[:, LAST_SEEN] >= self._book.now - _LATELY) & (marks[:, 0] != VIRTUAL)))
 
     def _hold_by_place(self, scan: Scan) -> None:
         """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""

@@ -10,6 +10,9 @@ such walls; here the others stay what they are).
 
 Which walls do is found from the map: a wall that counts is straight, long, seen often, and two thirds of the walls
 whose direction against it is well known agree with it, three at least. Where walls bend or stand askew, none does.
+
+In a hall one or two walls are all there is for a minute. So a very long one counts alone where nothing else tells:
+it errs by three times as much, and is the building's direction only until most walls of some place say otherwise.
 """
 
 from __future__ import annotations
@@ -22,12 +25,15 @@ from numba import njit
 from slam.landmarks.curved_walls import curvature
 from slam.types import LINE, Array
 
-__all__ = ["SQUARE", "find_square"]
+__all__ = ["HELD", "HELD_ALONE", "SQUARE", "find_square"]
 
-SQUARE = 12  # column of a landmark's marks: 0, or 1 of a wall that was held against the building's direction
+SQUARE = 12  # column of a landmark's marks: 0, or of a wall that was held against the building's direction
+HELD_ALONE, HELD = 1.0, 2.0  # … as a very long one alone, or as one of most
 _SIGHTINGS = 10  # of a wall that counts; it is asked about at every so many
 _LENGTH_M, _BEND_RAD = 1.0, 0.002  # at least, and at most
-_KNOWN_RAD, _SURE_RAD = 0.008, 0.003  # 1σ of a wall against the building's direction, and against those that agree
+_KNOWN_RAD, _SURE_RAD = 0.03, 0.003  # 1σ of a wall against the building's direction, and against those that agree
+_ALONE_M, _ALONE = 8.0, 3.0  # a wall counts alone that is as long, its error so many times as large, …
+_LOST = 3.0  # … and its direction known so many times worse than that
 _AGREE, _SHARE = 3, 2.0 / 3.0
 _SIGMAS = 3.0  # within which others agree
 _FITS = 2.0  # within which it fits the direction: a wall that is left out costs little, one that is askew much
@@ -37,11 +43,12 @@ _RIGHT = 0.5 * math.pi
 @njit(cache=True, nogil=True, error_model="numpy")
 def find_square(
     x: Array, p: Array, marks: Array, now: int, sigma: float, model: Array, direction: float, variance: float,
-    cross: Array,
-) -> tuple[int, float]:  # fmt: skip
-    """Return a wall that this update showed and that stands square, and how far it is off the direction [rad].
+    cross: Array, sure: bool,
+) -> tuple[int, float, float, bool]:  # fmt: skip
+    """Return a wall that this update showed and that tells of the building's direction; -1 where there is none.
 
-    The wall is marked as square; -1 where there is none.
+    The wall is marked. Besides, how far it is off the direction, the 1σ of that [rad], and whether the direction
+    is to be taken from it instead: as it is not known yet, or from a wall alone, and wrong.
 
     Parameters
     ----------
@@ -57,21 +64,25 @@ def find_square(
         :func:`slam.landmarks.curved_walls.curvature_model`.
     direction, variance, cross
         The building's direction [rad], its variance, 0 if not known, and its covariance ``(≥ n,)`` with ``x``.
+    sure
+        Whether most walls of some place told of it.
     """
     for k in range(marks.shape[0]):
-        mark = marks[k]
-        due = mark[5] == now and mark[SQUARE] == 0.0 and mark[2] % _SIGHTINGS == 0.0
-        if not due or not _counts(mark, model) or not _majority(x, p, marks, k, sigma, model):
+        mark, a = marks[k], 3 + 2 * k
+        due = mark[5] == now and mark[SQUARE] != HELD and mark[2] % _SIGHTINGS == 0.0
+        if not due or not _counts(mark, model):
             continue
-        if variance == 0.0:
-            mark[SQUARE] = 1.0
-            return k, 0.0
-        a = 3 + 2 * k
+        most = _majority(x, p, marks, k, sigma, model)
+        if not most and (mark[SQUARE] == HELD_ALONE or mark[7] - mark[6] < _ALONE_M):
+            continue
+        own = sigma if most else _ALONE * sigma
         off, of_both = _from_square(x[a] - direction), p[a, a] + variance - 2.0 * cross[a]
-        if of_both < _KNOWN_RAD**2 and off * off < _FITS**2 * (of_both + sigma * sigma):
-            mark[SQUARE] = 1.0
-            return k, off
-    return -1, 0.0
+        fits = of_both < _KNOWN_RAD**2 and off * off < _FITS**2 * (of_both + own * own)
+        first = variance == 0.0 or (most and not sure and not fits)
+        if first or (fits and (most or of_both > (_LOST * own) ** 2)):
+            mark[SQUARE] = HELD if most else HELD_ALONE
+            return k, off, own, first
+    return -1, 0.0, 0.0, False
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

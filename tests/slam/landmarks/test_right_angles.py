@@ -20,7 +20,7 @@ from slam.geometry import wrap
 from slam.invariant import apply
 from slam.landmarks.book import MARKS
 from slam.landmarks.curved_walls import curvature_model
-from slam.landmarks.right_angles import SQUARE, find_square
+from slam.landmarks.right_angles import HELD, HELD_ALONE, SQUARE, find_square
 from slam.types import LINE
 
 Array = NDArray[np.float64]
@@ -47,11 +47,20 @@ def squared(x: Array, p: Array, marks: Array, direction: int = -1) -> list[int]:
         known = direction >= 0
         i = 3 + 2 * max(direction, 0)
         cross = np.concatenate([p[:i, i], p[i, i:]])
-        wall, _ = find_square(x, p, marks, NOW, SIGMA, MODEL, x[i], (p[i, i] + SIGMA**2) * known, cross * known)
+        of_direction = (x[i], (p[i, i] + SIGMA**2) * known, cross * known)
+        wall, _, own, first = find_square(x, p, marks, NOW, SIGMA, MODEL, *of_direction, known)
         if wall < 0:
             return out
+        assert own == SIGMA and first == (not known)
         out.append(wall)
         direction = direction if known else wall
+
+
+def alone(length: float, *, direction: float, sigma: float, sure: bool = False) -> tuple[int, float, float, bool]:
+    """Ask about the only wall, of direction 0, the building's being known to ``sigma``; 0: unknown."""
+    x, p, marks = room([0.0])
+    marks[0, 7] = length
+    return find_square(x, p, marks, NOW, SIGMA, MODEL, direction, sigma**2, np.zeros(len(x)), sure)
 
 
 SQUARE_ROOM = [0.3, 0.3 + 0.5 * math.pi, 0.3 - math.pi, 0.3 - 0.5 * math.pi]
@@ -60,7 +69,7 @@ SQUARE_ROOM = [0.3, 0.3 + 0.5 * math.pi, 0.3 - math.pi, 0.3 - 0.5 * math.pi]
 def test_walls_of_a_square_room_are_held_once() -> None:
     x, p, marks = room(SQUARE_ROOM)
     assert squared(x, p, marks) == [0, 1, 2, 3]
-    assert marks[:, SQUARE].tolist() == [1.0] * 4
+    assert marks[:, SQUARE].tolist() == [HELD] * 4
     assert squared(x, p, marks) == []
 
 
@@ -85,13 +94,45 @@ def test_what_does_not_count() -> None:
 
 
 def test_a_place_whose_direction_nobody_knows_is_left_alone() -> None:
-    """The far walls agree with each other, and are known against the near ones to 5 mrad, then to 20."""
-    for sigma, expected in ((0.005, [4, 5, 6, 7]), (0.02, [])):
+    """The far walls agree with each other, and are known against the near ones to 5 mrad, then to 50."""
+    for sigma, expected in ((0.005, [4, 5, 6, 7]), (0.05, [])):
         x, p, marks = room([*SQUARE_ROOM, *(a + 0.004 for a in SQUARE_ROOM)])
         marks[:4, 5] = NOW - 10.0
         far = np.arange(11, 19, 2)
         p[np.ix_(far, far)] += np.triu(np.full((4, 4), sigma**2))
         assert squared(x, p, marks, direction=0) == expected
+
+
+def test_a_very_long_wall_counts_alone_where_nothing_else_tells() -> None:
+    for length, sigma, direction, expected in (
+        (20.0, 0.02, 0.03, (0, False)),  # the direction is lost: any wall that fits tells
+        (20.0, 0.02, 0.05, (-1, False)),  # it does not fit
+        (20.0, 0.005, 0.003, (-1, False)),  # the direction is better known than such a wall is square
+        (4.0, 0.02, 0.03, (-1, False)),  # not long enough
+        (20.0, 0.0, 0.0, (0, True)),  # the first one
+        (4.0, 0.0, 0.0, (-1, False)),
+    ):
+        wall, off, own, first = alone(length, direction=direction, sigma=sigma)
+        assert (wall, first) == expected
+        if wall == 0:
+            assert own == 3.0 * SIGMA and off == pytest.approx(-direction)
+
+
+def test_a_direction_from_a_wall_alone_gives_way_to_that_of_most() -> None:
+    for sure in (False, True):
+        x, p, marks = room(SQUARE_ROOM)
+        wall, _, own, first = find_square(x, p, marks, NOW, SIGMA, MODEL, 0.4, 0.003**2, np.zeros(len(x)), sure)
+        assert (wall, own, first) == ((-1, 0.0, False) if sure else (0, SIGMA, True))
+
+
+def test_a_wall_held_alone_is_held_once_more_when_most_bear_it_out() -> None:
+    x, p, marks = room([*SQUARE_ROOM, *SQUARE_ROOM])
+    marks[:, 7] = 20.0
+    marks[2, SQUARE] = HELD_ALONE
+    assert squared(x, p, marks) == list(range(8))
+    x, p, marks = room([0.0])
+    marks[0, 7], marks[0, SQUARE] = 20.0, HELD_ALONE
+    assert find_square(x, p, marks, NOW, SIGMA, MODEL, 0.01, 0.02**2, np.zeros(len(x)), False)[0] < 0
 
 
 @given(st.integers(0, 10**6))
@@ -117,7 +158,7 @@ def test_a_wall_held_against_the_direction_is_a_correction_like_any_other(seed: 
     np.testing.assert_allclose(beside.cross[:, :n], whole[n:, :n], atol=1e-9)
 
     mean, (_, known, cross), (_, w, s) = beside.mean.copy(), beside.direction, work_space(4, n)
-    assert whiten_difference(p, n, i, cross, known, nu, variance, w, s) == 2
+    assert whiten_difference(p, n, i, known, cross, nu, variance, w, s) == 2
     beside.correct_direction(n, i, w, s)
     h = np.zeros(len(whole))
     h[i], h[-1] = 1.0, -1.0
@@ -140,7 +181,7 @@ def hold_all(askew: Array, sigma: float) -> tuple[Array, Array, float, float]:
     for i in range(5, n, 2):
         direction, variance, cross = beside.direction
         off = x[i] - direction
-        whiten_difference(aligned, n, i, cross, variance, -off, SIGMA**2, w, s)
+        whiten_difference(aligned, n, i, variance, cross, -off, SIGMA**2, w, s)
         apply(x, aligned, n, 2, marks, w, s, np.zeros(n))
         beside.correct_direction(n, i, w, s, reset=True)
     return x, aligned[:, :n], *beside.direction[:2]
