@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
 from slam.landmarks.book import KIND, LAST_SEEN
 from slam.types import VIRTUAL, Array, Indices
@@ -40,13 +41,15 @@ def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) ->
 def sightings(x: Array, marks: Array, match: Indices, offset: float, pose: Array, cov: Array) -> Array:
     """Return observation rows ``(k, 12)`` of landmarks ``(k,)`` as they are seen from a pose known to ``cov``.
 
-    The other arguments are those of :func:`seen_from`. All err with the one pose.
+    The other arguments are those of :func:`seen_from`. All err with the one pose. They are linear in its
+    difference from the believed pose, as the correction is: it may be known to a millimetre across a wall and to
+    half a metre along it, and the one must not be taken for the other.
     """
-    z, h, there = np.zeros((len(match), 12)), np.zeros((2, 5)), x.copy()
-    there[:3] = pose
+    z, h, away = np.zeros((len(match), 12)), np.zeros((2, 5)), pose - x[:3]
+    away[2] = wrap_scalar(float(away[2]))
     for k, row in enumerate(match.tolist()):
         z[k, KIND] = marks[row, 0]
-        z[k, :2] = predicted(there, row, z[k, KIND], offset, h)
+        z[k, :2] = np.array(predicted(x, row, z[k, KIND], offset, h)) + h[:, :3] @ away
         r = len(match) * h[:, :3] @ cov @ h[:, :3].T
         z[k, 2:5] = r[0, 0], r[0, 1], r[1, 1]
     return z

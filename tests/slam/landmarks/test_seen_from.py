@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from slam import LINE
 from slam.gaussian.stacked_update import stacked_update, work_space
 from slam.landmarks.association import predicted
 from slam.landmarks.book import KIND, LAST_SEEN, MARKS
-from slam.landmarks.seen_from import seen_from
+from slam.landmarks.seen_from import seen_from, sightings
 from slam.types import VIRTUAL, Array
 
 OFFSET = 0.2
@@ -30,13 +31,33 @@ def world() -> tuple[Array, Array, Array]:
 
 
 def test_sightings_are_what_is_foreseen_from_there_of_what_was_seen_last() -> None:
-    x, _, marks = world()
-    z, match = seen_from(x, marks, OFFSET, POSE, COV)
-    assert match.tolist() == [1, 0, 2]
-    x[:3] = POSE
-    for row, landmark in zip(z, match, strict=True):
-        assert row[KIND] == marks[landmark, 0]
-        np.testing.assert_allclose(row[:2], predicted(x, landmark, row[KIND], OFFSET, np.zeros((2, 5))))
+    """To first order in the difference."""
+    for share in (1e-3, 1e-4):
+        x, _, marks = world()
+        z, match = seen_from(x, marks, OFFSET, share * POSE, COV)
+        assert match.tolist() == [1, 0, 2]
+        x[:3] = share * POSE
+        for row, landmark in zip(z, match, strict=True):
+            assert row[KIND] == marks[landmark, 0]
+            seen = predicted(x, landmark, row[KIND], OFFSET, np.zeros((2, 5)))
+            np.testing.assert_allclose(row[:2], seen, rtol=0.0, atol=0.02 * share**2)
+
+
+@pytest.mark.parametrize("angle", np.linspace(0.0, np.pi, 7))
+def test_what_is_off_along_a_wall_moves_the_pose_along_it_alone(angle: float) -> None:
+    """A scan slides along a wall by 0.3 m, and is known to 0.5 m there, to a millimetre across."""
+    along, across = np.array([np.cos(angle), np.sin(angle)]), np.array([-np.sin(angle), np.cos(angle)])
+    x = np.array([0.0, 0.0, 0.0, 3.0, 0.0, -3.0, 0.0])
+    p = np.triu(np.diag(np.square([0.1, 0.1, 0.01, *[1e-4] * 4])))
+    marks = np.zeros((2, MARKS))
+    marks[:, 0] = VIRTUAL
+    cov = np.diag([0.0, 0.0, 1e-6])
+    cov[:2, :2] = 0.5**2 * np.outer(along, along) + 0.001**2 * np.outer(across, across)
+    match = np.array([0, 1])
+    z = sightings(x, marks, match, OFFSET, np.array([*0.3 * along, 0.0]), cov)
+    stacked_update(x, p, len(x), z, match, OFFSET, *work_space(8, len(x)))
+    assert x[:2] @ along == pytest.approx(0.3 * 0.1**2 / (0.1**2 + 0.5**2), rel=0.05)
+    assert abs(x[:2] @ across) < 1e-4 and abs(x[2]) < 1e-4
 
 
 def test_together_they_say_no_more_than_the_match() -> None:
