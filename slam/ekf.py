@@ -51,7 +51,7 @@ class EkfSlam(HeldByMap):
     def __init__(self, config: EkfConfig | None = None) -> None:
         super().__init__(config or EkfConfig())
         c = self.config
-        self.witness: Callable[[list[Innovation]], object] | None = None  # told of every correction before it
+        self.witness: Callable[[list[Innovation]], object] | None = None  # told of every match before it corrects
         self._max_turn = math.radians(c.max_turn_deg)
         self._curved = curvature_model(c.features)
         self._gates = np.array([c.gate, c.landmarks.new_distance_m, self._max_turn])
@@ -155,6 +155,7 @@ class EkfSlam(HeldByMap):
     def _correct_direction(self, i: int) -> None:
         """Correct by what :func:`slam.gaussian.stacked_update.whiten_difference` left of a wall's direction."""
         add_combination(self._x, self._n, self._s[:2, 2], self._w)
+        self._x[2] = wrap_scalar(float(self._x[2]))
         downdate(self._p, self._n, self._w, self._w, 2, 0)
         self._beside.correct_direction(self._n, i, self._w, self._s)
 

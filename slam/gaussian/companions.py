@@ -25,7 +25,7 @@ __all__ = ["Companions"]
 
 
 class Companions:
-    """States beside the map; of this class none to begin with, and more where :meth:`join` appends them."""
+    """States beside the map: those that are there all along, and more where :meth:`join` appends them."""
 
     def __init__(self, observations: int, size: int, cov: Array | None = None, *, direction: bool = False) -> None:
         """Begin with states of a covariance ``(k, k)``, none if left out; ``size`` is the map's state's.

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from slam.backend import BackendConfig
 from slam.landmarks.book import LandmarkPolicy
-from slam.settings import NotNegative, OneOf, Positive, Within
+from slam.settings import OneOf, Positive, Within
 
 __all__ = ["ASSOCIATIONS", "EkfConfig", "EkfLinesConfig"]
 
@@ -32,7 +32,7 @@ class EkfConfig(BackendConfig):
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
     lines: bool = False  # take straight walls for landmarks, too
     # 1σ of walls about the building's direction, if most stand square: slam.landmarks.right_angles; 0: left alone.
-    right_angle_sigma_rad: NotNegative = 0.001
+    right_angle_sigma_rad: Annotated[float, Within("[0, 0.003]")] = 0.001
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)
 
 

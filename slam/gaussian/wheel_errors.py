@@ -34,7 +34,7 @@ _TURN = np.array([-1.0, 1.0, -1.0, 1.0])
 
 
 class WheelErrors(Companions):
-    """Estimates of the five errors, and how they hang together with everything else."""
+    """Estimates of the five errors, the first states, and how they hang together with everything else."""
 
     def __init__(
         self, declared: LastingErrors, lever_m: float, observations: int, size: int, *, direction: bool = False

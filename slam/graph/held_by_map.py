@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import abc
-
-import numpy as np
+import math
 
 from slam.backend import found_cov
 from slam.gaussian.beliefs import GaussianBackend
@@ -12,14 +11,13 @@ from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS
 from slam.graph.places import Places
 from slam.health.relocalisation import Place, Relocaliser
-from slam.landmarks.book import LAST_SEEN
 from slam.landmarks.joint_compatibility import JOINT_LIMITS
 from slam.landmarks.seen_from import seen_from
-from slam.types import VIRTUAL, Array, Indices, Scan
+from slam.types import Array, Indices, Scan
 
 __all__ = ["HeldByMap"]
 
-_LATELY = 30  # scans
+_LATELY = 30  # scans since a landmark was seen that the drawn map is held against
 
 
 class HeldByMap(GaussianBackend):
@@ -40,17 +38,12 @@ class HeldByMap(GaussianBackend):
         """Correct by where beside the believed pose a scan fits the drawn map, where landmarks do not hold it."""
         recovery = self.recovery
         if self._doubtful:  # the pose is wrong if the scan contradicts the map from there, and from beside not
-            if self._drawn_of_landmarks() and recovery.opposed(self.grid, self._x[:3], scan):
+            if recovery.opposed(self.grid, self._x[:3], scan):
                 place = self._place_beside(scan)
                 if not recovery.opposed(self.grid, place.pose, scan):
-                    self._correct_by_map(place, JOINT_LIMITS)
+                    self._correct_by_map(place, JOINT_LIMITS, within=_LATELY)
         elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
             self._hold_by_place(scan)
-
-    def _drawn_of_landmarks(self) -> bool:
-        """Tell whether landmarks were seen lately: what was drawn since then has drifted with the pose."""
-        marks = self._book.marks
-        return bool(np.any((marks[:, LAST_SEEN] >= self._book.now - _LATELY) & (marks[:, 0] != VIRTUAL)))
 
     def _hold_by_place(self, scan: Scan) -> None:
         """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""
@@ -70,10 +63,14 @@ class HeldByMap(GaussianBackend):
         c = self.config
         return Relocaliser(c.relocalisation, self.grid, c.lidar_offset_m).check(scan, self._x[:3].copy())
 
-    def _correct_by_map(self, place: Place, limits: Array) -> None:
-        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen."""
+    def _correct_by_map(self, place: Place, limits: Array, within: float = math.inf) -> None:
+        """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen.
+
+        It is one among those seen within so many scans: what is drawn since others were has drifted with the pose.
+        """
         offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
-        self._correct_aside(*seen_from(self._x, self._book.marks, offset, place.pose, cov), limits)
+        told = seen_from(self._x, self._book.marks, offset, place.pose, cov, since=self._book.now - within)
+        self._correct_aside(*told, limits)
 
     def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:
         """Correct by what no feature of the scan shows, nor counts to its NIS; tell whether it stands."""

@@ -82,7 +82,7 @@ class LandmarkBook:
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
         surface it is, as the observation does. Then, of a wall's curvature, the information of its measurements,
         the same times what they measured, and where along the wall it is tangent to its line; how far its
-        sightings contradict it; and whether it was held against the direction of others. A view.
+        sightings contradict it; and how it was held against the building's direction. A view.
         """
         return self._marks[: self.count]
 

@@ -3,7 +3,7 @@
 After some corridors and halls the heading is known to some milliradians from scan to scan, and no scan says more:
 what is mapped there is turned as a whole. But of the walls of real buildings most run in two directions, within a
 milliradian or two. So the building's direction is a state of the filter, beside the map
-(:class:`slam.gaussian.companions.Companions`), and each wall is held against it once: it differs by a multiple of
+(:class:`slam.gaussian.companions.Companions`), and each wall is held against it once. It differs by a multiple of
 90°, up to an error of its own of ``EkfConfig.right_angle_sigma_rad``, and the first is what the direction is known
 from (Nguyen, Harati, Siegwart, "A lightweight SLAM algorithm using orthogonal planes", IROS 2007, keep nothing but
 such walls; here the others stay what they are).
@@ -12,7 +12,8 @@ Which walls do is found from the map: a wall that counts is straight, long, seen
 whose direction against it is well known agree with it, three at least. Where walls bend or stand askew, none does.
 
 In a hall one or two walls are all there is for a minute. So a very long one counts alone where nothing else tells:
-it errs by three times as much, and is the building's direction only until most walls of some place say otherwise.
+it errs by three times as much, and is the building's direction only until most walls of some place do not bear it
+out. It is held once more as one of most, which makes little of a ninth; what it has corrected stays.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def find_square(
     """Return a wall that this update showed and that tells of the building's direction; -1 where there is none.
 
     The wall is marked. Besides, how far it is off the direction, the 1σ of that [rad], and whether the direction
-    is to be taken from it instead: as it is not known yet, or from a wall alone, and wrong.
+    is to be taken from it instead: as it is not known yet, or from a wall alone, which this one does not bear out.
 
     Parameters
     ----------

@@ -9,6 +9,8 @@ sightings: together they say no more than the match did, however they are correl
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from slam.geometry import wrap_scalar
@@ -21,8 +23,10 @@ __all__ = ["seen_from", "sightings"]
 _SIGHTINGS = 3  # two points or walls say where the robot is; one more, should two walls be parallel
 
 
-def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) -> tuple[Array, Indices]:
-    """Return observation rows ``(k, 12)`` of the landmarks seen last, and which they are ``(k,)``.
+def seen_from(
+    x: Array, marks: Array, offset: float, pose: Array, cov: Array, *, since: float = -math.inf
+) -> tuple[Array, Indices]:
+    """Return observation rows ``(k, 12)`` of the landmarks seen last, and which they are ``(k,)``; of one none.
 
     Parameters
     ----------
@@ -32,9 +36,13 @@ def seen_from(x: Array, marks: Array, offset: float, pose: Array, cov: Array) ->
         The sensor's, ahead of the robot's centre [m].
     pose, cov
         Where a scan fits the map that is drawn of these landmarks ``(3,)``, and its covariance there ``(3, 3)``.
+    since
+        The update, of those counted by the marks, that the landmarks were seen at or later.
     """
-    real = np.flatnonzero(marks[:, 0] != VIRTUAL)
+    real = np.flatnonzero((marks[:, 0] != VIRTUAL) & (marks[:, LAST_SEEN] >= since))
     match = real[np.argsort(-marks[real, LAST_SEEN], kind="stable")[:_SIGHTINGS]]
+    if len(match) == 1:  # which may be the newest, that was not there when the map was drawn
+        match = match[:0]
     return sightings(x, marks, match, offset, pose, cov), match
 
 

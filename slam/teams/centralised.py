@@ -1,12 +1,13 @@
 """Centralised EKF-SLAM: one joint Gaussian of N robots' poses and one map, with nothing left out.
 
-    x = (x_a | m_1 … m_n),  e = (x_b, x_c, …)
+    x = (x_a | m_1 … m_n),  e = (x_b, x_c, …, β)
 
 The robot a whose turn it is stands where the single-robot filter has its robot, before the landmarks; the others
-stand beside the map (:mod:`slam.gaussian.companions`), which no scan of a's shows and every scan corrects. So each
-robot's step is the single-robot filter's, kernels and all, plus a product that is linear in landmarks and robots.
-A turn passes by exchanging three rows: O(n + N). With relative start poses known this is the filter of Fenwick,
-Newman and Leonard (ICRA 2002), and what distributed ones are measured against.
+stand beside the map (:mod:`slam.gaussian.companions`), which no scan of a's shows and every scan corrects, as does
+the building's direction β (:mod:`slam.landmarks.right_angles`). So each robot's step is the single-robot filter's,
+kernels and all, plus a product that is linear in landmarks and robots. A turn passes by exchanging three rows:
+O(n + N). With relative start poses known this is the filter of Fenwick, Newman and Leonard (ICRA 2002), and what
+distributed ones are measured against.
 """
 
 from __future__ import annotations

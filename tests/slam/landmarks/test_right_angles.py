@@ -135,40 +135,72 @@ def test_a_wall_held_alone_is_held_once_more_when_most_bear_it_out() -> None:
     assert find_square(x, p, marks, NOW, SIGMA, MODEL, 0.01, 0.02**2, np.zeros(len(x)), False)[0] < 0
 
 
+def test_most_are_two_thirds_of_the_others_that_are_well_known_and_three_at_least() -> None:
+    eight, askew = [*SQUARE_ROOM, *SQUARE_ROOM], [0.3 + 0.03 * k for k in range(1, 6)]
+    assert squared(*room([*eight, *askew[:3]])) == list(range(8))
+    assert squared(*room([*eight, *askew])) == []
+    assert squared(*room(SQUARE_ROOM[:3])) == []
+    x, p, marks = room(SQUARE_ROOM)
+    marks[3, 2] = 5.0  # sightings: too few to tell of the others
+    assert squared(x, p, marks) == []
+    x, p, marks = room(SQUARE_ROOM, sigma=0.004)  # none of the others is well known
+    assert squared(x, p, marks) == []
+
+
+def test_what_all_share_tells_nothing_of_a_wall_and_the_direction() -> None:
+    """The heading is lost since the start, but the walls are known well among themselves: these do not fit."""
+    x, p, marks = room([*SQUARE_ROOM, *(a + 0.004 for a in SQUARE_ROOM)])
+    marks[:4, 5] = NOW - 10.0
+    directions = np.arange(3, 19, 2)
+    p[np.ix_(directions, directions)] += np.triu(np.full((8, 8), 0.02**2))
+    assert squared(x, p, marks, direction=0) == []
+
+
 @given(st.integers(0, 10**6))
 def test_a_wall_held_against_the_direction_is_a_correction_like_any_other(seed: int) -> None:
-    """Against the plain formulas: the direction is one wall's plus an error; then another wall is held to it."""
+    """Against the plain formulas: the direction is one wall's plus an error; then another wall is held to it.
+
+    Some of the other states beside the map are there all along, some joined: of these only changes are kept.
+    """
     rng = np.random.default_rng(seed)
-    n, others = 3 + 2 * int(rng.integers(2, 8)), int(rng.integers(0, 4))
+    n, others, joined = 3 + 2 * int(rng.integers(2, 8)), int(rng.integers(0, 4)), int(rng.integers(0, 20))
     first, i = (3 + 2 * int(v) for v in rng.choice((n - 3) // 2, 2, replace=False))
-    root = rng.standard_normal((n + others, n + others))
+    root = rng.standard_normal((n + others + joined,) * 2)
     whole, x, nu, variance = root @ root.T, rng.standard_normal(n), float(rng.standard_normal()), 0.5
     p = aligned_zeros(n, n)
     p[:, :n] = np.triu(whole[:n, :n])
-    beside = Companions(4, n, whole[n:, n:].copy(), direction=True)
-    beside.cross[:others, :n] = whole[n:, :n]
+    own = n + others
+    beside = Companions(4, n, whole[n:own, n:own].copy(), direction=True)
+    beside.cross[:others, :n] = whole[n:own, :n]
     assert beside.direction[1] == 0.0
     beside.take_direction(x, p, n, first, variance)
 
-    copy = np.vstack([np.eye(n + others), np.eye(n + others)[first]])
+    copy = np.insert(np.eye(len(whole)), own, np.eye(len(whole))[first], axis=0)
     whole = copy @ whole @ copy.T
-    whole[-1, -1] += variance
+    whole[own, own] += variance
+    own += 1
     assert beside.direction[0] == x[first]
-    np.testing.assert_allclose(beside.cov, whole[n:, n:], atol=1e-9)
-    np.testing.assert_allclose(beside.cross[:, :n], whole[n:, :n], atol=1e-9)
+    np.testing.assert_allclose(beside.cov, whole[n:own, n:own], atol=1e-9)
+    np.testing.assert_allclose(beside.cross[:, :n], whole[n:own, :n], atol=1e-9)
 
+    if joined:
+        beside.join(whole[own:, :n], whole[n:own, own:])
     mean, (_, known, cross), (_, w, s) = beside.mean.copy(), beside.direction, work_space(4, n)
     assert whiten_difference(p, n, i, known, cross, nu, variance, w, s) == 2
     beside.correct_direction(n, i, w, s)
     h = np.zeros(len(whole))
-    h[i], h[-1] = 1.0, -1.0
+    h[i], h[own - 1] = 1.0, -1.0
     gain = whole @ h / (h @ whole @ h + variance)
-    after = whole - np.outer(gain, h @ whole)
+    change = -np.outer(gain, h @ whole)
+    after = whole + change
     np.testing.assert_allclose(w[:2, :n].T @ s[:2, 2], nu * gain[:n], atol=1e-9)
     np.testing.assert_allclose(np.triu(p[:, :n] - w[:2, :n].T @ w[:2, :n]), np.triu(after[:n, :n]), atol=1e-9)
     np.testing.assert_allclose(beside.mean - mean, nu * gain[n:], atol=1e-9)
-    np.testing.assert_allclose(beside.cov, after[n:, n:], atol=1e-9)
     np.testing.assert_allclose(beside.cross[:, :n], after[n:, :n], atol=1e-9)
+    cov, k = beside.cov, own - n
+    np.testing.assert_allclose(cov[:k], after[n:own, n:], atol=1e-9)
+    np.testing.assert_allclose(cov[:, :k], after[n:, n:own], atol=1e-9)
+    np.testing.assert_allclose(np.triu(cov[k:, k:]), np.triu(change[own:, own:]), atol=1e-9)
 
 
 def hold_all(askew: Array, sigma: float) -> tuple[Array, Array, float, float]:
@@ -210,9 +242,7 @@ def test_the_covariance_knows_of_the_error_that_all_walls_share() -> None:
 
 @pytest.mark.parametrize(("rooms", "most"), [("apartment", True), ("cave", False)])
 def test_in_rooms_most_walls_are_held_and_in_caves_none(rooms: str, most: bool) -> None:
-    env = gymnasium.make(
-        "mecanum_env/Explore-v0", rooms=rooms, config={"slam_config": {"right_angle_sigma_rad": SIGMA}}
-    )
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms)
     world, agent = env.unwrapped, agents.make("brisk-tour")
     observation, _ = env.reset(seed=3)
     agent.reset(world.belief, seed=3)
