@@ -118,11 +118,14 @@ def test_a_very_long_wall_counts_alone_where_nothing_else_tells() -> None:
             assert own == 3.0 * SIGMA and off == pytest.approx(-direction)
 
 
-def test_a_direction_from_a_wall_alone_gives_way_to_that_of_most() -> None:
-    for sure in (False, True):
+def test_a_direction_from_a_wall_alone_gives_way_to_that_of_most_where_these_do_not_bear_it_out() -> None:
+    for sure, direction, expected in (
+        (False, 0.4, (0, SIGMA, True)), (True, 0.4, (-1, 0.0, False)), (False, 0.301, (0, SIGMA, False)),
+    ):  # fmt: skip
         x, p, marks = room(SQUARE_ROOM)
-        wall, _, own, first = find_square(x, p, marks, NOW, SIGMA, MODEL, 0.4, 0.003**2, np.zeros(len(x)), sure)
-        assert (wall, own, first) == ((-1, 0.0, False) if sure else (0, SIGMA, True))
+        known = direction, 0.003**2, np.zeros(len(x))
+        wall, _, own, first = find_square(x, p, marks, NOW, SIGMA, MODEL, *known, sure)
+        assert (wall, own, first) == expected
 
 
 def test_a_wall_held_alone_is_held_once_more_when_most_bear_it_out() -> None:
@@ -145,6 +148,11 @@ def test_most_are_two_thirds_of_the_others_that_are_well_known_and_three_at_leas
     assert squared(x, p, marks) == []
     x, p, marks = room(SQUARE_ROOM, sigma=0.004)  # none of the others is well known
     assert squared(x, p, marks) == []
+
+
+def test_walls_may_err_as_they_are_said_to() -> None:
+    askew = np.array([1.2, -1.2, 1.2, -1.2]) * SIGMA
+    assert squared(*room(list(SQUARE_ROOM + askew), sigma=0.1 * SIGMA)) == [0, 1, 2, 3]
 
 
 def test_what_all_share_tells_nothing_of_a_wall_and_the_direction() -> None:
