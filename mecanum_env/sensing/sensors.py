@@ -16,7 +16,7 @@ from mecanum_env.config import LidarConfig, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, forward_matrix
 from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, fill_uniform
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
-from mecanum_env.sensing.slip import add_up, follow, patch_friction, spread, traction_constants
+from mecanum_env.sensing.slip import add_up, follow, mean_of_slipperiest, slipperiest, spread, traction_constants
 from slam.odometry.filters import OdometryFilter
 from slam.types import Array, Odometry, Scan
 
@@ -205,9 +205,11 @@ class WheelEncoders:
 
     def __init__(self, robot: RobotConfig, noise: NoiseConfig, rng: np.random.Generator) -> None:
         self._fixed = np.concatenate([
-            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m, noise.patch_share, spread(noise)],
+            [noise.encoder, 1.0 - noise.slip, robot.wheel_radius_m],
+            # All patches make slip as much as these of the slipperiest kind would.
+            [noise.patch_share * mean_of_slipperiest(noise), spread(noise)],
             creep(robot, noise), traction_constants(robot, noise.friction),
-            traction_constants(robot, patch_friction(noise)), forward_matrix(robot).ravel(),
+            traction_constants(robot, slipperiest(noise)), forward_matrix(robot).ravel(),
         ])  # fmt: skip
         self._last = np.zeros(16)  # see _LAST_TWIST and those after it
         u = rng.uniform(-1.0, 1.0, size=5)

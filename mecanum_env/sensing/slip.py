@@ -2,8 +2,8 @@
 
 The wheels' readings, of every few milliseconds, drive a body of the robot's mass over a floor of the declared
 friction, by the traction of :func:`mecanum_env.physics.robot.turn_wheels`; where there are slippery patches, a
-second body over one of them. By how much the wheels outrun these bodies is what they slip, here or there. Walls
-that hold the robot are not known.
+second body over the slipperiest of them, so that no slide ends unseen. By how much the wheels outrun these bodies
+is what they slip, here or at most there. Walls that hold the robot are not known.
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ from mecanum_env.config import NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import GRAVITY_M_S2, pull
 from slam.types import Array
 
-__all__ = ["add_up", "follow", "grip_m_s2", "patch_friction", "spread", "traction_constants"]
+__all__ = [
+    "add_up", "follow", "grip_m_s2", "mean_of_slipperiest", "patch_friction", "slipperiest", "spread",
+    "traction_constants",
+]  # fmt: skip
 
 _PARTS = 2  # of the time between two readings
 _ROUNDS = 2  # of finding how much a wheel slips at the end of a part, and so how it grips
@@ -34,6 +37,20 @@ def patch_friction(noise: NoiseConfig) -> float:
     return sum(noise.patch_friction) / 2.0 if noise.patch_share > 0.0 else noise.friction
 
 
+def slipperiest(noise: NoiseConfig) -> float:
+    """Return the least friction that patches may have, or the floor's where there are none."""
+    return noise.patch_friction[0] if noise.patch_share > 0.0 else noise.friction
+
+
+def mean_of_slipperiest(noise: NoiseConfig) -> float:
+    """Return how far and how long a robot slides on patches in the mean, as a share of the slipperiest one's.
+
+    Both go by 1/μ, and μ is uniform: the mean of a/μ over [a, b] is a ln(b/a) / (b - a).
+    """
+    least, most = noise.patch_friction
+    return least * math.log(most / least) / (most - least) if most > least else 1.0
+
+
 def grip_m_s2(friction: float) -> float:
     """Return what acceleration a floor passes on along x or y: rollers at 45° pass on 1/√2 of what it holds."""
     return friction * GRAVITY_M_S2 / math.sqrt(2.0)
@@ -46,9 +63,14 @@ def traction_constants(robot: RobotConfig, friction: float) -> list[float]:
 
 
 def spread(noise: NoiseConfig) -> float:
-    """Return the σ of what slips by either coordinate, beside its mean, as a share of what may: :func:`add_up`."""
+    """Return the σ of what slips by either coordinate, beside its mean, as a share of what may: :func:`add_up`.
+
+    What may is what slips on the floor, or by how much more does on the slipperiest patch.
+    """
     q = noise.patch_share
-    return math.sqrt(0.5 * q * (1.0 - q + _PATCHES_DIFFER**2)) if q > 0.0 else _KNOWN
+    if q == 0.0:
+        return _KNOWN
+    return mean_of_slipperiest(noise) * math.sqrt(0.5 * q * (1.0 - q + _PATCHES_DIFFER**2))
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)

@@ -77,6 +77,33 @@ def test_slip_that_lasts_adds_up_to_the_variance_of_its_sum() -> None:
     np.testing.assert_array_equal(slid, 0.0)
 
 
+@given(speed=st.floats(0.3, 0.8), patch_share=st.floats(0.05, 0.9), least=st.floats(0.05, 0.3))
+def test_where_patches_differ_their_mean_is_taken_out_and_the_longest_slide_declared(
+    speed: float, patch_share: float, least: float
+) -> None:
+    """Wheels that have gone at one speed stop at once; the robot slides v² / 2 a, for v / a, by the patch's a."""
+    most, dt, readings = least + 0.2, 0.1, 20
+    noise = NoiseConfig(
+        encoder=0.0, radius_error=0.0, base_error=0.0, slip=0.0, friction=2.0, patch_share=patch_share,
+        patch_friction=(least, most),
+    )  # fmt: skip
+    encoders = WheelEncoders(ROBOT, noise, np.random.default_rng(0))
+    turned = speed / ROBOT.wheel_radius_m * dt * np.arange(1, readings + 1)[:, None] / readings * np.ones(4)
+    for _ in range(100):
+        encoders.odometry(turned, dt, np.random.default_rng(0))
+    slid, longest = 0.0, speed / grip_m_s2(least)
+    for step in range(100):
+        odometry = encoders.odometry(np.zeros((readings, 4)), dt, np.random.default_rng(0))
+        slid += odometry.twist[0] * dt
+        assert odometry.slip[0] > 1e-3 or (step + 1) * dt > longest
+    frictions = np.linspace(least, most, 1001)
+    on_patches = np.mean([speed**2 / (2.0 * grip_m_s2(mu)) for mu in frictions])
+    on_the_floor = speed**2 / (2.0 * grip_m_s2(2.0))
+    expected = (1.0 - patch_share) * on_the_floor + patch_share * on_patches
+    # A wheel that slips by less than s₀ does not pull with all its grip.
+    assert 0.97 * expected < slid < 1.12 * expected + 1e-3
+
+
 def jerky_errors(noise: NoiseConfig, steps_each: int) -> tuple[np.ndarray, np.ndarray]:
     """Drive a robot in jerks, a twist for so many steps; return what the odometry is off by, and V.
 
