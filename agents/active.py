@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig
-from agents.driving.grip import GentleFollower
-from agents.learned.chooser import SlipConfig
+from agents.driving.grip import GentleFollower, SlipConfig, WheelWatch
 from agents.ppo_frontier import PpoFrontier, PpoFrontierConfig
 from agents.view_points.anchoring import anchoring, marks_of, spread_m
 from agents.view_points.sightings import SensorModel, expected_sightings
@@ -62,8 +61,7 @@ class ActiveConfig(PpoFrontierConfig):
 
     look: LookConfig = field(default_factory=LookConfig)
     drift: DriftConfig = field(default_factory=DriftConfig)
-    # In place of the policy's.
-    slip: SlipConfig = field(default_factory=lambda: SlipConfig(lateral_m_s2=1.2))
+    slip: SlipConfig = field(default_factory=SlipConfig)
 
 
 class ActiveSlam(PpoFrontier):
@@ -72,34 +70,35 @@ class ActiveSlam(PpoFrontier):
     def __init__(self, config: ActiveConfig | Mapping[str, Any] | None = None, **body: Any) -> None:
         with argument("config"):
             settings = from_mapping(ActiveConfig, config)
-        self._look_config, self._drift = settings.look, settings.drift
+        self._look_config, self._drift, self._slip = settings.look, settings.drift, settings.slip
         super().__init__(settings, **body)
-        self.config = replace(self.config, slip=settings.slip)
 
     def _forget(self) -> None:
         super()._forget()
         self._follower = self._gentle = GentleFollower(
             self.config.control, robot=self._robot, lidar=self._lidar, step_s=self._step_s
         )
+        self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * self._slip.firm_share)
         self._looked_s: float | None = 0.0  # at the start; None once it has driven off
         self._lately: deque[tuple[Array, Array]] = deque(maxlen=self._drift.steps + 1)  # poses, covariances
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action: looking first, then to the goal, slowly where the place grows unsure."""
+        self._wheels.look(observation, belief)
         if self._looked_s is not None:
             if self._looks_on(belief):
-                return self._look(observation, belief)
+                return self._look(belief)
             self._looked_s = None
         self._lately.append((np.array(belief.pose, dtype=np.float64), np.array(belief.pose_cov, dtype=np.float64)))
+        self._follower.config = self._control()
         action = super().act(observation, belief)
         return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action
 
     # ---- looking first ---------------------------------------------------------------------------------------
 
-    def _look(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def _look(self, belief: Belief) -> NDArray[np.float32]:
         """Stand for a step; a goal is there from the beginning, if the first scan shows one."""
         assert self._looked_s is not None
-        self._wheels.look(observation, belief)
         self._keep_watch(belief)
         if self._looked_s == 0.0:
             self._goal = self.choose(belief)
@@ -134,11 +133,11 @@ class ActiveSlam(PpoFrontier):
     # ---- driving ---------------------------------------------------------------------------------------------
 
     def _control(self) -> ControlConfig:
-        """Return how to drive: where the position grows unsure too fast, so slowly that it no longer does.
+        """Return how to drive: gently where wheels slip, slowly where the position grows unsure too fast.
 
         Each step adds a variance in proportion to the square of its length, as long as nothing else tells.
         """
-        usual, drift = super()._control(), self._drift
+        usual, drift = self._slip.eased(self.config.control, self._wheels.share), self._drift
         if len(self._lately) <= drift.steps:
             return usual
         poses = np.array([pose for pose, _ in self._lately])

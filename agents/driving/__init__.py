@@ -2,5 +2,5 @@
 
 ``driver`` asks for another goal when that is due and notices what does not work out; ``control`` follows a path
 with ``follow``'s kernels, ``safety`` has the last word on a twist, ``sides`` are what it keeps to beside other
-robots, ``grip`` learns how gently to drive.
+robots, ``grip`` learns how slippery the floor is and drives gently.
 """

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,10 @@ from agents.driving.control import ControlConfig, PathFollower
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.motion import twist_between
+from slam.settings import Config, PositiveShare, Rate, require
 from slam.types import Array
 
-__all__ = ["GentleFollower", "WheelWatch", "eased"]
+__all__ = ["GentleFollower", "SlipConfig", "WheelWatch"]
 
 _MEMORY = 200.0  # steps at full weight of what was expected before any was driven
 _FORGET = 0.998  # share of the past that a step leaves: what was learnt fades over some fifty seconds
@@ -70,10 +71,28 @@ class WheelWatch:
         self._missed = _FORGET * self._missed + min(error, 0.25)
 
 
-def eased(usual: ControlConfig, share: float, **gentle: float) -> ControlConfig:
-    """Return how to drive a share (0 … 1) of the way from as usual to these gentle values, where they are less."""
-    before = {name: getattr(usual, name) for name in gentle}
-    return replace(usual, **{k: v + share * (min(v, gentle[k]) - v) for k, v in before.items()})
+@dataclass(frozen=True, kw_only=True)
+class SlipConfig(Config):
+    """How a floor found slippery is driven on: beyond what it grips wheels slide, and odometry tells less."""
+
+    acceleration_m_s2: Rate = 1.0
+    lateral_m_s2: Rate = 1.2  # in turns of the path
+    firm_share: PositiveShare = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
+    slippery_share: PositiveShare = 0.02  # … from here on it is driven as gently as it can be
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.firm_share < self.slippery_share,
+            f"SlipConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
+        )
+
+    def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
+        """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
+        slippery = float(np.interp(share, [self.firm_share, self.slippery_share], [0.0, 1.0]))
+        gentle = {"acceleration_m_s2": self.acceleration_m_s2, "lateral_m_s2": self.lateral_m_s2}
+        before = {name: getattr(usual, name) for name in gentle}
+        return replace(usual, **{k: v + slippery * (min(v, gentle[k]) - v) for k, v in before.items()})
 
 
 class GentleFollower(PathFollower):

@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from agents.driving.control import ControlConfig
-from agents.driving.grip import WheelWatch, eased
 from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
 from slam.belief import Belief
-from slam.settings import Config, Duration, NotNegative, PositiveShare, Rate, require
+from slam.settings import Duration, NotNegative, require
 
-__all__ = ["Chooser", "ChooserConfig", "SlipConfig"]
+__all__ = ["Chooser", "ChooserConfig"]
 
 _MANY = 4  # times as many candidates as are shown: to so many the ways are searched for
-
-
-@dataclass(frozen=True, kw_only=True)
-class SlipConfig(Config):
-    """How a floor found slippery is driven on: beyond what it grips wheels slide, and odometry tells less."""
-
-    acceleration_m_s2: Rate = 1.0
-    lateral_m_s2: Rate = 0.75  # in turns of the path
-    firm_share: PositiveShare = 0.012  # of the wheels' speed: no greater error of the odometry is taken for slip …
-    slippery_share: PositiveShare = 0.02  # … from here on it is driven as gently as it can be
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(
-            self.firm_share < self.slippery_share,
-            f"SlipConfig.firm_share {self.firm_share} must be below slippery_share {self.slippery_share}",
-        )
-
-    def eased(self, usual: ControlConfig, share: float) -> ControlConfig:
-        """Return how to drive where odometry errs by ``share`` of the wheels' speed: as usual, or gentler."""
-        slippery = float(np.interp(share, [self.firm_share, self.slippery_share], [0.0, 1.0]))
-        return eased(usual, slippery, acceleration_m_s2=self.acceleration_m_s2, lateral_m_s2=self.lateral_m_s2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +22,6 @@ class ChooserConfig(TourConfig):
     """The parts of the explorer, the tour that is shown with the choice, and how a choice is described."""
 
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
-    slip: SlipConfig = field(default_factory=SlipConfig)
     large_m2: NotNegative = 400.0  # known: on a larger map ways are long, as is choosing, and a choice lasts …
     large_replan_s: Duration = 2.0  # … so long
 
@@ -75,17 +47,6 @@ class Chooser(Tour):
         self._found: Candidates | None = None
         self._last: tuple[Choice, Candidates] | None = None
         self._taken = -1  # index of the candidate that was chosen
-        self._wheels = WheelWatch(self._robot, step_s=self._step_s, share=0.5 * self.config.slip.firm_share)
-
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
-        """Return the next action on the way to what was chosen, as gentle as the floor was found slippery."""
-        self._wheels.look(observation, belief)
-        self._follower.config = self._control()
-        return super().act(observation, belief)
-
-    def _control(self) -> ControlConfig:
-        """Return how to drive next."""
-        return self.config.slip.eased(self.config.control, self._wheels.share)
 
     def _lasts_s(self, belief: Belief) -> float:
         usual = super()._lasts_s(belief)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
 
 import gymnasium
 import numpy as np
@@ -12,7 +11,6 @@ from gymnasium.utils.env_checker import check_env
 
 import agents
 import mecanum_env  # noqa: F401 - registers
-from agents.brisk_tour import BRISK
 from agents.frontier_env import ExploreFrontierEnv
 from agents.learned.choice import CANDIDATE, STATE
 from agents.ppo_frontier import load_choice_policy
@@ -182,20 +180,6 @@ def test_a_policy_is_driven_here_as_by_its_agent(noise):
         np.testing.assert_array_equal(info["true_pose"], other["true_pose"])
 
 
-def test_a_slippery_floor_is_driven_on_gently_once_the_wheels_have_told_of_it():
-    def driven(noise, **slip):
-        env = gymnasium.make(ID, rooms="apartment", noise=noise, driver={"control": asdict(BRISK), "slip": slip})
-        play(env, 1, most=40)
-        control = env.unwrapped.agent._follower.config
-        return control.acceleration_m_s2, control.lateral_m_s2
-
-    brisk = BRISK.acceleration_m_s2, BRISK.lateral_m_s2
-    assert driven("nominal") == brisk
-    assert driven("slippery", acceleration_m_s2=1.0, lateral_m_s2=0.7) == pytest.approx((1.0, 0.7))
-    assert driven("slippery", acceleration_m_s2=9.0, lateral_m_s2=9.0) == brisk  # gentle never is rougher
-    assert driven("slippery", firm_share=0.5, slippery_share=0.6) == brisk
-
-
 def test_it_says_what_is_wrong():
     env = gymnasium.make(ID, rooms="rectangular").unwrapped
     env.reset(seed=0)
@@ -206,8 +190,6 @@ def test_it_says_what_is_wrong():
         ExploreFrontierEnv(discount=0.0)
     with pytest.raises(ValueError, match="valid"):
         ExploreFrontierEnv(driver={"speed": 1.0})
-    with pytest.raises(ValueError, match=r"slip: SlipConfig\.firm_share 0.03 must be below slippery_share 0.02"):
-        ExploreFrontierEnv(driver={"slip": {"firm_share": 0.03}})
-    with pytest.raises(ValueError, match=r"slip\.lateral_m_s2 must be in \[0.001, 100\], got"):
-        ExploreFrontierEnv(driver={"slip": {"lateral_m_s2": 0.0}})
+    with pytest.raises(ValueError, match=r"control\.lateral_m_s2 must be in \[0.001, 100\], got"):
+        ExploreFrontierEnv(driver={"control": {"lateral_m_s2": 0.0}})
     assert len(STATE) == env.observation_space["state"].shape[0]
