@@ -51,9 +51,8 @@ class CompressedEkfConfig(EkfConfig):
 
 
 class Change(NamedTuple):
-    """What a region's corrections make of the rest of the map. The first columns are the map's own."""
+    """What a region's corrections make of the rest's covariance. The first columns are the map's own."""
 
-    x: Array  # (n,) the map's state; what is far is up to date
     left: Array  # (k, ≥ n) L and …
     right: Array  # (k, ≥ n) … R: the covariance of what is far gains Lᵀ R
     own: Array  # (own, ≥ n) covariance of the states beside the map with what is far
@@ -184,23 +183,30 @@ class CompressedEkfSlam(EkfSlam):
             self._map_p = _enlarged(self._map_p, len(self._map_p))
         change = self._change()
         self._write(self._map_p, change)
-        self._map_x[b], self._map_own[:, b] = change.x[b], change.own[:, b]
+        self._map_x[b], self._map_own[:, b] = self._rest()[b], change.own[:, b]
         self._map_x[a], self._map_own[:, a] = self._x[: self._n], self._beside.cross[: self._beside.own, : self._n]
         self._map_ids[self._near], self._map_marks[self._near] = self._book.ids, self._book.marks
 
+    def _rest(self) -> Array:
+        """Return the map's state ``(n,)``, in which what is far is up to date."""
+        x = self._map_x.copy()
+        if len(self._v):
+            end = int(state_rows(self._far, robot=True).max()) + 1
+            add_combination(x, end, self._beside.mean[self._beside.own :], self._v)
+        return x
+
     def _change(self) -> Change:
-        """Return what the region's corrections make of the rest."""
+        """Return what the region's corrections make of the rest's covariance."""
         y, v, k = self._beside, self._v, self._beside.own
         end = int(state_rows(self._far, robot=True).max()) + 1
         size = max(end, int(state_rows(self._near, robot=True).max()) + 1)
-        x, own, loss = self._map_x.copy(), np.zeros((k, max(size, len(self._map_x)))), aligned_zeros(0, size)
+        own, loss = np.zeros((k, max(size, len(self._map_x)))), aligned_zeros(0, size)
         if len(v):
-            add_combination(x, end, y.mean[k:], v)
             root = root_of_loss(y.cov[k:, k:], self._weights, self.config.rank_tolerance)
             loss = aligned_zeros(len(root), size)
             loss[:, :end] = product(root, v, end)[:, :end]
             own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
-        return Change(x, loss, -loss, own)
+        return Change(loss, -loss, own)
 
     def _cross(self, rows: int) -> Array:
         """Return the covariance ``(rows, n)`` of the region's first states with what is far; 0 with the others."""
@@ -290,7 +296,7 @@ class CompressedEkfSlam(EkfSlam):
         ids = self._ids
         row_of_id = np.full(max(len(self._book.row_of_id), int(ids.max(initial=0)) + 1), -1, np.int64)
         row_of_id[ids] = np.arange(len(ids))
-        far = self._change().x[state_rows(self._far, robot=False)].reshape(-1, 2)
+        far = self._rest()[state_rows(self._far, robot=False)].reshape(-1, 2)
         return np.concatenate([self._points, far]), row_of_id
 
 

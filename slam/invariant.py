@@ -113,16 +113,25 @@ class InvariantEkfSlam(CompressedEkfSlam):
         super()._enter()
         self._turned = 0.0
 
+    def _rest(self) -> Array:
+        return self._retracted()[0] if len(self._far) else super()._rest()
+
+    def _retracted(self) -> tuple[Array, Array]:
+        """Return the map's state ``(n,)``, what is far retracted, and the columns of its reset ``(3, n)``."""
+        x, delta = self._map_x.copy(), super()._rest() - self._map_x
+        columns = np.zeros((3, len(x)))
+        x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
+        # Walls far away were settled long ago.
+        end = int(state_rows(self._far, robot=False).max()) + 1
+        _retract(x, end, delta, self._map_marks, columns, math.inf)
+        return x, columns
+
     def _change(self) -> Change:
-        """Return what the region's corrections make of the rest, its retraction and reset included."""
+        """Return what the region's corrections make of the rest's covariance, its reset included."""
         change = super()._change()
         if not len(self._far):
             return change
-        far, size = state_rows(self._far, robot=False), change.left.shape[1]
-        x, delta, columns = self._map_x.copy(), change.x - self._map_x, np.zeros((3, len(change.x)))
-        x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
-        # Walls far away were settled long ago.
-        _retract(x, int(far.max()) + 1, delta, self._map_marks, columns, math.inf)
+        far, size, columns = state_rows(self._far, robot=False), change.left.shape[1], self._retracted()[1]
         a, robot = np.zeros((3, size)), [2, 0, 1]
         a[:, far] = columns[:, far]
         # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
@@ -134,7 +143,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         u = u[robot] + product(0.5 * pose_cov[np.ix_(robot, robot)], a, size)
         own = change.own.copy()
         own[:, :size] += product(self._beside.cross[: len(own), robot], a, size)[:, : own.shape[1]]
-        return Change(x, np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)
+        return Change(np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)
 
     @property
     def wheel_errors(self) -> tuple[Array, Array] | None:

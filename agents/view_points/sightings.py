@@ -27,6 +27,7 @@ _STEP = 0.7  # cells: less than one, so that no wall is stepped over, diagonal o
 _BLIND = 2.5  # cells before a surface, within which the grid's own drawing of it is met
 _PIECE_M = 0.3  # between the points of a wall that are looked for
 _MOST_PIECES = 40
+_OUT_OF_REACH = 1.001  # of the range, the nearest point of a wall: nothing of it is in sight, roundings aside
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +124,13 @@ def _sees_wall(
         return False
     length = math.hypot(ends[2] - ends[0], ends[3] - ends[1])
     count = min(max(int(length / _PIECE_M), 2), _MOST_PIECES)
+    # Along the wall from the foot of the sensor's perpendicular.
+    start = -ny * (ends[0] - sensor[0]) + nx * (ends[1] - sensor[1])
+    step = (-ny * (ends[2] - ends[0]) + nx * (ends[3] - ends[1])) / count
+    end = start + count * step
+    beside = min(abs(start), abs(end)) if start * end > 0.0 else 0.0
+    if math.hypot(away, beside) > _OUT_OF_REACH * limits[1]:
+        return False
     best_from, best_to, run = 0, -1, 0
     for j in range(count + 1):
         share = j / count
@@ -133,9 +141,6 @@ def _sees_wall(
     seen_m = (best_to - best_from) * length / count
     if seen_m < limits[7]:
         return False
-    # Along the wall from the foot of the sensor's perpendicular.
-    start = -ny * (ends[0] - sensor[0]) + nx * (ends[1] - sensor[1])
-    step = (-ny * (ends[2] - ends[0]) + nx * (ends[3] - ends[1])) / count
     low, high = start + best_from * step, start + best_to * step
     beams = abs(math.atan2(high, away) - math.atan2(low, away)) / limits[3]
     if beams < limits[8]:

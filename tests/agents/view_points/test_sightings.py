@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
 
 from agents.view_points.sightings import SensorModel, expected_sightings
 from agents.ways import cost_map as cost_maps
@@ -16,6 +18,7 @@ from slam.types import LINE
 from tests.agents.grids import belief_of, fill, room
 
 LIDAR, ROBOT = LidarConfig(), RobotConfig()
+HALL = room(30.0, 4.0)
 CORNERS = np.array([[0.1, 0.1], [7.9, 0.1], [7.9, 3.9], [0.1, 3.9]])
 
 
@@ -73,6 +76,22 @@ def test_a_wall_is_seen_from_its_own_side_only_and_the_better_the_more_of_it():
     _, whole_cov = look(classes, (5.0, 2.0, 0.0), [behind[0]], kinds, [behind[1]])
     _, piece_cov = look(classes, (5.0, 2.0, 0.0), [piece[0]], kinds, [piece[1]])
     assert (whole_cov[0, 0, [0, 2]] < piece_cov[0, 0, [0, 2]]).all()
+
+
+@given(a=st.floats(0.2, 29.0), length=st.floats(0.7, 60.0), heading=st.floats(-3.1, 3.1))
+def test_of_a_long_hall_s_wall_what_is_in_reach_is_seen(a: float, length: float, heading: float) -> None:
+    pose, b = (15.0, 2.0, heading), min(a + length, 29.8)
+    mark, ends = wall(b, 3.9, a, 3.9)
+    seen = look(HALL, pose, [mark], [float(LINE)], [ends])[0].all()
+    sensor = 15.0 + LIDAR.offset_m * math.cos(heading)
+
+    def within(reach_m: float) -> float:
+        return max(min(b, sensor + reach_m) - max(a, sensor - reach_m), 0.0)
+
+    if within(4.0) > 1.0:
+        assert seen
+    if within(LIDAR.range_max_m) < 0.5:
+        assert not seen
 
 
 def test_a_wall_s_accuracy_is_that_of_the_fitted_line():
