@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 
 import agents
 from agents.active import ActiveSlam, _grown
+from agents.brisk_tour import BRISK
 from agents.driving.control import ControlConfig
 from agents.driving.grip import GentleFollower, SlipConfig, WheelWatch
 from mecanum_env.config import LidarConfig, RobotConfig
@@ -170,6 +172,24 @@ def test_wheels_that_slip_are_found_out_and_driven_gently():
         assert watch.share == pytest.approx(share, rel=0.2)
     watch.look(None, belief)
     watch.look({}, belief)
+
+
+def test_it_drives_gently_where_its_wheels_have_told_of_slip():
+    def driven(noise: str, **slip: float) -> tuple[float, float]:
+        env = gymnasium.make("mecanum_env:mecanum_env/Explore-v0", rooms="apartment", noise=noise).unwrapped
+        observation, _ = env.reset(seed=1)
+        agent = ready(env.belief, **GO, slip=slip)
+        for _ in range(200):
+            observation = env.step(agent.act(observation, env.belief))[0]
+        control = agent._follower.config
+        return control.acceleration_m_s2, control.lateral_m_s2
+
+    brisk = BRISK.acceleration_m_s2, BRISK.lateral_m_s2
+    assert driven("nominal") == brisk
+    assert driven("slippery", acceleration_m_s2=1.0, lateral_m_s2=0.7) == pytest.approx((1.0, 0.7))
+    assert driven("slippery", acceleration_m_s2=9.0, lateral_m_s2=9.0) == brisk  # gentle never is rougher
+    with pytest.raises(ValueError, match=r"slip: SlipConfig\.firm_share 0.03 must be below slippery_share 0.02"):
+        agents.make("active", config={"slip": {"firm_share": 0.03}})
 
 
 def test_a_gentle_follower_keeps_to_its_acceleration():
