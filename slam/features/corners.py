@@ -39,7 +39,8 @@ from slam.types import CONCAVE, CONVEX, LINE, Array
 
 _LOOSE_M = 0.02
 _CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
-_SPREAD = 5.0  # most χ² per degree of freedom of an end face's points, at a right angle to the surface
+_SAME = 2.0  # σ along the surface by which a point may be off an end face's others
+_UNIFORM = 1.0 / 12.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -124,8 +125,9 @@ def edge(
 
     Where the next beam would still meet the surface's line but passes it, the surface ends: between the two
     beams, uniformly. A short end face may show in between (a wall is as thick as that), all of it behind the
-    line; hidden or not, it is taken to recede at a right angle, and where it is seen its points tell the end. That
-    is from beyond the end alone: what shows behind the line from elsewhere is another surface, a door's frame.
+    line; hidden or not, it is taken to recede at a right angle, and where it is seen its points tell the end, up
+    to the first that is of another face (a door's frame has steps). That is from beyond the end alone: what shows
+    behind the line from elsewhere is another surface, or the same where it bends away.
     (Where a beam stops short of the line, something nearer hides the surface: the rim of a shadow, no landmark.)
     """
     if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
@@ -134,11 +136,13 @@ def edge(
     step = 1 if side == 1 else -1
     index = int(line[LAST]) if side == 1 else int(line[FIRST])
     full = n * increment > 2.0 * math.pi - 1.5 * increment
+    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
     # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
     end = _meets(line, rays[index])
-    t = missed = 0.0
+    t = missed = slide = 0.0
     faces = on_face = 0
-    weight = mean = spread = 0.0  # of the face's points that are clear of the line, along it
+    one_face = True
+    weight = mean = 0.0  # of the face's points that are clear of the line, beyond the surface's last
     while True:
         index += step
         if index < 0 or index >= n:
@@ -154,11 +158,18 @@ def edge(
         missed = line[R] / across  # range at which the beam would meet the line
         if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
             return 0
-        if faces == 0:
-            t = _meets(line, rays[index])
         px, py = reach * rays[index, 0], reach * rays[index, 1]
         beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
         depth = line[NX] * px + line[NY] * py - line[R]
+        slide = (-line[NY] * rays[index, 0] + line[NX] * rays[index, 1]) * step  # < 0: from beyond the end
+        if depth < near and beyond > 2.0 * limits[SIGMA] * max(-slide, 0.0):
+            end = _meets(line, rays[index])  # noise has split it: the surface goes on
+            faces = on_face = 0
+            continue
+        if faces == 0:
+            if slide >= 0.0 and depth < 2.0 * near:
+                return 0  # it bends away
+            t, one_face, weight, mean = _meets(line, rays[index]), True, 0.0, 0.0
         if reach > missed + limits[EDGE_JUMP]:
             if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
                 break  # past the end face, or there is none to see
@@ -167,24 +178,28 @@ def edge(
         faces += 1
         if faces > 40:
             return 0
-        slide = -line[NY] * rays[index, 0] + line[NX] * rays[index, 1]
-        if depth > _CLEAR * limits[SIGMA] and step * slide < 0.0:
+        if one_face and slide < 0.0 and depth > _CLEAR * limits[SIGMA]:
             w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
-            on_face, weight = on_face + 1, weight + w
             off = beyond - mean
-            mean += w / weight * off
-            spread += w * off * (beyond - mean)
+            one_face = on_face == 0 or off * off < _SAME**2 * (1.0 / w + 1.0 / weight)
+            if one_face:
+                on_face, weight = on_face + 1, weight + w
+                mean += w / weight * off
     spacing = abs(t - end)
     if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
-    if on_face >= 2 and spread < _SPREAD * (on_face - 1):
-        s = end + step * mean
-        along = 1.0 / weight + limits[FLOOR] ** 2
+    if on_face > 0:
+        # A face nearer the surface's last point may lie hidden between two beams, the less likely the more show.
+        s = end + step * (mean if on_face > 1 else min(0.5 * mean, mean))
+        along = 1.0 / weight + _UNIFORM * mean * mean
+        if on_face == 1:
+            along += limits[SIGMA] ** 2
     else:
-        # A uniform error of the beams' spacing, with some more since it lasts while the robot stands still. And
-        # what was seen of an end face: its points pass for the surface's while they lie within a few σ of it.
-        s = end + step * mean if on_face == 1 else 0.5 * (t + end)
-        along = (limits[EDGE_SIGMA] * spacing) ** 2 + limits[FLOOR] ** 2 + 4.0 * limits[SIGMA] ** 2
+        s = 0.5 * (t + end)
+        along = _UNIFORM * spacing * spacing
+        if slide < 0.0:  # a face's points pass for the surface's while they lie within a few σ of it
+            along += 4.0 * limits[SIGMA] ** 2
+    along += limits[EDGE_SIGMA] ** 2 + limits[FLOOR] ** 2
     x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]

@@ -114,7 +114,7 @@ def test_convex_corners_of_a_box_and_no_corner_where_it_hides_the_wall() -> None
 def test_an_end_face_that_noise_hides_is_in_the_covariance(thick: float) -> None:
     """From the sides a wall's end face is seen, and its first points pass for the wall's: no heavy tail."""
     nees = np.array(ends_of_a_wall(0.03, thick=thick, from_x=(1.0, 5.0))[1])
-    assert 0.4 < np.mean(nees) / 2 < 0.7
+    assert 0.7 < np.mean(nees) / 2 < 1.2
     assert np.quantile(nees, 0.99) < 13.0  # of χ² with two degrees of freedom 9.2
 
 
@@ -123,8 +123,8 @@ def test_the_end_of_a_wall_is_a_corner_wherever_it_is_seen_from(sigma: float) ->
     """The two ends of a free-standing wall, their bias and spread against the declared covariance."""
     errors, nees = ends_of_a_wall(sigma, thick=0.3, from_x=(2.2, 3.8))
     assert len(errors) > 300
-    assert np.abs(np.mean(errors, axis=0)).max() < 0.004
-    assert 0.7 < np.mean(nees) < 2.2
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.002
+    assert 0.85 < np.mean(nees) / 2 < 1.15
 
 
 def test_an_end_face_that_is_seen_tells_the_end() -> None:
@@ -133,8 +133,56 @@ def test_an_end_face_that_is_seen_tells_the_end() -> None:
     off = np.array(errors)[:, 0]
     assert len(off) > 150
     assert abs(np.mean(off)) < 0.001 and np.quantile(np.abs(off), 0.95) < 0.008
-    assert 0.7 < np.mean(nees) / 2 < 1.3
+    assert 0.6 < np.mean(nees) / 2 < 1.1  # less, as a step nearer the wall might have been hidden
     assert np.quantile(nees, 0.99) < 12.0  # of χ² with two degrees of freedom 9.2
+
+
+def frame_of_a_door(depth: float) -> np.ndarray:
+    """A wall along y = 3 that ends at x = 3, the frame of its door a step farther back and out."""
+    return np.array([[1.0, 3.0], [3.0, 3.0], [3.0, 3.0 + depth], [3.1, 3.0 + depth], [3.1, 3.4], [1.0, 3.4]])
+
+
+def ends_of(frame: np.ndarray, *, from_x: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Errors along the wall [m], positive where it seems too long, and normalised ones, of ends near (3, 3)."""
+    rng = np.random.default_rng(0)
+    extractor = FeatureExtractor(FeatureConfig(edge_sigma_m=0.0))
+    along, normalised = [], []
+    for _ in range(400):
+        pose = np.array([rng.uniform(*from_x), rng.uniform(1.0, 2.5), rng.uniform(-3, 3)])
+        corners = corners_in(extractor, polygon_scan(pose, [ROOM, frame], rng))
+        for (rho, phi), cov, kind in zip(corners.range_bearing, corners.cov, corners.kind, strict=True):
+            bearing = phi + pose[2]
+            x, y = pose[0] + rho * math.cos(bearing), pose[1] + rho * math.sin(bearing)
+            if kind == CONVEX and math.hypot(x - 3.0, y - 3.0) < 0.3 and abs(y - 3.0) < 0.05:
+                slope = np.array([math.cos(bearing), -rho * math.sin(bearing)])
+                along.append(x - 3.0)
+                normalised.append((x - 3.0) / math.sqrt(slope @ cov @ slope))
+    return np.array(along), np.array(normalised)
+
+
+@pytest.mark.parametrize("depth", [0.1, 0.15])
+@pytest.mark.parametrize("from_x", [(1.2, 2.8), (3.4, 5.0)])
+def test_an_end_is_the_same_from_both_sides_of_a_door(depth: float, from_x: tuple[float, float]) -> None:
+    """Otherwise whoever drives past is dragged along, by every door alike."""
+    along, normalised = ends_of(frame_of_a_door(depth), from_x=from_x)
+    assert len(along) > 150
+    assert abs(np.mean(along)) < 0.004
+    assert 0.5 < np.mean(normalised**2) < 1.5
+
+
+def test_a_wall_that_noise_has_split_ends_where_it_ends() -> None:
+    """Near a wall some point is far enough off to split it: the end is beyond the piece that is left."""
+    along, _ = ends_of(frame_of_a_door(0.1), from_x=(2.0, 2.8))
+    assert np.quantile(np.abs(along), 0.98) < 0.03
+
+
+def test_a_surface_that_bends_away_has_no_end() -> None:
+    """From its own side; of 400 looks some pass the horizon of the bend, and look beyond it like past an end."""
+    angles = np.linspace(0.0, 0.5 * math.pi, 60)
+    bend = np.column_stack([3.0 + 1.5 * np.sin(angles), 4.5 - 1.5 * np.cos(angles)])
+    rounded = np.vstack([[[1.0, 3.0]], bend, [[1.0, 4.5]]])
+    along, _ = ends_of(rounded, from_x=(1.5, 2.8))
+    assert len(along) < 25
 
 
 def test_a_surface_that_lies_a_little_farther_back_is_no_end_face() -> None:
@@ -161,7 +209,7 @@ def ends_of_a_wall(
     """Errors (range, bearing) and NEES of the ends of a wall, seen from its south."""
     wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.0 + thick], [2.0, 3.0 + thick]])
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma, edge_sigma_m=0.0))
     errors, nees = [], []
     for _ in range(200):
         pose = np.array([rng.uniform(*from_x), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
