@@ -1,13 +1,9 @@
-"""What an account leaves unsaid of its corners: on which walls they lie, and how far the end of a wall is off.
+"""What an account leaves unsaid of its corners: on which walls they lie, and which no wall reaches.
 
 The filter takes from a corner only what the walls that make it do not say (docs/reference/features.md), so across
 a wall a corner's own covariance is centimetres wide, where the wall is known to a millimetre or two. Here such a
 corner is read off its wall: its foot on the wall, or where two walls cross. Both are functions of the account's
 state, so the covariance goes over by their Jacobian and nothing is counted twice.
-
-Where a surface is seen to end, a corner's error lasts along the surface. A filter cannot say that of white noise,
-and takes so much of it that the sum is no less. How much of the variance is the corner's own, its covariance
-tells: it is what is left where all else is known.
 
 A convex corner is seen together with its walls, so they reach it. Where one was seen to end before, the lines of
 two surfaces only cross there, behind a jamb perhaps, and the corner is off along the wall by as much.
@@ -20,13 +16,11 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.linalg import inv
-from scipy.linalg.blas import dger
 from scipy.sparse import coo_array
 
 from slam.accounts.account import Account
 from slam.metrics.chi_square import chi2_quantile
-from slam.settings import Angle, Config, Length, Share, Within
+from slam.settings import Angle, Config, Length, Within
 from slam.types import CONVEX, Array
 
 __all__ = ["CornerConfig", "settled"]
@@ -34,13 +28,12 @@ __all__ = ["CornerConfig", "settled"]
 Blocks = dict[tuple[int, int], Array]
 """Blocks ``(2, 2)`` of a Jacobian, by the corner whose row they are in, and the point or wall."""
 
-_NOTHING = 1e-12  # [m²] lets a covariance be inverted in which something is exactly known
 _FACING = 0.3  # cosine; a corner's bisector makes 45° with the free side of either wall
 
 
 @dataclass(frozen=True, kw_only=True)
 class CornerConfig(Config):
-    """Which walls a corner lies on, and how far off ends are; chosen in apartments of training seeds 0-249."""
+    """Which walls a corner lies on; chosen in apartments of training seeds 0-249."""
 
     off_m: Length = 0.05  # from the wall …
     beyond_m: Length = 0.15  # … and past what was seen of it
@@ -48,18 +41,14 @@ class CornerConfig(Config):
     jamb_m: Length = 0.4  # … or a convex corner's, where no other is: of 61,078 this takes 6 true and 5 false ones
     crossing_rad: Angle = 0.96  # least angle between two walls that make a corner
     reach_m: Length = 0.06  # from a convex corner to what was seen of its walls; 5 of 6 farther off were false
-    # The end of a surface lies between two beams: a uniform error, of a twelfth of the squared spacing. The filter
-    # takes all of that, four times (FeatureConfig.edge_sigma and wall_lasting_scans) …
-    end_share: Share = 1.0 / (12.0 * 4.0)
-    end_sigma_m: Length = 0.0075  # … for this, which is much the same however often the end is seen
 
 
 def settled(account: Account, config: CornerConfig | None = None) -> Account:
-    """Return the account with its ends' errors as they are, and its corners on the walls on which they lie."""
+    """Return the account with its corners on the walls on which they lie."""
     config = config or CornerConfig()
     if not len(account.points):
         return account
-    cov = _with_lasting_ends(account, config)
+    cov = account.cov.copy()
     points, blocks, apart = _on_walls(account, cov, config)
     if blocks:
         _go_over(cov, blocks)
@@ -67,29 +56,6 @@ def settled(account: Account, config: CornerConfig | None = None) -> Account:
         at = slice(3 + 2 * u, 5 + 2 * u)
         cov[at, at] += np.outer(gap, gap)
     return replace(account, points=points, cov=cov)
-
-
-def _with_lasting_ends(account: Account, config: CornerConfig) -> Array:
-    """Return the covariance with v → min(v, share · v + σ²), v being a convex corner's own largest variance.
-
-    Own is what it has where all else is known: less by no more than that, one corner after the other, a covariance
-    stays one. A corner where two surfaces meet has less than σ², and keeps it.
-    """
-    cov, information = account.cov.copy(), account.cov.copy()
-    np.fill_diagonal(information, np.diag(cov) + _NOTHING)
-    # Not in place: SciPy 1.17 then writes to nowhere where rounding has left a negative eigenvalue.
-    information = np.ascontiguousarray(inv(information, check_finite=False))
-    for u in np.flatnonzero(account.kinds == CONVEX):
-        at = slice(3 + 2 * u, 5 + 2 * u)
-        variances, axes = np.linalg.eigh(np.linalg.inv(information[at, at]))
-        less = variances[1] - (config.end_share * variances[1] + config.end_sigma_m**2)
-        if less > 0.0:
-            axis = axes[:, 1]
-            cov[at, at] -= less * np.outer(axis, axis)
-            column = information[:, at] @ axis
-            # In place, as in a building a matrix has hundreds of megabytes; transposed, as BLAS counts.
-            dger(less / (1.0 - less * (axis @ column[at])), column, column, a=information.T, overwrite_a=True)
-    return cov
 
 
 def _on_walls(account: Account, cov: Array, config: CornerConfig) -> tuple[Array, Blocks, list[tuple[int, Array]]]:

@@ -9,6 +9,7 @@ from numba import njit
 from slam.features.surfaces import (
     CURVATURE,
     EDGE_FACE,
+    EDGE_FLOOR,
     EDGE_JUMP,
     EDGE_LENGTH,
     EDGE_POINTS,
@@ -40,7 +41,6 @@ from slam.types import CONCAVE, CONVEX, LINE, Array
 _LOOSE_M = 0.02
 _CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
 _SAME = 2.0  # σ along the surface by which a point may be off an end face's others
-_UNIFORM = 1.0 / 12.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -140,8 +140,7 @@ def edge(
     # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
     end = _meets(line, rays[index])
     t = missed = slide = 0.0
-    faces = on_face = 0
-    one_face = True
+    faces = on_face = stray = 0
     weight = mean = 0.0  # of the face's points that are clear of the line, beyond the surface's last
     while True:
         index += step
@@ -162,14 +161,15 @@ def edge(
         beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
         depth = line[NX] * px + line[NY] * py - line[R]
         slide = (-line[NY] * rays[index, 0] + line[NX] * rays[index, 1]) * step  # < 0: from beyond the end
-        if depth < near and beyond > 2.0 * limits[SIGMA] * max(-slide, 0.0):
-            end = _meets(line, rays[index])  # noise has split it: the surface goes on
-            faces = on_face = 0
+        farther = beyond > 3.0 * limits[SIGMA] * max(-slide, 0.0)  # than the last, so not of an end face there
+        if farther and depth < near:
+            end = _meets(line, rays[index]) if slide >= 0.0 else end + step * beyond
+            faces = on_face = 0  # the surface goes on: noise has split it
             continue
         if faces == 0:
-            if slide >= 0.0 and depth < 2.0 * near:
+            if farther and depth < 2.0 * near:
                 return 0  # it bends away
-            t, one_face, weight, mean = _meets(line, rays[index]), True, 0.0, 0.0
+            t, stray, weight, mean = _meets(line, rays[index]), 0, 0.0, 0.0
         if reach > missed + limits[EDGE_JUMP]:
             if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
                 break  # past the end face, or there is none to see
@@ -178,28 +178,34 @@ def edge(
         faces += 1
         if faces > 40:
             return 0
-        if one_face and slide < 0.0 and depth > _CLEAR * limits[SIGMA]:
+        if stray < 2 and slide < 0.0 and depth > _CLEAR * limits[SIGMA]:
             w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
             off = beyond - mean
-            one_face = on_face == 0 or off * off < _SAME**2 * (1.0 / w + 1.0 / weight)
-            if one_face:
-                on_face, weight = on_face + 1, weight + w
+            if on_face == 0 or off * off < _SAME**2 * (1.0 / w + 1.0 / weight):
+                on_face, weight, stray = on_face + 1, weight + w, 0
                 mean += w / weight * off
+            else:
+                stray += 1
     spacing = abs(t - end)
     if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
-    if on_face > 0:
-        # A face nearer the surface's last point may lie hidden between two beams, the less likely the more show.
-        s = end + step * (mean if on_face > 1 else min(0.5 * mean, mean))
-        along = 1.0 / weight + _UNIFORM * mean * mean
-        if on_face == 1:
-            along += limits[SIGMA] ** 2
-    else:
+    share = limits[EDGE_SIGMA]
+    if on_face == 0:
         s = 0.5 * (t + end)
-        along = _UNIFORM * spacing * spacing
-        if slide < 0.0:  # a face's points pass for the surface's while they lie within a few σ of it
+        along = (share * spacing) ** 2
+        if slide < 0.0:  # a face's first points pass for the surface's
             along += 4.0 * limits[SIGMA] ** 2
-    along += limits[EDGE_SIGMA] ** 2 + limits[FLOOR] ** 2
+    elif on_face == 1:
+        s = end + step * min(0.5 * mean, mean)
+        along = (share * mean) ** 2 + 1.0 / weight + limits[SIGMA] ** 2
+    else:
+        s = end + step * mean
+        along = 1.0 / weight
+        if stray > 0:  # a face with steps: one nearer the surface's last point may lie hidden between two beams
+            along += (share * mean) ** 2
+    along += limits[FLOOR] ** 2
+    if on_face < 2 or stray > 0:
+        along += limits[EDGE_FLOOR] ** 2
     x, y = line[MX] - line[NY] * s, line[MY] + line[NX] * s
     off = line[VAR_OFFSET] + s * s * line[VAR_SLOPE] + limits[FLOOR] ** 2
     nx, ny, ax, ay = line[NX], line[NY], -line[NY], line[NX]
@@ -245,8 +251,6 @@ def walls_first(
             continue
         if first or second:
             _loosen(row, lines[one if first else two])
-        if row[7] != 0.0:  # where a surface seems to end lasts, too
-            row[2:5] *= lasting
         count += 1
     return count
 

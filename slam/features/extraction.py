@@ -41,8 +41,10 @@ class FeatureConfig(Config):
     edge_length_m: Gap = 0.35  # of a surface whose visible end is taken for a corner
     edge_points: Count = 8  # … and the points on it: fewer would let a piece of a round column pass for straight
     edge_face_m: Gap = 0.25  # thickest wall of which the end face may show
-    # 1σ along the surface that frames, bevels and ledges may take off an end; chosen on real floors.
-    edge_sigma_m: Gap = 0.01
+    # 1σ of a visible end along the surface, as a share of the beams' spacing there. A uniform error has 0.29, but
+    # it lasts while beams and surface move alike.
+    edge_sigma: Positive = 0.6
+    edge_floor_m: Gap = 0.01  # … and what frames, bevels and ledges take off an end; chosen on real floors
     edge_jump_m: Gap = 0.15  # how far beyond the surface the next beam must go
     edge_spacing_m: Gap = 0.2  # farthest apart that two beams may meet the surface there
     # 1σ of a corner along each axis that the model of straight walls leaves out; like those of walls below, chosen
@@ -53,8 +55,7 @@ class FeatureConfig(Config):
     # Through a door the walls beyond are seen by a few beams, and nothing else tells as much.
     wall_points: Count = 5
     # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
-    # jamb; so does what is not seen of where a surface ends. As noise of each it counts for so much more, and adds
-    # up to no less.
+    # jamb. As noise of each it counts for so much more, and adds up to no less.
     wall_lasting_scans: Annotated[float, Within("[1, 1e6]")] = 4.0
     # Of a wall's curvature (slam.landmarks.curved_walls): the probability that it has one, 1σ of it where it has,
     # and the share by which it changes along the wall. Chosen in caves of the training seeds 100-115.
@@ -86,7 +87,7 @@ class FeatureExtractor:
         self._limits = np.array([
             c.range_sigma_m, c.split_sigmas, c.split_floor_m, c.min_points, c.min_length_m,
             math.sin(math.radians(c.min_angle_deg)), c.max_gap_m, c.sigma_floor_m, c.edge_length_m, c.edge_jump_m,
-            c.edge_spacing_m, c.edge_points, c.edge_face_m, c.edge_sigma_m,
+            c.edge_spacing_m, c.edge_points, c.edge_face_m, c.edge_sigma, c.edge_floor_m,
         ])  # fmt: skip
 
     def extract(self, scan: Scan) -> NDArray[np.float64]:

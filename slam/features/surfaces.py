@@ -20,8 +20,8 @@ MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost
 # The config as the kernels take it.
 (
     SIGMA, SPLIT_SIGMAS, SPLIT_FLOOR, MIN_POINTS, MIN_LENGTH, SIN_MIN_ANGLE, MAX_GAP, FLOOR,
-    EDGE_LENGTH, EDGE_JUMP, EDGE_SPACING, EDGE_POINTS, EDGE_FACE, EDGE_SIGMA,
-) = range(14)  # fmt: skip
+    EDGE_LENGTH, EDGE_JUMP, EDGE_SPACING, EDGE_POINTS, EDGE_FACE, EDGE_SIGMA, EDGE_FLOOR,
+) = range(15)  # fmt: skip
 # A fitted line: its normal, away from the sensor, and distance; the points' weighted centroid; the variances of
 # offset (at the centroid) and slope, which are uncorrelated there; from where to where it reaches along (-ny, nx)
 # from the centroid; its points; its first and last beam; which of its ends make a corner with a neighbour (bits 0

@@ -145,7 +145,7 @@ def frame_of_a_door(depth: float) -> np.ndarray:
 def ends_of(frame: np.ndarray, *, from_x: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     """Errors along the wall [m], positive where it seems too long, and normalised ones, of ends near (3, 3)."""
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor(FeatureConfig(edge_sigma_m=0.0))
+    extractor = FeatureExtractor(FeatureConfig(edge_sigma=0.29, edge_floor_m=0.0))
     along, normalised = [], []
     for _ in range(400):
         pose = np.array([rng.uniform(*from_x), rng.uniform(1.0, 2.5), rng.uniform(-3, 3)])
@@ -209,7 +209,7 @@ def ends_of_a_wall(
     """Errors (range, bearing) and NEES of the ends of a wall, seen from its south."""
     wall = np.array([[2.0, 3.0], [4.0, 3.0], [4.0, 3.0 + thick], [2.0, 3.0 + thick]])
     rng = np.random.default_rng(0)
-    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma, edge_sigma_m=0.0))
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma, edge_sigma=0.29, edge_floor_m=0.0))
     errors, nees = [], []
     for _ in range(200):
         pose = np.array([rng.uniform(*from_x), rng.uniform(0.5, 2.0), rng.uniform(-3, 3)])
