@@ -40,6 +40,7 @@ from slam.types import CONCAVE, CONVEX, LINE, Array
 
 _LOOSE_M = 0.02
 _CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
+_MOST_ON_FACE = 40  # points
 _SAME = 2.0  # σ along the surface by which a point may be off an end face's others
 
 
@@ -132,68 +133,18 @@ def edge(
     """
     if line[T1] - line[T0] < limits[EDGE_LENGTH] or line[POINTS] < limits[EDGE_POINTS]:
         return 0
-    n = ranges.shape[0]
     step = 1 if side == 1 else -1
-    index = int(line[LAST]) if side == 1 else int(line[FIRST])
-    full = n * increment > 2.0 * math.pi - 1.5 * increment
-    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
-    # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
-    end = _meets(line, rays[index])
-    t = missed = slide = 0.0
-    faces = on_face = stray = 0
-    weight = mean = 0.0  # of the face's points that are clear of the line, beyond the surface's last
-    while True:
-        index += step
-        if index < 0 or index >= n:
-            if not full:
-                return 0
-            index %= n
-        reach = ranges[index]
-        if math.isnan(reach):
-            continue
-        across = line[NX] * rays[index, 0] + line[NY] * rays[index, 1]
-        if across < 0.05:
-            return 0
-        missed = line[R] / across  # range at which the beam would meet the line
-        if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
-            return 0
-        px, py = reach * rays[index, 0], reach * rays[index, 1]
-        beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
-        depth = line[NX] * px + line[NY] * py - line[R]
-        slide = (-line[NY] * rays[index, 0] + line[NX] * rays[index, 1]) * step  # < 0: from beyond the end
-        farther = beyond > 3.0 * limits[SIGMA] * max(-slide, 0.0)  # than the last, so not of an end face there
-        if farther and depth < near:
-            end = _meets(line, rays[index]) if slide >= 0.0 else end + step * beyond
-            faces = on_face = 0  # the surface goes on: noise has split it
-            continue
-        if faces == 0:
-            if farther and depth < 2.0 * near:
-                return 0  # it bends away
-            t, stray, weight, mean = _meets(line, rays[index]), 0, 0.0, 0.0
-        if reach > missed + limits[EDGE_JUMP]:
-            if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
-                break  # past the end face, or there is none to see
-        elif beyond > limits[EDGE_FACE]:
-            return 0  # the surface goes on, a little off the line
-        faces += 1
-        if faces > 40:
-            return 0
-        if stray < 2 and slide < 0.0 and depth > _CLEAR * limits[SIGMA]:
-            w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
-            off = beyond - mean
-            if on_face == 0 or off * off < _SAME**2 * (1.0 / w + 1.0 / weight):
-                on_face, weight, stray = on_face + 1, weight + w, 0
-                mean += w / weight * off
-            else:
-                stray += 1
+    found, end, t, beyond_it, on_face, stray, weight, mean = _past_the_end(
+        line, step, ranges, rays, increment, range_max, limits
+    )
     spacing = abs(t - end)
-    if spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
+    if not found or spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
     share = limits[EDGE_SIGMA]
     if on_face == 0:
         s = 0.5 * (t + end)
         along = (share * spacing) ** 2
-        if slide < 0.0:  # a face's first points pass for the surface's
+        if beyond_it:  # a face's first points pass for the surface's
             along += 4.0 * limits[SIGMA] ** 2
     elif on_face == 1:
         s = end + step * min(0.5 * mean, mean)
@@ -215,6 +166,71 @@ def edge(
         CONVEX, direction, step, corner,
     )  # fmt: skip
     return 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _past_the_end(
+    line: Array, step: int, ranges: Array, rays: Array, increment: float, range_max: float, limits: Array
+) -> tuple[bool, float, float, bool, int, int, float, float]:
+    """Go on, beam by beam, from a surface's last one until one passes its end.
+
+    Returns whether it ends there; where the surface's last point and the first beam past it meet the line, along
+    it; whether the robot is beyond the end; of the points of the end face that are clear of the line how many
+    are as far along as each other, how many in a row are not, the weight of those and their mean, beyond the end.
+    """
+    n = ranges.shape[0]
+    index = int(line[LAST]) if step == 1 else int(line[FIRST])
+    full = n * increment > 2.0 * math.pi - 1.5 * increment
+    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
+    # The ends by their bearings: the noise of one range would move them along a wall seen at an angle.
+    end = _meets(line, rays[index])
+    t = slide = weight = mean = 0.0
+    faces = on_face = stray = 0
+    none = False, end, t, False, 0, 0, 0.0, 0.0
+    while faces <= _MOST_ON_FACE:
+        index += step
+        if index < 0 or index >= n:
+            if not full:
+                return none
+            index %= n
+        reach = ranges[index]
+        if math.isnan(reach):
+            continue
+        across = line[NX] * rays[index, 0] + line[NY] * rays[index, 1]
+        if across < 0.05:
+            return none
+        missed = line[R] / across  # range at which the beam would meet the line
+        if missed > range_max - 0.1 or reach < missed - limits[SPLIT_SIGMAS] * limits[SIGMA]:
+            return none
+        px, py = reach * rays[index, 0], reach * rays[index, 1]
+        beyond = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY]) - end) * step
+        depth = line[NX] * px + line[NY] * py - line[R]
+        slide = (-line[NY] * rays[index, 0] + line[NX] * rays[index, 1]) * step  # < 0: from beyond the end
+        farther = beyond > 3.0 * limits[SIGMA] * max(-slide, 0.0)  # than the last, so not of an end face there
+        if farther and depth < near:
+            end = _meets(line, rays[index]) if slide >= 0.0 else end + step * beyond
+            faces = on_face = 0  # the surface goes on: noise has split it
+            continue
+        if faces == 0:
+            if farther and depth < 2.0 * near:
+                return none  # it bends away
+            t, stray, weight, mean = _meets(line, rays[index]), 0, 0.0, 0.0
+        if reach > missed + limits[EDGE_JUMP]:
+            if not (depth < limits[EDGE_FACE] and -limits[EDGE_FACE] < beyond < limits[EDGE_FACE]):
+                # Past the end face, or there is none to see.
+                return True, end, t, slide < 0.0, on_face, stray, weight, mean
+        elif beyond > limits[EDGE_FACE]:
+            return none  # the surface goes on, a little off the line
+        faces += 1
+        if stray < 2 and slide < 0.0 and depth > _CLEAR * limits[SIGMA]:
+            w = 1.0 / ((limits[SIGMA] * slide) ** 2 + limits[FLOOR] ** 2)
+            off = beyond - mean
+            if on_face == 0 or off * off < _SAME**2 * (1.0 / w + 1.0 / weight):
+                on_face, weight, stray = on_face + 1, weight + w, 0
+                mean += w / weight * off
+            else:
+                stray += 1
+    return none
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
