@@ -236,7 +236,7 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
     mt = -ny * line[MX] + nx * line[MY]  # of the centroid, from the line's foot
     gate = (_OUTLIER * sigma) ** 2
     n = 0
-    sw = st = stt = se = ste = 0.0
+    sw = st = stt = sttt = stttt = se = ste = stte = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
         d = nx * x + ny * y
@@ -247,16 +247,22 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
         if d <= 0.5 * r or e * e * weight > gate:
             continue
         n += 1
+        wt, we = weight * t, weight * e
+        wtt = wt * t
         sw += weight
-        st += weight * t
-        stt += weight * t * t
-        se += weight * e
-        ste += weight * t * e
+        st += wt
+        stt += wtt
+        sttt += wtt * t
+        stttt += wtt * t * t
+        se += we
+        ste += wt * e
+        stte += wtt * e
     if n < 3:
         return n
     mean = st / sw
     spread = stt - mean * st
-    slope = (ste - mean * se) / spread
+    ste -= mean * se  # about the centroid from here on
+    slope = ste / spread
     # Turned by the slope about the weighted centroid, where offset and slope are uncorrelated.
     mt += mean
     offset = r + se / sw
@@ -266,6 +272,12 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
     line[NX], line[NY], line[R], line[MX], line[MY] = nx, ny, nx * mx + ny * my, mx, my
     line[VAR_OFFSET] = sigma * sigma / sw
     line[VAR_SLOPE] = sigma * sigma / spread
+    # What a line leaves of t², q = t² − spread / sw − lean t, is what a curved surface's points depart along.
+    lean = (sttt - mean * (3.0 * stt - 2.0 * mean * st)) / spread
+    left = stttt - mean * (4.0 * sttt - mean * (6.0 * stt - 3.0 * mean * st)) - spread * (spread / sw + lean * lean)
+    bulge = stte - mean * (2.0 * ste + mean * se) - spread / sw * se - lean * ste
+    left = max(left, 1e-9 * stttt)  # three points in two places leave nothing
+    line[CURVATURE], line[VAR_CURVATURE] = 2.0 * bulge / left, 4.0 * sigma * sigma / left
     return n
 
 
@@ -304,7 +316,7 @@ def _is_straight(xy: Array, a: int, b: int, limits: Array, line: Array) -> bool:
     """Tell whether the points ``a`` … ``b`` lie on their line, neither off it nor bulging away from it."""
     n, sigma = b - a + 1, limits[SIGMA]
     nx, ny, r, mx, my = line[NX], line[NY], line[R], line[MX], line[MY]
-    spread = residual = off = curve = third = fourth = largest = 0.0
+    spread = residual = off = curve = fourth = largest = 0.0
     for i in range(a, b + 1):
         x, y = xy[i, 0], xy[i, 1]
         t = -ny * (x - mx) + nx * (y - my)
@@ -313,18 +325,11 @@ def _is_straight(xy: Array, a: int, b: int, limits: Array, line: Array) -> bool:
         residual += e * e
         off += e
         curve += tt * e
-        third += tt * t
         fourth += tt * tt
         largest = max(largest, tt)
     if spread <= 0.0 or residual > n * (max(2.0 * sigma, 0.5 * limits[SPLIT_FLOOR])) ** 2:
         return False
     mean = spread / n
-    # Of the part of t² that a line leaves: where points lie closer at one end it leans along with t.
-    lone = fourth - mean * spread - third * third / spread
-    if lone <= 0.0:
-        return False
-    square = r * r / (mx * mx + my * my)  # of the cosine of incidence, by which noise acts across
-    line[CURVATURE], line[VAR_CURVATURE] = 2.0 * (curve - mean * off) / lone, 4.0 * sigma * sigma * square / lone
     return not _is_curved(curve - mean * off, fourth - mean * spread, largest, sigma)
 
 

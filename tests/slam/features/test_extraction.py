@@ -176,6 +176,26 @@ def test_a_wall_that_noise_has_split_ends_where_it_ends() -> None:
     assert np.quantile(np.abs(along), 0.98) < 0.03
 
 
+def test_door_jambs_do_not_bend_a_wall() -> None:
+    """Beams on the end faces of a wall's pieces are nearly in line with them; thousands of looks add up."""
+    rng = np.random.default_rng(1)
+    extractor = FeatureExtractor(FeatureConfig())
+    pieces = [np.array([[a, 3.0], [a + 3.9, 3.0], [a + 3.9, 3.15], [a, 3.15]]) for a in (0.0, 5.0, 10.0)]
+    measured = []
+    for _ in range(400):
+        pose = np.array([rng.uniform(1.0, 13.0), rng.uniform(1.5, 2.5), rng.uniform(-3, 3)])
+        extractor.extract(polygon_scan(pose, pieces, rng))
+        measured += [
+            (z[10], z[11])
+            for z in extractor.with_walls()
+            if z[5] == LINE and abs(math.remainder(z[1] + pose[2] - 0.5 * math.pi, math.tau)) < 0.1
+        ]
+    kappa, variance = np.array(measured).T
+    assert len(kappa) > 700
+    assert abs(np.sum(kappa / variance)) < 3.0 * math.sqrt(np.sum(1.0 / variance))
+    assert np.mean(kappa**2 / variance) == pytest.approx(1.0, abs=0.2)
+
+
 def test_a_surface_that_bends_away_has_no_end() -> None:
     """From its own side; of 400 looks some pass the horizon of the bend, and look beyond it like past an end."""
     angles = np.linspace(0.0, 0.5 * math.pi, 60)
