@@ -274,7 +274,8 @@ def _refine(xy: Array, a: int, b: int, sigma: float, line: Array) -> int:
     line[VAR_SLOPE] = sigma * sigma / spread
     # What a line leaves of t², q = t² − spread / sw − lean t, is what a curved surface's points depart along.
     lean = (sttt - mean * (3.0 * stt - 2.0 * mean * st)) / spread
-    left = stttt - mean * (4.0 * sttt - mean * (6.0 * stt - 3.0 * mean * st)) - spread * (spread / sw + lean * lean)
+    fourth = stttt - mean * (4.0 * sttt - mean * (6.0 * stt - 3.0 * mean * st))
+    left = fourth - spread * (spread / sw + lean * lean)
     bulge = stte - mean * (2.0 * ste + mean * se) - spread / sw * se - lean * ste
     left = max(left, 1e-9 * stttt)  # three points in two places leave nothing
     line[CURVATURE], line[VAR_CURVATURE] = 2.0 * bulge / left, 4.0 * sigma * sigma / left
