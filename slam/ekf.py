@@ -26,7 +26,6 @@ from slam.health.relocalisation import Place
 from slam.landmark_backend import observation_rows
 from slam.landmarks.association import IGNORED, UNMATCHED, refuse_unlikely
 from slam.landmarks.book import DIRECTION, EDGE, FROM, KIND, TO, count_recent, match_and_recall
-from slam.landmarks.contradicted import DOUBT, doubt
 from slam.landmarks.curved_walls import along_wall, curvature_model, first_bend, forget, straighten
 from slam.landmarks.innovations import Innovation, innovations
 from slam.landmarks.joint_compatibility import JOINT_LIMITS, MAX_OBSERVATIONS, joint_compatibility
@@ -34,6 +33,7 @@ from slam.landmarks.loop_closing import agreeing, put_off
 from slam.landmarks.rescue import match_missed
 from slam.landmarks.right_angles import find_square
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
+from slam.landmarks.wall_evidence import take_back, take_evidence
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
 from slam.types import LINE, Array, Observations, Odometry, Scan
@@ -72,6 +72,7 @@ class EkfSlam(HeldByMap):
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
         self._places = Places(self.config.lidar_offset_m, self.config.features.range_sigma_m)
+        self._lasting = np.zeros(2)  # see slam.landmarks.wall_evidence
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
         self.nis, self.nis_dof = 0.0, 0
 
@@ -315,14 +316,15 @@ class EkfSlam(HeldByMap):
         if lines:
             given = z.copy()
             straighten(self._x, offset, z, match, marks, self._curved)
-            doubts = doubt(self._x, self._p, offset, z, match, marks)
+            before = take_evidence(self._x, self._p, offset, z, match, marks, self._book.now, self._lasting)
         if self.witness is not None:
             self.witness(innovations(self._x, self._p, offset, z, match, self._book.ids))
         self._correct(z, match, limits)
         stands = self.nis_dof > 0 or self.nis == 0.0
         if lines and not stands:
-            z[:], marks[:, DOUBT] = given, doubts
+            z[:] = given
             forget(z, match, marks)
+            take_back(before, marks, self._lasting)
         return stands
 
     def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:

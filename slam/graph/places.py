@@ -108,7 +108,7 @@ class Places:
         """Return what a scan says of the nearest place, and how far that is away [m]: infinity without one.
 
         What it says is observation rows ``(2, 12)`` of the place's points, and which landmarks they are; None
-        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 13)`` the landmarks' marks.
+        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 14)`` the landmarks' marks.
         """
         match, away = self._near(x, marks)
         if away >= _NEAR_M:

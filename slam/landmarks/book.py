@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
-from slam.landmarks.contradicted import DOUBT
+from slam.landmarks.wall_evidence import DOUBT
 from slam.settings import Config, Count, Gap, NotNegative
 from slam.types import LINE, VIRTUAL, Array, Scan
 
@@ -27,7 +27,7 @@ __all__ = [
 KIND, DIRECTION, EDGE, FROM, TO = 5, 6, 7, 8, 9  # columns of an observation row, see FeatureExtractor.extract
 FROM_MARK = 6  # column of ``marks``: where a wall begins, a point's end of a surface, a virtual point's place
 
-MARKS = 13  # columns of ``marks``, one row a landmark; the last five are of walls: see curved_walls and on
+MARKS = 14  # columns of ``marks``, one row a landmark; the last six are of walls: see curved_walls and on
 _KIND, _DIRECTION, _SEEN, _MISSED, _UNSEEN, LAST_SEEN, _FROM, _TO = range(8)
 RECENT = 3  # updates, of which a landmark was in one: it is missed where it is not seen again
 _SAME_TURN = 0.6  # [rad] between two sightings of one landmark
@@ -51,7 +51,7 @@ class LandmarkPolicy(Config):
     drop_after: Count = 15  # contradictions more than sightings
     overlook_after: Count = 25  # dropped when overlooked, in plain view, more often than this …
     overlook_ratio: NotNegative = 5.0  # … and this many times the sightings
-    contradicted_after: NotNegative = 14.0  # of a wall: see slam.landmarks.contradicted
+    contradicted_after: NotNegative = 14.0  # of a wall: see slam.landmarks.wall_evidence
     clear_margin_m: Gap = 0.3  # a beam that goes this far beyond a landmark contradicts it
 
 
@@ -77,12 +77,13 @@ class LandmarkBook:
 
     @property
     def marks(self) -> Array:
-        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 13)``.
+        """Kind, direction, sightings, contradictions, times overlooked, last sighting, from, to … ``(n, 14)``.
 
         A wall goes from one to the other [m], along it from its foot; of a point, "from" says which end of a
         surface it is, as the observation does. Then, of a wall's curvature, the information of its measurements,
         the same times what they measured, and where along the wall it is tangent to its line; how far its
-        sightings contradict it; and how it was held against the building's direction. A view.
+        sightings contradict it; how it was held against the building's direction; and the mean of its last
+        innovations of direction. A view.
         """
         return self._marks[: self.count]
 
@@ -123,7 +124,8 @@ class LandmarkBook:
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
         seen = -math.inf if kind == VIRTUAL else self._now
-        self._marks[self.count] = (kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen, *extent, *bend, 0.0, 0.0)
+        first = kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen
+        self._marks[self.count] = (*first, *extent, *bend, 0.0, 0.0, 0.0)
         self.row_of_id[new_id] = self.count
         self._next_id = max(self._next_id, new_id + 1)
         self.count += 1
@@ -138,7 +140,7 @@ class LandmarkBook:
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
     def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
-        """Have these landmarks ``(n,)``, with these marks ``(n, 13)``, instead of those it has."""
+        """Have these landmarks ``(n,)``, with these marks ``(n, 14)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
         self._make_room(count)

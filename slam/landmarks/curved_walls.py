@@ -88,7 +88,7 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
     z, match
         Observation rows ``(m, 12)`` and their landmarks ``(m,)``, negative for none.
     marks
-        Of all landmarks ``(n, 13)``: :class:`slam.landmarks.book.LandmarkBook`.
+        Of all landmarks ``(n, 14)``: :class:`slam.landmarks.book.LandmarkBook`.
     model
         :func:`curvature_model`.
     """

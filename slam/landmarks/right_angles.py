@@ -56,7 +56,7 @@ def find_square(
     x, p
         The state and the upper triangle of its covariance.
     marks
-        Of all landmarks ``(n, 13)``: :class:`slam.landmarks.book.LandmarkBook`.
+        Of all landmarks ``(n, 14)``: :class:`slam.landmarks.book.LandmarkBook`.
     now
         The number of updates reviewed.
     sigma

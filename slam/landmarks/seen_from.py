@@ -31,7 +31,7 @@ def seen_from(
     Parameters
     ----------
     x, marks
-        The state ``(3 + 2n,)``, and the landmarks' marks ``(n, 13)``: :class:`slam.landmarks.book.LandmarkBook`.
+        The state ``(3 + 2n,)``, and the landmarks' marks ``(n, 14)``: :class:`slam.landmarks.book.LandmarkBook`.
     offset
         The sensor's, ahead of the robot's centre [m].
     pose, cov
