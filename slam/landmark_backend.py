@@ -77,7 +77,7 @@ class LandmarkBackend(Backend):
 
     @property
     def _marks(self) -> Array:
-        """Marks ``(n, 13)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
+        """Marks ``(n, 14)`` of every landmark, see :class:`slam.landmarks.book.LandmarkBook`."""
         return self._book.marks
 
     @property

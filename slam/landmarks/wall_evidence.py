@@ -49,7 +49,8 @@ _TIMES = 25.0
 def lasting_factor(products: Array) -> float:
     """Return by how much walls' noise is larger than that of single scans; ``products``: their sum and number."""
     count = max(products[1], 1.0)
-    return 1.0 + _TIMES * max(products[0] / count - _SURE * _SCATTER / math.sqrt(count), 0.0)
+    lasts = products[0] / count - _SURE * _SCATTER / math.sqrt(count)
+    return float(1.0 + _TIMES * max(lasts, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
