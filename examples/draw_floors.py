@@ -236,22 +236,20 @@ def furnished(rng: np.random.Generator) -> Floor:
     return floor
 
 
-CURVED = {"ring": ring, "winding": winding}
-STRAIGHT: dict[str, Callable[[np.random.Generator], Floor]] = {
-    "atrium": atrium, "honeycomb": honeycomb, "warehouse": warehouse, "corridor": corridor, "garage": garage,
-    "any_angle": any_angle, "furnished": furnished,
+FLOORS: dict[str, Callable[[np.random.Generator], Floor]] = {
+    "ring": ring, "winding": winding, "atrium": atrium, "honeycomb": honeycomb, "warehouse": warehouse,
+    "corridor": corridor, "garage": garage, "any_angle": any_angle, "furnished": furnished,
 }  # fmt: skip
+CLOSED = "corridor", "garage", "any_angle", "furnished"
 
 
 def main(folder: Path) -> None:
-    """Write the plans, those with curved walls into a folder of their own."""
+    """Write the plans."""
+    folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(8)
-    for kind, floors in (("curved", CURVED), ("straight", STRAIGHT)):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-        for name, draw in floors.items():
-            closed = name in ("corridor", "garage", "any_angle", "furnished")
-            draw(rng).save(folder / kind / name, closed=closed)
-    print(f"{len(CURVED) + len(STRAIGHT)} plans in {folder}/curved and {folder}/straight")
+    for name, draw in FLOORS.items():
+        draw(rng).save(folder / name, closed=name in CLOSED)
+    print(f"{len(FLOORS)} plans in {folder}")
 
 
 if __name__ == "__main__":
