@@ -72,7 +72,7 @@ def take_evidence(
     """
     before = np.empty((marks.shape[0] + 1, 2))
     before[:-1, 0], before[:-1, 1], before[-1] = marks[:, DOUBT], marks[:, _MEAN], products
-    h, factor = np.empty((2, 5)), lasting_factor(products)
+    h, factor, counted = np.empty((2, 5)), lasting_factor(products), np.zeros(marks.shape[0], np.bool_)
     for k in range(z.shape[0]):
         if match[k] < 0 or z[k, 5] != LINE:
             continue
@@ -82,6 +82,10 @@ def take_evidence(
         off, turned = row[0] - rho, wrap_scalar(row[1] - bearing)
         nis = (s11 * off * off - 2.0 * s01 * off * turned + s00 * turned * turned) / (s00 * s11 - s01 * s01)
         mark[DOUBT] = max(mark[DOUBT] + min(0.5 * nis, _MOST) - _ALLOWED, 0.0)
+        row[2:5] *= factor
+        if counted[match[k]]:
+            continue  # another piece of the same wall, with the same error of the pose
+        counted[match[k]] = True
         innovation = min(max(turned / math.sqrt(s11), -_CLIP), _CLIP)
         if now - mark[_LAST_SEEN] > _GAP:
             mark[_MEAN] = 0.0
@@ -89,7 +93,6 @@ def take_evidence(
             products[0] += innovation * mark[_MEAN]
             products[1] += 1.0
         mark[_MEAN] += _SHARE * (innovation - mark[_MEAN])
-        row[2:5] *= factor
     return before
 
 

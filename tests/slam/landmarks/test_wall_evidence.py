@@ -57,6 +57,23 @@ def test_white_noise_is_left_as_it_is() -> None:
     assert sum(factor_after(seed, 0.0, 600) > 1.0 for seed in range(20)) <= 1
 
 
+def test_what_pieces_of_a_wall_share_in_one_scan_does_not_last() -> None:
+    """Three pieces of each wall, whose errors are mostly that of the pose: as white as one."""
+
+    def factor(seed: int) -> float:
+        rng, marks, products = np.random.default_rng(seed), np.zeros((8, MARKS)), np.zeros(2)
+        x, p, match = np.concatenate([np.zeros(3), *[WALL] * 8]), np.zeros((19, 19)), np.repeat(np.arange(8), 3)
+        for now in range(300):
+            z = np.vstack([sighting(rng, 0.0) for _ in match])
+            pose = SIGMAS[1] * np.repeat(rng.standard_normal(8), 3)
+            z[:, 1] = WALL[0] + np.sqrt(0.3) * (z[:, 1] - WALL[0]) + np.sqrt(0.7) * pose
+            take_evidence(x, p, 0.0, z, match, marks, now, products)
+            marks[:, 5] = now
+        return float(lasting_factor(products))
+
+    assert sum(factor(seed) > 1.0 for seed in range(20)) <= 1
+
+
 @pytest.mark.parametrize("share", [0.05, 0.15, 0.3])
 def test_errors_that_last_count_as_often_as_they_do(share: float) -> None:
     """The mean of 16 scans with a share s of their variance in common is 1 + 15 s times as uncertain."""
