@@ -76,13 +76,8 @@ class GroundTruth:
     def _view_from_everywhere(self, robot: RobotConfig, lidar: LidarConfig) -> OccupancyGrid:
         """Map the plan without noise from all over the places that the robot's body can reach."""
         plan = self.plan
-        reachable = (plan.clearance() >= robot.inscribed_radius_m).astype(np.uint8)
-        _, labels = cv2.connectedComponents(reachable, connectivity=4)
-        col = int((self.start[0] - plan.origin[0]) / plan.resolution)
-        row = int((self.start[1] - plan.origin[1]) / plan.resolution)
-        label = labels[min(max(row, 0), labels.shape[0] - 1), min(max(col, 0), labels.shape[1] - 1)]
+        here = plan.reachable(robot.inscribed_radius_m, self.start)
         stride = max(round(_VIEW_SPACING_M / plan.resolution), 1)
-        here = (labels == label) if label > 0 else (labels < 0)
         cells = np.argwhere(here[stride // 2 :: stride, stride // 2 :: stride]) * stride + stride // 2
         views = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
         views = np.vstack([views, self.start[:2]])

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -159,6 +160,20 @@ class FloorPlan:
         See :func:`clearance_of`.
         """
         return clearance_of(self.free, self.resolution)
+
+    def reachable(self, clearance_m: float, start: Array) -> NDArray[np.bool_]:
+        """Return which cells ``(rows, cols)`` have a clearance [m] and hang together with a start ``(≥ 2,)`` [m].
+
+        The start may stand nearer to a surface than that: what counts is the cell with that clearance that is
+        nearest to it. Where no cell has it, none is reachable.
+        """
+        roomy: NDArray[np.bool_] = self.clearance() >= clearance_m
+        rows, cols = roomy.shape
+        dx = (np.arange(cols) + 0.5) * self.resolution + self.origin[0] - start[0]
+        dy = (np.arange(rows) + 0.5) * self.resolution + self.origin[1] - start[1]
+        nearest = int(np.argmin(np.where(roomy, dx**2 + dy[:, None] ** 2, np.inf)))
+        _, labels = cv2.connectedComponents(roomy.astype(np.uint8), connectivity=4)
+        return np.asarray(roomy & (labels == labels.flat[nearest]), np.bool_)
 
     def distance_to_surfaces(self, points: Array) -> Array:
         """Return the exact distance [m] ``(n,)`` from points ``(n, 2)`` to the nearest wall or obstacle."""

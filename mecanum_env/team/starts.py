@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
 from mecanum_env.config import RobotConfig
@@ -50,12 +49,5 @@ def start_poses(
 
 def _reachable(plan: FloorPlan, clearance_m: float) -> Array:
     """Return the middles ``(n, 2)`` of the cells with that clearance that hang together with the start's room."""
-    free = (plan.clearance() >= clearance_m).astype(np.uint8)
-    _, labels = cv2.connectedComponents(free, connectivity=4)
-    cells = np.argwhere(free)
-    middles = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
-    if not len(cells):
-        return np.zeros((0, 2))
-    nearest = cells[np.argmin(np.hypot(*(middles - np.array(plan.start[:2])).T))]
-    there = labels[tuple(cells.T)] == labels[tuple(nearest)]
-    return np.asarray(middles[there], np.float64)
+    cells = np.argwhere(plan.reachable(clearance_m, np.array(plan.start)))
+    return np.asarray((cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin), np.float64)

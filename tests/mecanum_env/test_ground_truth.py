@@ -8,6 +8,7 @@ from mecanum_env import rooms
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.episode import score_map
 from mecanum_env.ground_truth import Coverage, GroundTruth, on_lattice
+from mecanum_env.rooms.files.importers import from_raster
 from slam.geometry import transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -37,6 +38,19 @@ def test_mappable_cells_are_free_and_walls_are_near_surfaces() -> None:
     walls = in_world(truth.walls)
     assert np.max(truth.plan.distance_to_surfaces(walls)) < 0.06
     assert np.max(truth.plan.distance_to_surfaces(transform_points(truth.start, truth.corners))) < 1e-6
+
+
+def test_a_start_beside_a_wall_reaches_what_one_in_the_open_does() -> None:
+    free = np.zeros((120, 200), bool)
+    free[10:110, 10:100] = free[10:110, 102:190] = free[50:70, 100:102] = True  # two rooms, a door
+    plan = from_raster(free, name="two rooms", resolution=0.05, start=(2.5, 2.5, 0.0))
+    robot = RobotConfig()
+    cells = [
+        GroundTruth(plan, np.array(start), robot=robot, lidar=LidarConfig(), resolution=0.05).mappable_cells
+        for start in ((2.5, 2.5, 0.0), (2.5, 0.5 + robot.inscribed_radius_m - 0.02, 0.0))
+    ]
+    assert cells[1] == pytest.approx(cells[0], rel=0.005)
+    assert cells[0] * 0.05**2 > 0.95 * plan.area_m2
 
 
 def test_coverage_follows_changes_and_starts_over_after_a_redraw() -> None:
