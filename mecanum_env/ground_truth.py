@@ -18,7 +18,7 @@ from slam.types import Array, Scan
 
 __all__ = ["Coverage", "GroundTruth"]
 
-_VIEW_SPACING_M = 0.8  # between the places that visibility is computed from: a quarter of it finds 0.5 % more
+_VIEW_SPACING_M = 0.8  # side of the squares in each of which visibility is computed: a quarter finds 0.3 % more
 _VIEW_BEAMS = 360
 _MOST_CELLS = 30_000_000  # of the rasters: some 70 bytes each while they are made
 
@@ -77,8 +77,7 @@ class GroundTruth:
         """Map the plan without noise from all over the places that the robot's body can reach."""
         plan = self.plan
         here = plan.reachable(robot.inscribed_radius_m, self.start)
-        stride = max(round(_VIEW_SPACING_M / plan.resolution), 1)
-        cells = np.argwhere(here[stride // 2 :: stride, stride // 2 :: stride]) * stride + stride // 2
+        cells = _one_a_block(here, max(round(_VIEW_SPACING_M / plan.resolution), 1))
         views = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
         views = np.vstack([views, self.start[:2]])
         grid = OccupancyGrid(self.resolution)
@@ -152,6 +151,22 @@ def on_lattice(
     if r0 < r1 and c0 < c1:
         out[r0:r1, c0:c1] = raster[r0 - r : r1 - r, c0 - c : c1 - c]
     return out
+
+
+def _one_a_block(mask: NDArray[np.bool_], side: int) -> NDArray[np.int64]:
+    """Return for each block of ``side`` × ``side`` cells that has any the one nearest its middle: rows, columns.
+
+    Of cells at the same distance it is the first by row, then by column.
+    """
+    rows, cols = (math.ceil(size / side) for size in mask.shape)
+    padded = np.zeros((rows * side, cols * side), np.bool_)
+    padded[: mask.shape[0], : mask.shape[1]] = mask
+    r, c = np.divmod(np.arange(side * side), side)
+    order = np.argsort((r - side // 2) ** 2 + (c - side // 2) ** 2, kind="stable")
+    inside = padded.reshape(rows, side, cols, side).swapaxes(1, 2).reshape(rows, cols, -1)[..., order]
+    blocks = np.argwhere(inside.any(axis=2))
+    nearest = order[inside.argmax(axis=2)[tuple(blocks.T)]]
+    return np.asarray(blocks * side + np.stack([r[nearest], c[nearest]], axis=1), np.int64)
 
 
 def _check_size(plan: FloorPlan, resolution: float) -> None:

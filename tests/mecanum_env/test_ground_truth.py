@@ -53,6 +53,17 @@ def test_a_start_beside_a_wall_reaches_what_one_in_the_open_does() -> None:
     assert cells[0] * 0.05**2 > 0.95 * plan.area_m2
 
 
+@pytest.mark.parametrize("offset", [0, 3, 6, 9, 12])
+def test_narrow_passages_are_mappable_wherever_they_lie(offset: int) -> None:
+    free = np.zeros((300, 300), bool)
+    free[140:160, 10:290] = True  # a corridor of 1 m, and across it aisles of 0.5 m, which a youbot just fits in
+    for left in range(20 + offset, 280, 55):
+        free[20:280, left : left + 10] = True
+    plan = from_raster(free, name="aisles", resolution=0.05, start=(7.0, 7.5, 0.0))
+    truth = GroundTruth(plan, np.array(plan.start), robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+    assert truth.mappable_cells * 0.05**2 > 0.92 * plan.area_m2  # but for cells that a wall runs along
+
+
 def test_coverage_follows_changes_and_starts_over_after_a_redraw() -> None:
     truth = truth_of("rectangular", 1)
     rows, cols = truth.mappable.shape
