@@ -26,7 +26,9 @@ __all__ = [
 ]  # fmt: skip
 
 _SCAN_WITHIN_M = 2.0
-_POSES = 8  # of a predicted motion, the present one included
+_POSES = 8  # of a predicted motion at least, the present one included
+_APART_M = 0.1  # between two of them at most: farther, the rim steps over a post of one cell and the gaps to it
+_MOST_POSES = 1000  # a body that takes minutes to stop turning is not worth more
 _SPEEDS = (1.0, 0.7, 0.45, 0.25, 0.1)  # shares of the wanted twist that are tried
 _SIDESTEPS = (0.6, -0.6, 1.2, -1.2)  # [rad] off the wanted direction, tried after that
 _SIDESTEP_M_S = 0.12
@@ -200,7 +202,7 @@ def body_gaps(
     """
     way = _braking_way(twist, guard)
     map_now = map_ahead = scan_now = scan_ahead = np.inf
-    for k in range(_POSES):
+    for k in range(len(way)):
         map_gap, scan_gap = _gaps_at(way[k, 0], way[k, 1], way[k, 2], pose, near, hits, guard)
         if k == 0:
             map_now, scan_now = map_gap, scan_gap
@@ -249,12 +251,19 @@ def _held_s(t: float, twist: Array, guard: Guard) -> float:
 
 @njit(cache=True, nogil=True)
 def _braking_way(twist: Array, guard: Guard) -> Array:
-    """Return poses on the way to a stand ``(poses, 3)``, even in time, in the body frame now: the first is 0."""
+    """Return poses on the way to a stand ``(poses, 3)``, even in time, in the body frame now: the first is 0.
+
+    There are so many that what the body passes over lies in it, or within the gaps of it, at one of them.
+    """
     total = guard.lag_s + _braking_s(twist, guard)
-    way = np.zeros((_POSES, 3))
+    half_l, half_w = guard.half
+    corner_m_s = math.hypot(twist[0], twist[1]) + abs(twist[2]) * math.hypot(half_l, half_w)
+    pieces = math.ceil(corner_m_s * total / min(half_l, half_w, _APART_M))
+    poses = min(max(_POSES, pieces + 1), _MOST_POSES)
+    way = np.zeros((poses, 3))
     last = 0.0
-    for k in range(1, _POSES):
-        held = _held_s(total * k / (_POSES - 1), twist, guard)
+    for k in range(1, poses):
+        held = _held_s(total * k / (poses - 1), twist, guard)
         dt, last = held - last, held
         middle = way[k - 1, 2] + 0.5 * dt * twist[2]
         way[k, 0] = way[k - 1, 0] + dt * (math.cos(middle) * twist[0] - math.sin(middle) * twist[1])
@@ -268,7 +277,7 @@ def _keeps_side(twist: Array, sides: Array, guard: Guard) -> bool:
     """Tell whether the body, braking from a twist, crosses no line; or, where it has, goes no farther."""
     way = _braking_way(twist, guard)
     now = np.empty(len(sides))
-    for k in range(_POSES):
+    for k in range(len(way)):
         x, y = way[k, 0], way[k, 1]
         c, s = math.cos(way[k, 2]), math.sin(way[k, 2])
         for i in range(len(sides)):

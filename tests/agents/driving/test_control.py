@@ -176,6 +176,28 @@ def test_gaps_against_brute_force():
     assert scan_ahead == pytest.approx(min(0.31 - travelled, math.hypot(0.21 - travelled, 0.21)), abs=1e-6)
 
 
+SMALL = RobotConfig(
+    length_m=0.2, width_m=0.16, mass_kg=2.5, wheel_radius_m=0.03, wheelbase_m=0.13, track_m=0.1, max_speed_m_s=2.0,
+    motor_torque_nm=1.0,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("robot", "speed"), [(SMALL, 2.0), (RobotConfig(max_speed_m_s=2.0), 1.5)])
+def test_a_fast_body_steps_over_nothing(robot, speed):
+    """Neither a wall that the scan shows nor a post of one cell on the map, wherever on the way it stands."""
+    guard = PathFollower(ControlConfig(), robot=robot, lidar=LIDAR, step_s=0.1)._guard
+    free, pose = np.zeros((80, 80)), np.array([1.0, 2.0, 0.0])
+    nothing, twist = np.zeros((0, 2)), np.array([speed, 0.0, 0.0])
+    front = 0.5 * robot.length_m
+    stopped = front + speed * guard.lag_s + speed**2 / (2.0 * guard.braking_m_s2)
+    for ahead in np.arange(front + 0.05, stopped, 0.05):
+        wall = np.stack([np.full(200, ahead), np.linspace(-1.0, 1.0, 200)], axis=1)
+        assert body_gaps(twist, pose, local_map(belief_of(free, tuple(pose)), 2.0), wall, guard)[3] < 0.04
+        classes = room(4.0, 4.0)
+        fill(classes, 1.0 + ahead, 2.0, 1.05 + ahead, 2.05)
+        assert body_gaps(twist, pose, local_map(belief_of(classes, tuple(pose)), 2.0), nothing, guard)[1] < 0.04
+
+
 def test_scan_points_stand_in_the_body_frame():
     scan = np.ones(360, np.float32)
     scan[180], scan[270], scan[0] = 1.0 / 8.0, 0.5 / 8.0, 0.0
