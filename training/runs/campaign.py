@@ -22,9 +22,7 @@ from training.runs.provenance import project_digest, short_digest
 from training.runs.running import versions, write_json
 from training.runs.typed import parts_of
 
-__all__ = [
-    "Pool", "Workers", "backend_names", "installed_version", "keep_settings", "made_by", "run_all", "worker_pool",
-]  # fmt: skip
+__all__ = ["Pool", "Workers", "backend_names", "keep_settings", "made_by", "run_all", "worker_pool"]
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -66,11 +64,6 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
     return chosen
 
 
-def installed_version() -> str:
-    """Return this project's version, part of what a result depends on."""
-    return versions().get("mecanum-slam", "not installed")
-
-
 def made_by(*names: str | Path) -> dict[str, Any]:
     """Return what results depend on besides what is asked for: the code, and what files of these names hold.
 
@@ -78,7 +71,8 @@ def made_by(*names: str | Path) -> dict[str, Any]:
     image.
     """
     files = {str(name): _digest(Path(name)) for name in names if Path(name).is_file()}
-    return {"version": installed_version(), "code": project_digest(), **({"files": files} if files else {})}
+    version = versions().get("mecanum-slam", "not installed")
+    return {"version": version, "code": project_digest(), **({"files": files} if files else {})}
 
 
 def _digest(path: Path) -> str:

@@ -13,7 +13,7 @@ import typer
 from slam.formats import atomic_write
 from slam.settings import check_name
 from training.figures.tables import text_table
-from training.runs.campaign import installed_version, keep_settings
+from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Out, Ray, Seed, workers_of
 from training.runs.rows import resume
@@ -62,7 +62,7 @@ def study(
             check_name("part", name, PARTS)
     sizes = {"files": files, "steps": steps, "kills": kills, "places": places, "soak": soak}
     who = workers_of(workers, ray)
-    keep_settings(out, {"version": installed_version(), "seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
+    keep_settings(out, made_by() | {"seed": seed}, [PAGE, *(f"{name}.json" for name in PARTS)])
     found: dict[str, Summary] = {}
     for name in chosen:
         part = PARTS[name]

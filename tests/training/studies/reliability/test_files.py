@@ -133,6 +133,10 @@ def test_the_command_goes_on_and_writes_what_it_found(
     assert main(argv) == 0
     assert time.monotonic() - began < 5
     assert main(["study", "reliability", "--parts", "nothing", "--out", str(tmp_path)]) == 2
+    monkeypatch.setattr("training.runs.campaign.project_digest", lambda: "of other code")
+    capsys.readouterr()
+    assert main(argv) == 2
+    assert "choose another --out" in capsys.readouterr().err
 
 
 def test_every_part_has_an_option_of_its_name() -> None:
