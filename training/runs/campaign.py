@@ -68,7 +68,7 @@ def made_by(*names: str | Path) -> dict[str, Any]:
     """Return what results depend on besides what is asked for: the code, and what files of these names hold.
 
     Names of no file, such as those of agents and of generators of rooms, are the code's. A ROS map counts with its
-    image.
+    image, a policy with the JSON beside it that says how its driver is set.
     """
     files = {str(name): _digest(Path(name)) for name in names if Path(name).is_file()}
     version = versions().get("mecanum-slam", "not installed")
@@ -76,8 +76,12 @@ def made_by(*names: str | Path) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
+    files = [path]
     with bad_input():
-        files = [path, image_of(path)] if path.suffix.lower() in MAP_SUFFIXES else [path]
+        if path.suffix.lower() in MAP_SUFFIXES:
+            files.append(image_of(path))
+    if path.suffix == ".safetensors":
+        files.append(path.with_suffix(".json"))
     return short_digest(each.read_bytes() for each in files)
 
 

@@ -113,11 +113,18 @@ def test_the_command_goes_on_where_it_stopped(
     assert {path.name for path in out.iterdir()} == {*command.FILES, command.STORE, "settings.json"}
     # Rows of one policy, or plan, are none of another's of the same name.
     policy, elsewhere = tmp_path / "mine.safetensors", tmp_path / "elsewhere"
+    asked = [*given[:-1], str(elsewhere), "--seeds", "1", "--agent", str(policy)]
     for name in ("ppo-frontier", "ppo"):
         for suffix in (".safetensors", ".json"):
             shutil.copy(SHIPPED.with_name(f"{name}{suffix}"), policy.with_suffix(suffix))
-        code = main([*given[:-1], str(elsewhere), "--seeds", "1", "--agent", str(policy)])
-        assert code == (0 if name == "ppo-frontier" else 2)
+        assert main(asked) == (0 if name == "ppo-frontier" else 2)
+    assert "holds runs with files" in capsys.readouterr().err
+    # Nor are they of the same weights with a driver that is set otherwise.
+    about = json.loads(SHIPPED.with_suffix(".json").read_text("utf-8"))
+    about["driver"]["control"]["speed_share"] = 0.5
+    shutil.copy(SHIPPED, policy)
+    policy.with_suffix(".json").write_text(json.dumps(about), "utf-8")
+    assert main(asked) == 2
     assert "holds runs with files" in capsys.readouterr().err
 
 
