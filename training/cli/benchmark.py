@@ -31,8 +31,9 @@ def benchmark(
         str | None, typer.Option(help="SLAM backends, separated by commas.  [default: invariant-ekf]")
     ] = None,
     split: Annotated[
-        str, typer.Option(help="Seeds: test (10000:10049), validation (1000:1049) or train (0:999).")
-    ] = "test",
+        str | None,
+        typer.Option(help="Seeds: test (10000:10049), validation (1000:1049) or train (0:999).  [default: test]"),
+    ] = None,
     seeds: Annotated[
         str | None, typer.Option(help="Other seeds than the split's: 3, 0:9 (both included) or 1,4,7.")
     ] = None,
@@ -62,12 +63,16 @@ def benchmark(
     ] = None,
     maps: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of that protocol's PNG maps.")] = None,
     scan: Annotated[
-        str, typer.Option(help="How that protocol looks around: way-points or continuous.")
-    ] = "way-points",
+        str | None,
+        typer.Option(help="How that protocol looks around: way-points or continuous.  [default: way-points]"),
+    ] = None,
     sensor: Annotated[
-        str,
-        typer.Option(help="What that protocol's rays show: public (as in its code) or wide (cells beside, too)."),
-    ] = "public",
+        str | None,
+        typer.Option(
+            help="What that protocol's rays show: public (as in its code) or wide (cells beside, too).  "
+            "[default: public]"
+        ),
+    ] = None,
     max_steps: opt.MaxSteps = None,
     workers: opt.Workers = None,
     ray: opt.Ray = None,
@@ -100,22 +105,29 @@ def benchmark(
       mecanum benchmark --protocol dungeons --maps dungeons --agents tour,learned-tour --out out/dungeons
     """  # noqa: D301
     who = opt.workers_of(workers, ray)
-    if protocol is not None or maps is not None:
+    its_own = [
+        name for name, given in (("--maps", maps), ("--scan", scan), ("--sensor", sensor)) if given is not None
+    ]
+    if protocol is not None or its_own:
         suites_only = {
-            "--suite": suite, "--slam": slam, "--seeds": seeds, "--floor-plans": floor_plans,
+            "--suite": suite, "--slam": slam, "--split": split, "--seeds": seeds, "--floor-plans": floor_plans,
             "--robot": robot, "--config": config, "--baseline": baseline, "--max-steps": max_steps,
             "--report": report or None, "--parquet": parquet or None,
             "--robots": None if robots == "1" else robots, "--communication": communication, "--range": range_m,
             "--starts": starts, "--unknown-starts": unknown_starts or None,
         }  # fmt: skip
-        _check_protocol(protocol, maps, [name for name, given in suites_only.items() if given is not None])
+        not_its = [name for name, given in suites_only.items() if given is not None]
+        _check_protocol(protocol, its_own, not_its)
         assert maps is not None
         from training.dungeons import protocol as dungeons
 
         names = [name for name in parts_of(agents) if name]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(maps, names, out=out, workers=who, scan=scan, sensor=sensor)
+        summary = dungeons.run_dungeons(
+            maps, names, out=out, workers=who, scan="way-points" if scan is None else scan,
+            sensor="public" if sensor is None else sensor,
+        )  # fmt: skip
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     from training.benchmark import run as task
@@ -126,8 +138,8 @@ def benchmark(
     from training.benchmark.suites import teams_of
 
     plan = task.BenchmarkPlan.parse(
-        suite=suite, agents=agents, slam=slam, split=split, seeds=seeds, baseline=baseline,
-        floor_plans=floor_plans, max_steps=max_steps, robot=robot, config=config,
+        suite=suite, agents=agents, slam=slam, split="test" if split is None else split, seeds=seeds,
+        baseline=baseline, floor_plans=floor_plans, max_steps=max_steps, robot=robot, config=config,
         teams=teams_of(
             robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
         ),
@@ -150,12 +162,12 @@ def benchmark(
     print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
 
 
-def _check_protocol(protocol: str | None, maps: Path | None, not_its: list[str]) -> None:
+def _check_protocol(protocol: str | None, its_own: list[str], not_its: list[str]) -> None:
     if protocol is None:
-        raise BadInput("--maps belongs to a protocol; give --protocol dungeons with it")
+        raise BadInput(f"{its_own[0]} belongs to a protocol; give --protocol dungeons with it")
     if protocol != "dungeons":
         raise BadInput(f"unknown protocol {protocol!r}{suggestion(protocol, ['dungeons'])}; valid: dungeons")
-    if maps is None:
+    if "--maps" not in its_own:
         raise BadInput("--protocol dungeons needs its maps; give --maps DIR, a folder of PNG maps")
     if not_its:
         raise BadInput(f"--protocol dungeons has no {not_its[0]}; leave it out")
