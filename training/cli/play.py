@@ -57,18 +57,19 @@ def play(
     """  # noqa: D301
     from training.episodes.team import read_team
     from training.play.game import Game, open_window
-    from training.play.session import Session
+    from training.play.session import Session, checked_config
     from training.play.team_session import TeamSession
 
     team = read_team(
         robots=robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
     )
+    where: dict[str, Any] = {"agent": agent, "rooms": rooms, "slam": slam, "robot": robot, "noise": noise}
+    where["floor_plan"] = floor_plan
+    checked_config(**where)  # a wrong name is told without a display, too
     window = open_window()
     try:
         with _said_where_it_takes_long():
-            where: dict[str, Any] = {"rooms": rooms, "slam": slam, "robot": robot, "noise": noise}
-            where |= {"agent": agent, "seed": seed, "floor_plan": floor_plan}
-            session = Session(**where) if robots == 1 else TeamSession(team=team, **where)
+            session = Session(seed=seed, **where) if robots == 1 else TeamSession(team=team, seed=seed, **where)
         Game(session, window, speed=speed).run(frames)
     finally:
         window.close()

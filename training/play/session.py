@@ -24,9 +24,22 @@ from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 from training.runs.typed import LAST_SEED
 
-__all__ = ["Session"]
+__all__ = ["Session", "checked_config"]
 
 T = TypeVar("T")
+
+
+def checked_config(agent: str, **where: Any) -> EnvConfig:
+    """Return where it is played, after :func:`mecanum_env.arguments.make_config`; nothing is made yet.
+
+    Raises
+    ------
+    BadInput
+        In one line: which option, file or name is wrong, the agent's among them, and what to do.
+    """
+    with bad_input():
+        agents.check(agent)
+        return make_config(**where)
 
 
 class Session:
@@ -61,9 +74,8 @@ class Session:
 
     def __init__(self, *, agent: str = "nearest-frontier", seed: int = 0, **where: Any) -> None:
         self.agent_name = agent
+        config = checked_config(agent, **where)
         with bad_input():
-            agents.check(agent)
-            config = make_config(**where)
             # A plan from a file is a kind of rooms of its own.
             self._kinds: list[tuple[str, str | None]] = [(name, None) for name in room_registry.names()]
             if config.floor_plan is not None:

@@ -292,6 +292,19 @@ def test_the_command_refuses_a_speed_that_is_none(capsys: pytest.CaptureFixture[
         assert "--speed" in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize("robots", ["1", "2"])
+@pytest.mark.parametrize(
+    ("option", "name"), [("--rooms", "nope"), ("--slam", "efk"), ("--robot", "yuobot"), ("--agent", "nobody")]
+)  # fmt: skip
+def test_a_wrong_name_is_told_without_a_display(
+    robots: str, option: str, name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "none-such")
+    assert main(["play", "--robots", robots, option, name]) == 2
+    error = capsys.readouterr().err
+    assert f"'{name}'" in error and error.count("\n") == 1
+
+
 def test_without_a_display_or_pygame_the_remedy_is_said(pygame: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     from training.play.game import open_window
 
