@@ -187,6 +187,8 @@ class ExploreFrontierEnv(ChoiceEnv):
 
     def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Drive to a view point until the next choice is due; see the class."""
+        if not hasattr(self, "_seen"):
+            raise RuntimeError("call reset() before step()")
         most = self.driver.choice.most
         try:
             k = int(action)

@@ -218,6 +218,8 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             gymnasium.logger.warn('render() needs render_mode="rgb_array" or "human" in gym.make')
         if self.render_mode != "rgb_array":
             return None
+        if not self._ready:
+            raise RuntimeError("call reset() before render()")
         from mecanum_env.views.render import render_frame
 
         return render_frame(self)

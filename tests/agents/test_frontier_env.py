@@ -36,6 +36,14 @@ def test_it_is_an_environment_after_gymnasiums_rules():
     check_env(env.unwrapped, skip_render_check=True)
 
 
+def test_before_the_first_reset_it_says_what_to_do():
+    env = ExploreFrontierEnv(rooms="rectangular", render_mode="rgb_array")
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before step\(\)"):
+        env.step(0)
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before render\(\)"):
+        env.render()
+
+
 @pytest.mark.parametrize("rooms", ["rectangular", "apartment", "corridors", "cave", "maze"])
 def test_an_episode_adds_up(rooms):
     env = gymnasium.make(ID, rooms=rooms, reward=TIME_ALONE, config={"time_limit_s": 12.0})

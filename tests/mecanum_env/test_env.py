@@ -52,6 +52,14 @@ def test_gymnasium_finds_nothing_to_complain_of(env_id: str) -> None:
         check_env(make(env_id, render_mode="rgb_array").unwrapped, skip_render_check=NO_WINDOWS)
 
 
+def test_before_the_first_reset_it_says_what_to_do() -> None:
+    env = ExploreEnv(rooms="rectangular", render_mode="rgb_array")
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before step\(\)"):
+        env.step(np.zeros(3, np.float32))
+    with pytest.raises(RuntimeError, match=r"call reset\(\) before render\(\)"):
+        env.render()
+
+
 @pytest.mark.parametrize("env_id", IDS)
 def test_stable_baselines3_finds_nothing_to_complain_of(env_id: str) -> None:
     sb3 = pytest.importorskip("stable_baselines3.common.env_checker", reason="needs the extra `train`")
