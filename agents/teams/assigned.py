@@ -42,6 +42,7 @@ class Assigned(Shared, NearestFrontier):
         clusters = found.frontiers.target_labels[crew.pieces]
         kinds = np.unique(clusters)
         # Two robots are not sent to one cluster: what the first sees of it is for the second no longer there.
-        nearest = np.array([np.where(clusters == kind, costs, np.inf).argmin(axis=1) for kind in kinds]).T
-        column = assign(np.take_along_axis(costs, nearest, axis=1))[crew.own]
+        by_cluster = np.array([np.where(clusters == kind, costs, np.inf) for kind in kinds])
+        nearest = by_cluster.argmin(axis=2).T
+        column = assign(by_cluster.min(axis=2).T)[crew.own]
         return nearest[crew.own, [column]] if column >= 0 else np.zeros(0, dtype=np.int64)

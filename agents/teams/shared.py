@@ -58,9 +58,12 @@ class Shared(Explorer):
         )  # fmt: skip
         if crew is None:
             return found
-        # The farther the way, the more there must be to see: for whoever is nearest.
+        # The farther the way, the more there must be to see: for whoever is nearest. What nobody can reach is
+        # no work to share: whoever was given it would leave real places to others for it.
         extents = found.frontiers.extents[found.frontiers.target_labels[crew.pieces]]
-        crew = crew.of(extents >= self._frontier_config.wanted_extent(crew.costs.min(axis=0)) - 1e-9)
+        nearest = crew.costs.min(axis=0)
+        worth = extents >= self._frontier_config.wanted_extent(nearest) - 1e-9
+        crew = crew.of(worth & np.isfinite(nearest))
         own = crew.pieces[self._owned(crew, found)] if len(crew.pieces) else crew.pieces
         own = own[np.isfinite(found.costs[own])]
         if not len(own):

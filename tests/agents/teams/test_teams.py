@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import agents
+from agents.teams.assigned import Assigned
+from agents.teams.crew import Crew
 from mecanum_env.team.team import Team
 from slam.belief import Teammate
 from slam.grids.occupancy import UNKNOWN
@@ -49,12 +53,22 @@ def crossroads() -> np.ndarray:
     return classes
 
 
-def goals(name: str, poses: list[tuple[float, float, float]], config=None) -> np.ndarray:
+def closed_off() -> np.ndarray:
+    """The crossroads, and two places between the arms that were seen and that no way leads to."""
+    classes = crossroads()
+    for x in (1.5, 8.5):
+        fill(classes, x, 1.5, x + 2.0, 3.0, 0)
+        fill(classes, x, 1.0, x + 2.0, 1.5, UNKNOWN)
+    return classes
+
+
+def goals(name: str, poses: list[tuple[float, float, float]], config=None, classes=None) -> np.ndarray:
     """Where robots at these poses, who know of each other, go; each decides by itself."""
+    classes = crossroads() if classes is None else classes
     chosen = []
     for k, pose in enumerate(poses):
         mates = tuple(Teammate(j, np.array(p), 0.0) for j, p in enumerate(poses) if j != k)
-        belief = replace(belief_of(crossroads(), pose), teammates=mates, robot=k)
+        belief = replace(belief_of(classes, pose), teammates=mates, robot=k)
         agent = agents.make(name, config=config)
         agent.reset(belief, 0)
         goal = agent.choose(belief)
@@ -63,13 +77,24 @@ def goals(name: str, poses: list[tuple[float, float, float]], config=None) -> np
     return np.array(chosen)
 
 
+@pytest.mark.parametrize("classes", [crossroads(), closed_off()], ids=["all reachable", "some closed off"])
 @pytest.mark.parametrize("name", TEAMS)
-def test_each_goes_to_an_arm_of_its_own(name):
+def test_each_goes_to_an_arm_of_its_own(name, classes):
     short = {"frontiers": {"view_range_m": 1.5}}
     config = {"driver": short} if name == "team-frontier" else short
-    at = goals(name, [(6.0, 6.0, 0.0), (5.6, 5.2, 0.0), (6.5, 6.6, 0.0), (5.4, 6.5, 0.0)], config)
+    at = goals(name, [(6.0, 6.0, 0.0), (5.6, 5.2, 0.0), (6.5, 6.6, 0.0), (5.4, 6.5, 0.0)], config, classes)
     apart = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))[np.triu_indices(4, 1)]
     assert apart.min() > 2.0, at
+
+
+def test_a_cluster_that_one_cannot_reach_is_left_to_whoever_can():
+    costs = np.array([[1.0, 4.0], [2.0, np.inf]])
+    crew = Crew(
+        robots=np.arange(2), own=0, pieces=np.arange(2), costs=costs, bound=np.full(2, -1),
+        cells=np.zeros((2, 2), np.int64), travel=cast(Any, None),
+    )  # fmt: skip
+    found = cast(Any, SimpleNamespace(frontiers=SimpleNamespace(target_labels=np.arange(2))))
+    assert Assigned()._owned(crew, found).tolist() == [1]
 
 
 @pytest.mark.parametrize(("name", "alone"), [("team-tour", "brisk-tour"), ("team-frontier", "ppo-frontier")])
