@@ -125,6 +125,28 @@ def test_others_are_seen_and_not_mapped() -> None:
     assert second.observation_space.contains(second.observe())
 
 
+def test_where_frames_are_one_what_a_robot_tells_counts_before_an_older_sighting_of_it() -> None:
+    starts = np.array([(2.0, 3.0, 0.2), (5.0, 4.0, 1.0)])
+    errors = {}
+    for known in (True, False):
+        backend = "truth" if known else "invariant-ekf"
+        team = Team(2, floor_plan=_hall(), config=ALL, team={"known_starts": known}, slam=backend)
+        team.reset(seed=0, options={"start_poses": starts})
+        team.step({k: np.zeros(3, np.float32) for k in team.active})
+        first, second = team.members
+        assert first.sightings
+        true = compose(inverse(first.truth.ground.start), compose(second.truth.ground.start, second.truth.pose))
+        mate = first.belief.teammates[0]
+        assert mate.age_s == pytest.approx(0.0, abs=0.11)
+        errors[known] = np.hypot(*(mate.pose - true)[:2])
+        if known:  # of a sighting that is newer nothing better is known
+            told = first.knowledge.heard[1]
+            first.knowledge.heard[1] = told._replace(time_s=told.time_s - 0.1)
+            errors["newer"] = np.hypot(*(first.belief.teammates[0].pose - true)[:2])
+    assert errors[True] < 1e-6 < 1e-3 < min(errors["newer"], errors[False])
+    assert max(errors.values()) < 0.1
+
+
 def test_a_sighting_s_noise_is_the_declared_one() -> None:
     team = Team(2, floor_plan=_hall(), config=ALL, slam="truth")
     team.reset(seed=0, options={"start_poses": [(2.0, 3.0, 0.2), (5.0, 4.0, 1.0)]})
