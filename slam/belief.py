@@ -27,6 +27,7 @@ class Teammate(NamedTuple):
     pose: Array  # (3,) in the belief's frame
     age_s: float  # since it was there
     goal: Array | None = None  # (2,) where it said to go [m], in the belief's frame
+    ended: bool = False  # it has told that it stands where it is for good
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

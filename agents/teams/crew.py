@@ -66,7 +66,7 @@ def muster(
     left
         ``(m,)`` which candidates there is something to see at.
     trust_s
-        How long after it was last heard or seen another robot is counted on [s].
+        How long after it was last heard or seen another robot is counted on [s], unless it has ended.
     range_m, beyond_m
         As in :func:`agents.view_points.sight.view_points`.
     same_m
@@ -74,9 +74,8 @@ def muster(
     """
     pieces = np.flatnonzero(left)
     own = Teammate(belief.robot, np.asarray(belief.pose), 0.0, goal)
-    mates = sorted(
-        [own, *(mate for mate in belief.teammates if mate.age_s <= trust_s)], key=lambda mate: mate.robot
-    )
+    counted_on = [mate for mate in belief.teammates if mate.age_s <= trust_s and not mate.ended]
+    mates = sorted([own, *counted_on], key=lambda mate: mate.robot)
     if len(mates) == 1 or not len(pieces):
         return None
     targets, normals = found.frontiers.targets[pieces], found.frontiers.normals[pieces]

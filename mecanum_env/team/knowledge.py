@@ -64,11 +64,12 @@ class Knowledge:
             account = None if self._frames is None else Account.of(self.robot, time_s, self._backend)
             self._chart = time_s, Chart.of(self._backend.grid), account
 
-    def report(self, time_s: float) -> Report:
-        """Return what this robot tells of itself."""
+    def report(self, time_s: float, *, ended: bool) -> Report:
+        """Return what this robot tells of itself, whose episode may have ended."""
         frames = {} if self._frames is None else dict(self._frames.found)
+        goal = None if ended else self.goal
         return Report(
-            time_s, self._backend.pose, self._backend.pose_cov, self.goal, *self._chart, self._start, frames
+            time_s, self._backend.pose, self._backend.pose_cov, goal, *self._chart, self._start, frames, ended
         )
 
     # ---- hearing and seeing --------------------------------------------------------------------------------
@@ -147,5 +148,7 @@ class Knowledge:
             elif not placed:
                 continue
             # Copies: reports are everybody's.
-            found.append(Teammate(robot, pose.copy(), time_s - when, None if goal is None else goal.copy()))
+            goal = None if goal is None else goal.copy()
+            ended = report is not None and report.ended
+            found.append(Teammate(robot, pose.copy(), time_s - when, goal, ended))
         return tuple(found)

@@ -25,3 +25,4 @@ class Report(NamedTuple):
     account: Account | None  # where frames have to be found
     start: Start | None  # where starts are known, but not for sure: which it believes in
     frames: Mapping[int, Array]  # poses (3,) of others' frames, as far as it found them
+    ended: bool  # its episode is over: it goes nowhere

@@ -237,7 +237,10 @@ class Team:
             if due:
                 for knowledge in hearing:
                     knowledge.chart_now(time_s)
-            reports = {knowledge.robot: knowledge.report(time_s) for knowledge in hearing}
+            reports = {
+                knowledge.robot: knowledge.report(time_s, ended=knowledge.robot not in self.active)
+                for knowledge in hearing
+            }
             for knowledge in hearing:  # what they have heard of robots that are elsewhere
                 for robot, report in knowledge.heard.items():
                     if robot not in reports or reports[robot].time_s < report.time_s:

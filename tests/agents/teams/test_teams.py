@@ -87,6 +87,23 @@ def test_each_goes_to_an_arm_of_its_own(name, classes):
     assert apart.min() > 2.0, at
 
 
+@pytest.mark.parametrize("name", TEAMS)
+def test_nothing_is_left_to_one_that_has_ended(name):
+    """Though it stands before the only arm that there is still to see."""
+    classes = crossroads()
+    for x0, y0, x1, y1 in ((0, 5, 1, 7), (11, 5, 12, 7), (5, 0, 7, 1)):
+        fill(classes, x0, y0, x1, y1)
+    mate = Teammate(1, np.array([5.4, 9.5, 0.0]), 0.0)
+    for ended in (False, True):
+        crews = []
+        agent = agents.make(name)
+        agent._owned = lambda crew, found, crews=crews: crews.append(crew) or np.arange(len(crew.pieces))
+        belief = replace(belief_of(classes, (6.0, 2.0, 0.0)), teammates=(mate._replace(ended=ended),), robot=0)
+        agent.reset(belief, 0)
+        assert agent.choose(belief) is not None
+        assert bool(crews) is not ended  # alone, it shares nothing out
+
+
 def test_a_cluster_that_one_cannot_reach_is_left_to_whoever_can():
     costs = np.array([[1.0, 4.0], [2.0, np.inf]])
     crew = Crew(

@@ -34,6 +34,23 @@ def test_one_that_has_ended_goes_on_to_sense_and_believe(belief: str) -> None:
     assert ages[1] == pytest.approx(0.0) and other.belief.teammates[0].age_s == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("belief", ["own", "joint"])
+def test_one_that_has_ended_is_told_to_have_no_goal_and_to_be_done(belief: str) -> None:
+    team = Team(2, team={"belief": belief}, config=TOUCHED, max_steps=300)
+    team.reset(seed=2, options={"floor_plan": _hall(), "start_poses": [(11.5, 3.0, 0.0), (6.0, 3.5, 0.0)]})
+    ahead, still = np.array([0.6, 0.0, 0.0], np.float32), np.zeros(3, np.float32)
+    team.members[0].knowledge.goal = np.array([1.0, 2.0])
+    while 0 in team.active:
+        (mate,) = team.members[1].belief.teammates
+        assert not mate.ended
+        team.step({0: ahead, 1: still})
+    team.step({1: still})
+    (mate,) = team.members[1].belief.teammates
+    assert mate.goal is None and mate.ended and mate.age_s == pytest.approx(0.0)
+    (other,) = team.members[0].belief.teammates
+    assert not other.ended
+
+
 def test_who_writes_into_what_it_is_told_changes_nobody_else_s_belief() -> None:
     team = Team(3, rooms="apartment", max_steps=20)
     team.reset(seed=1)
