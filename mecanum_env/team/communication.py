@@ -1,4 +1,4 @@
-"""Who hears whom: by distance, and by the walls in between."""
+"""Who hears whom: by distance, and by what is in between."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.team.config import CommunicationConfig
 from slam.types import Array
 
 __all__ = ["groups", "walls_between"]
 
 
-def groups(config: CommunicationConfig, places: Array, segments: Array) -> NDArray[np.int64]:
+def groups(config: CommunicationConfig, places: Array, plan: FloorPlan) -> NDArray[np.int64]:
     """Return for each robot ``(n,)`` the number of its group: those that hear each other, directly or by others.
 
     Parameters
     ----------
     places : Array
         Where they are ``(n, 2)`` [m], in the plan's frame.
-    segments : Array
-        The plan's surfaces ``(s, 4)`` [m]; a wall is two of them.
+    plan : FloorPlan
+        What is in between.
     """
     n = len(places)
     if config.model == "unlimited" or n == 1:
@@ -33,25 +34,37 @@ def groups(config: CommunicationConfig, places: Array, segments: Array) -> NDArr
     hears = np.zeros((n, n), np.bool_)
     for i in range(n):
         for j in range(i):
-            hears[i, j] = _hears(config, places[i], places[j], segments)
+            hears[i, j] = _hears(config, places[i], places[j], plan)
     return np.asarray(connected_components(hears, directed=False)[1], np.int64)
 
 
-def _hears(config: CommunicationConfig, a: Array, b: Array, segments: Array) -> bool:
-    """Tell whether two robots hear each other: log-distance path loss, and a loss for each wall."""
+def _hears(config: CommunicationConfig, a: Array, b: Array, plan: FloorPlan) -> bool:
+    """Tell whether two robots hear each other: log-distance path loss, and a loss for each wall.
+
+    Sight ends where a beam of the lidar does, at furniture as well. A signal loses next to nothing there.
+    """
     distance = math.hypot(*(a - b))
     if distance > config.range_m or config.model == "range":
         return distance <= config.range_m
-    walls = walls_between(a, b, segments)
-    if config.model == "line-of-sight" or walls == 0:
-        return walls == 0
+    if config.model == "line-of-sight":
+        return walls_between(a, b, plan.segments) == 0 and not _meets_disc(a, b, plan.circles)
+    walls = walls_between(a, b, plan.walls)
+    if walls == 0:
+        return True
     spare_db = 10.0 * config.path_loss * math.log10(config.range_m / max(distance, 1e-3))
     return spare_db >= config.wall_loss_db * walls
 
 
-def walls_between(a: Array, b: Array, segments: Array) -> int:
-    """Return how many walls the straight line between two points ``(2,)`` crosses: half of its surfaces."""
-    return (_crossings(a[0], a[1], b[0], b[1], segments) + 1) // 2
+def walls_between(a: Array, b: Array, walls: Array) -> int:
+    """Return how many walls the line between two points ``(2,)`` crosses: half of the surfaces ``(w, 4)``."""
+    return (_crossings(a[0], a[1], b[0], b[1], walls) + 1) // 2
+
+
+def _meets_disc(a: Array, b: Array, circles: Array) -> bool:
+    """Tell whether the straight line between two points ``(2,)`` meets a disc ``(c, 3)``: x, y, radius [m]."""
+    along, out = b - a, circles[:, :2] - a
+    share = np.clip(out @ along / max(float(along @ along), 1e-12), 0.0, 1.0)
+    return bool((np.hypot(*(share[:, None] * along - out).T) < circles[:, 2]).any())
 
 
 @njit(cache=True, nogil=True)

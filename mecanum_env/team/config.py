@@ -26,7 +26,8 @@ _HALF_DEGREE, _TWO_DEGREES = math.radians(0.5), math.radians(2.0)
 class CommunicationConfig(Config):
     """Who hears whom, and how often maps are exchanged; whoever hears one of a chain hears all of it."""
 
-    # "line-of-sight": within range and no wall between; "walls": each wall costs signal
+    # "line-of-sight": within range and nothing between that a lidar's beam ends at, wall or furniture;
+    # "walls": each wall costs signal, furniture does not
     model: Annotated[str, OneOf(COMMUNICATION)] = "unlimited"
     range_m: Length = 10.0  # in the open
     wall_loss_db: NotNegative = 5.0  # of a wall in between

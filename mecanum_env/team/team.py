@@ -228,7 +228,7 @@ class Team:
                 for other, measured, cov in member.sightings:
                     self.joint.members[member.number].see(other, measured, cov, gate=_GATE)
         places = np.array([member.truth.world.pose[:2] for member in members])
-        self.groups = groups(self.team.communication, places, self.ground.plan.segments)
+        self.groups = groups(self.team.communication, places, self.ground.plan)
         due = self._steps % self._every == 0
         for group in range(int(self.groups.max()) + 1):
             hearing = [member.knowledge for member in members if self.groups[member.number] == group]
