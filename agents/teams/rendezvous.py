@@ -1,14 +1,17 @@
 """The team's tour with appointments: robots that do not hear each other meet again, and tell what they have seen.
 
-All agree on it beforehand, so that no message is needed: every so often they meet where they stood at the
-beginning, and each leaves off in time to be there. Who hears all the others has met them wherever they are.
+All agree on it beforehand, so that no message is needed: they meet at the origin of the beliefs' frame, where the
+first robot started, and each leaves off in time to be there. The time between two appointments doubles, for what
+is left is farther and farther away. Who hears all the others has met them wherever they are.
+
+Where starts are not known, each has a frame of its own, and comes back to where it started itself: that brings
+together those that started side by side.
 Appointments are the simplest way of exploring together under limited range (Roy and Dudek, "Collaborative robot
 exploration and rendezvous", Autonomous Robots 2001).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -29,9 +32,8 @@ __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
 class AppointmentsConfig(Config):
     """When robots meet."""
 
-    every_s: Duration = 60.0  # from the beginning on
+    every_s: Duration = 60.0  # from the beginning to the first; each interval is twice the one before
     wait_s: Duration = 10.0  # for those that are late
-    heard_s: Duration = 2.0  # who was heard so lately is there
     speed_m_s: Rate = 0.4  # at which the way there is driven, about
 
 
@@ -50,38 +52,47 @@ class Rendezvous(TeamTour):
 
     def _forget(self) -> None:
         super()._forget()
-        self._place: Array | None = None  # (2,) where they meet
-        self._team: set[int] = set()  # numbers of all others that were ever known
+        self._place = np.zeros(2)  # where they meet
         self._next = 1  # number of the next appointment
+        self._apart = False  # some robot that still explores is not heard now
         self._meeting = False  # on its way there, or waiting
 
     def choose(self, belief: Belief) -> Goal | None:
         """Return the next view point, or the meeting place when it is time."""
-        if self._place is None:
-            stood = np.array([belief.pose[:2], *(mate.pose[:2] for mate in belief.teammates)], np.float64)
-            self._place = stood.mean(axis=0)
-        self._team |= {mate.robot for mate in belief.teammates}
-        config = self.config.appointments
-        heard = {mate.robot for mate in belief.teammates if mate.age_s <= config.heard_s}
-        at_s = self._next * config.every_s
-        if heard == self._team:  # as good as met
-            self._next = max(self._next, math.floor(self._time / config.every_s + 0.5) + 1)
-        elif self._time > at_s + config.wait_s:  # in vain
-            self._next = math.floor(self._time / config.every_s) + 1
-        else:
+        if self._apart:
             there, cost = self._way_there(belief)
-            if self._time + cost / config.speed_m_s >= at_s:
+            if self._time + cost / self.config.appointments.speed_m_s >= self._appointed_s(self._next):
                 return self._set_off(there, cost)
         if self._meeting:
             self._target, self._meeting = None, False
         goal = super().choose(belief)
-        if goal is None and heard != self._team and self._time < self._next * config.every_s + config.wait_s:
+        if goal is None and self._apart:
             return self._set_off(*self._way_there(belief))  # the others may know of more
         return goal
 
+    def _appointed_s(self, number: int) -> float:
+        """Return when an appointment is [s]: each interval is twice the one before, to get twice as far."""
+        return self.config.appointments.every_s * (2.0**number - 1.0)
+
+    def _keep_book(self, observation: Mapping[str, Any] | None, belief: Belief) -> None:
+        """Work out which appointment is the next; to be asked at every step.
+
+        A group that hears each other is the same to all in it: at the step at which it is the whole team all
+        know that they have met, and none goes to an appointment that another holds for kept.
+        """
+        others = 0 if observation is None else len(observation.get("teammates", ()))
+        # Who has ended comes to no appointment.
+        counted = sum(mate.ended or mate.age_s < 0.5 * self._step_s for mate in belief.teammates)
+        self._apart = counted < others
+        last_s, next_s = self._appointed_s(self._next - 1), self._appointed_s(self._next)
+        if self._apart:
+            kept = self._time > next_s + self.config.appointments.wait_s  # in vain
+        else:
+            kept = self._time >= 0.5 * (last_s + next_s)  # as good as met
+        self._next += kept
+
     def _way_there(self, belief: Belief) -> tuple[Goal, float]:
         """Return the meeting place, or the place nearest to it that can be reached, as a goal, and its cost."""
-        assert self._place is not None
         path, cost, _ = self._way_near(self._place, belief)
         return Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path), cost
 
@@ -94,6 +105,7 @@ class Rendezvous(TeamTour):
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
+        self._keep_book(observation, belief)
         action = super().act(observation, belief)
         if self._meeting and self._status == "driving":
             self._status = "meeting"
