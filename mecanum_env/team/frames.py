@@ -11,8 +11,10 @@ from mecanum_env.team.reports import Report
 from slam.accounts.account import Account
 from slam.backend import Backend
 from slam.geometry import compose, inverse
-from slam.teams.alignment import align
+from slam.grids.occupancy import OccupancyGrid
+from slam.teams.alignment import Alignment, AlignmentConfig, align, same_place
 from slam.teams.apart import Start, without_start
+from slam.teams.contradiction import contradiction
 from slam.teams.sighting import combine, relative_pose
 from slam.types import Array, Sighting
 
@@ -21,14 +23,17 @@ __all__ = ["Frames"]
 _EXACT = 1e-8 * np.eye(3)
 _TRY_AGAIN_S = 10.0  # maps have to grow before another look finds what one did not
 _LOOK_AGAIN_S = 60.0  # at a frame that is known, for a better one
+_CONFIG = AlignmentConfig()
 
 
 class Frames:
     """What a robot knows of the others' frames.
 
     Maps are laid on each other by their landmarks (:func:`slam.teams.alignment.align`), by the robot with the
-    lower number of two, who tells the other. A sighting, or starts that are known roughly, say where to look; by
-    themselves they place a robot, but no map.
+    lower number of two, who tells the others. A sighting, or starts that are known roughly, say where to look; by
+    themselves they place a robot, but no map. Where nothing says where to look, rooms that repeat may fit where
+    they are not: a first match is not used before a later look, with more landmarks matched, finds the same.
+    What a later look contradicts is given up.
 
     Parameters
     ----------
@@ -45,6 +50,9 @@ class Frames:
     def __init__(self, robot: int, backend: Backend, start: Start | None = None, *, known: bool = False) -> None:
         self.found: dict[int, Array] = {}
         """Pose ``(3,)`` of a robot's frame in the own one, as far as maps tell."""
+        self.told: dict[int, Array] = {}
+        """Those of them that this robot found by itself, and tells the others."""
+        self._held: dict[int, Alignment] = {}  # first matches that nothing has confirmed yet
         self._robot, self._backend, self._start, self._known = robot, backend, start, known
         self._rough: dict[int, tuple[Array, Array]] = {}  # pose and covariance, by sightings
         self._looked_s: dict[int, float] = {}
@@ -76,15 +84,24 @@ class Frames:
         ``account`` is the own one, as the others have it.
         """
         for robot, report in heard.items():
-            if robot < self._robot and self._robot in report.frames:
-                self.found[robot] = inverse(report.frames[self._robot])
-            elif robot > self._robot and account is not None and report.account is not None:
+            if robot > self._robot and account is not None and report.account is not None:
                 self._look(time_s, account, report)
-        for robot, report in heard.items():  # by way of another
-            if robot in self.found:
-                for other, frame in report.frames.items():
-                    if other != self._robot and other not in self.found:
-                        self.found[other] = compose(self.found[robot], frame)
+        # From scratch each time: what one has given up nobody goes on to tell.
+        links = [(self._robot, other, pose) for other, pose in self.told.items()]
+        links += [(robot, *link) for robot, report in heard.items() for link in report.frames.items()]
+        placed = {self._robot: np.zeros(3)}
+        while True:  # by way of as few others as can be
+            further: dict[int, Array] = {}
+            for one, other, pose in links:
+                if one in placed and other not in placed:
+                    further.setdefault(other, compose(placed[one], pose))
+                elif other in placed and one not in placed:
+                    further.setdefault(one, compose(placed[other], inverse(pose)))
+            if not further:
+                break
+            placed |= further
+        del placed[self._robot]
+        self.found = placed
 
     def _look(self, time_s: float, account: Account, report: Report) -> None:
         assert report.account is not None
@@ -103,6 +120,25 @@ class Frames:
             other = without_start(other, report.start)
         chart = report.chart
         grids = None if chart is None else (self._backend.grid, chart.grid(self._backend.grid.resolution))
-        found = align(account, other, grids=grids, prior=prior)
-        if found is not None:
-            self.found[robot] = found.pose
+        self._weigh(robot, align(account, other, _CONFIG, grids=grids, prior=prior), grids, sure=prior is not None)
+
+    def _weigh(
+        self, robot: int, found: Alignment | None, grids: tuple[OccupancyGrid, OccupancyGrid] | None, *, sure: bool
+    ) -> None:
+        """Take over what a look has found, hold it till it is confirmed, or give up what it contradicts."""
+        before = self.told.get(robot)
+        if before is not None and (
+            (found is not None and not same_place(before, found.pose, _CONFIG))
+            or (grids is not None and contradiction(*grids, before) > _CONFIG.most_contradicted)
+        ):
+            del self.told[robot]
+        if found is None:
+            return
+        first = self._held.get(robot)
+        if first is not None and not same_place(first.pose, found.pose, _CONFIG):
+            first = None
+        if sure or robot in self.told or (first is not None and found.matches > first.matches):
+            self.told[robot] = found.pose
+            self._held.pop(robot, None)
+        elif first is None:
+            self._held[robot] = found

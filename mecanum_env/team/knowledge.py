@@ -66,7 +66,7 @@ class Knowledge:
 
     def report(self, time_s: float, *, ended: bool) -> Report:
         """Return what this robot tells of itself, whose episode may have ended."""
-        frames = {} if self._frames is None else dict(self._frames.found)
+        frames = {} if self._frames is None else dict(self._frames.told)
         goal = None if ended else self.goal
         return Report(
             time_s, self._backend.pose, self._backend.pose_cov, goal, *self._chart, self._start, frames, ended

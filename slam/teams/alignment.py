@@ -24,7 +24,7 @@ from slam.teams.contradiction import contradiction
 from slam.teams.joint import Joint, Link, SameConfig, joint_of
 from slam.types import Array
 
-__all__ = ["Alignment", "AlignmentConfig", "align"]
+__all__ = ["Alignment", "AlignmentConfig", "align", "same_place"]
 
 Pairs = NDArray[np.int64]
 
@@ -70,6 +70,11 @@ class Alignment:
     rival: float  # matches that the next best explains, as a share
     contradicted: float  # share of walls in the other's free space; nan without grids
 
+    @property
+    def matches(self) -> int:
+        """How many landmarks are the same."""
+        return len(self.points) + len(self.walls)
+
 
 def align(
     a: Account, b: Account, config: AlignmentConfig | None = None, *,
@@ -100,7 +105,7 @@ def align(
             prior is not None and not _near_prior(fit.pose, fit.joint.cov[-3:, -3:], prior, config)
         ):
             continue
-        if not any(_same_place(fit.pose, other.pose, config) for other in found):
+        if not any(same_place(fit.pose, other.pose, config) for other in found):
             found.append(fit)
     found.sort(key=lambda fit: -fit.matches)
     if not found:
@@ -146,7 +151,7 @@ def _fit(
         if len(points) + len(walls) < 2:
             return None
         pose = rigid_fit(a, b, pose, points, walls)
-    if not _same_place(guess, pose, config):
+    if not same_place(guess, pose, config):
         return None
     contradicted = math.nan if grids is None else contradiction(*grids, pose)
     if contradicted > config.most_contradicted:
@@ -191,7 +196,8 @@ def _links(a: Account, b: Account, points: Pairs, walls: Pairs) -> list[Link]:
     return [(0, int(u), 1, int(v)) for u, v in points] + [(0, n + int(u), 1, m + int(v)) for u, v in walls]
 
 
-def _same_place(one: Array, other: Array, config: AlignmentConfig) -> bool:
+def same_place(one: Array, other: Array, config: AlignmentConfig) -> bool:
+    """Tell whether two poses ``(3,)`` of a frame are one place but for errors."""
     apart = compose(inverse(one), other)
     return bool(np.hypot(*apart[:2]) < config.rival_m and abs(apart[2]) < config.rival_rad)
 
