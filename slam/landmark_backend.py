@@ -43,14 +43,12 @@ class LandmarkBackend(Backend):
 
     def _may_spin(self, scan: Scan, match: Indices, recent: int, still: int) -> bool:
         """Tell whether the wheels may have turned in vain; see :meth:`SpinningWheels.suspected`."""
-        if not self._spinning.suspected(self.grid, self.sensor_pose, scan, recent, still, match):
+        spinning, c = self._spinning, self.config
+        if not spinning.suspected(self.grid, self.sensor_pose, scan, recent, still, match):
             return False
-        self._spinning.touching = self._touches(scan)
+        sigma_m = c.features.range_sigma_m
+        spinning.touching = touches(scan, c.lidar_offset_m, c.body_length_m, c.body_width_m, sigma_m)
         return True
-
-    def _touches(self, scan: Scan) -> bool:
-        c = self.config
-        return touches(scan, c.lidar_offset_m, c.body_length_m, c.body_width_m, c.features.range_sigma_m)
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 

@@ -42,7 +42,7 @@ class HeldByMap(GaussianBackend):
                 place = self._place_beside(scan)
                 if not recovery.opposed(self.grid, place.pose, scan):
                     self._correct_by_map(place, JOINT_LIMITS, within=_LATELY)
-        elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._touches(scan):
+        elif self.config.lines and self._places.due(self.nis_dof // 2, scan) and not self._spinning.touching:
             self._hold_by_place(scan)
 
     def _hold_by_place(self, scan: Scan) -> None:
@@ -51,8 +51,6 @@ class HeldByMap(GaussianBackend):
         ends = places.ends(scan, self.extractor)
         seen, away = places.seen(x, book.marks, ends)
         fits = seen is not None and self._correct_aside(*seen, JOINT_LIMITS)
-        if fits:
-            places.accept()
         if places.wanted(away, fits=fits):
             for z in places.make(book.next_id, ends):
                 self._add(z, None)
@@ -71,9 +69,7 @@ class HeldByMap(GaussianBackend):
         It is one among those seen within so many scans: what is drawn since others were has drifted with the pose.
         """
         offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
-        book, kept = self._book, self.recovery.kept  # scans that contradict the map are not drawn
-        drawn, since = book.ids < (book if kept is None else kept["_book"]).next_id, book.now - within
-        told = seen_from(self._x, book.marks, offset, place.pose, cov, drawn=drawn, since=since)
+        told = seen_from(self._x, self._book.marks, offset, place.pose, cov, since=self._book.now - within)
         self._correct_aside(*told, limits)
 
     def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:

@@ -37,11 +37,6 @@ class Patch:
     common_var: float  # [m²] of what all beams of one scan on it have in common: what the model leaves out
     straight: bool
 
-    @property
-    def told(self) -> Array:
-        """The information ``(3, 3)`` that is of beams."""
-        return self.info - np.eye(3) / _PRIOR_SIGMA**2
-
     @cached_property
     def extent(self) -> Array:
         """A disc around the points ``(3,)``: centre x, y and radius [m]."""

@@ -44,7 +44,6 @@ _SHARE, _IN_SIGHT = 0.3, 0.8  # of beams that lie on the place's surfaces; of th
 _LEAST_M, _LEAST_RAD = 0.3, 0.1  # 1σ: a scan that shows less exactly where it was taken makes no place …
 _GROW_M, _GROW_RAD = 0.04, 0.02  # … and one that fits less exactly adds nothing to one
 _PRIOR = np.diag([0.5**-2, 0.5**-2, 0.2**-2])  # keeps an alignment along a single wall from running away
-_UNKNOWN = 1e-4  # of that, where a scan says nothing
 _FEWEST_NEW = 5  # beams on surfaces that a place does not have
 
 
@@ -81,7 +80,6 @@ class Places:
         self._few = 0
         self._view_rad = 2.0 * math.pi
         self._last = np.full(3, 1e6)  # where a scan was last held against a place
-        self._fit: tuple[int, BeamEnds, NDArray[np.bool_], Array, Array] | None = None  # see :meth:`accept`
 
     def __deepcopy__(self, _: object) -> Places:
         """Return a copy with the same places: what one holds is replaced, not changed."""
@@ -110,8 +108,7 @@ class Places:
         """Return what a scan says of the nearest place, and how far that is away [m]: infinity without one.
 
         What it says is observation rows ``(2, 12)`` of the place's points, and which landmarks they are; None
-        where it does not fit. Where the filter takes it, it is to be accepted. ``x`` ``(3 + 2n,)`` is the state,
-        ``marks`` ``(n, 14)`` the landmarks' marks.
+        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 14)`` the landmarks' marks.
         """
         match, away = self._near(x, marks)
         if away >= _NEAR_M:
@@ -124,23 +121,13 @@ class Places:
             return None, away
         common = self._lasting(x[:3]) * place.common_var
         told = links(place.surfaces, ends, found, np.zeros((len(common), 3)), common)
-        info = told.info.sum(axis=0)
-        at = found.pose - np.linalg.solve(info + _PRIOR, told.gradient.sum(axis=0))
-        # What the prior says is the robot's own belief, and no measurement.
-        cov = np.linalg.inv(info + _UNKNOWN * _PRIOR)
-        exact = cov[0, 0] + cov[1, 1] < _GROW_M**2 and cov[2, 2] < _GROW_RAD**2
-        self._fit = number, ends, (found.beside < 0) & exact, at, x[:3].copy()
+        cov = np.linalg.inv(told.info.sum(axis=0) + _PRIOR)
+        at = found.pose - cov @ told.gradient.sum(axis=0)
+        if cov[0, 0] + cov[1, 1] < _GROW_M**2 and cov[2, 2] < _GROW_RAD**2:
+            self._grow(number, ends, found.beside < 0, at)
         turn = about_z(float(frame[2]))
         fit, cov = compose(frame, at), turn @ cov @ turn.T
         return (sightings(x, marks, match, self._offset_m, fit, cov), match), away
-
-    def accept(self) -> None:
-        """Note that what a scan said last stands; a place grows by what it shows besides, if it fits exactly."""
-        assert self._fit is not None
-        number, ends, new, at, self._last = self._fit
-        self._fit = None
-        if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
-            self._places[number] = _with_patches(self._places[number], patches, at)
 
     def wanted(self, away: float, *, fits: bool) -> bool:
         """Tell whether to make a place so far from the nearest one, which a scan has just fitted or not."""
@@ -152,7 +139,7 @@ class Places:
         None where the scan shows too little. ``number`` is the id that the first of the points will have.
         """
         patches = new_patches(ends, np.ones(len(ends), np.bool_), _MODEL)
-        cov = np.linalg.inv(np.sum([np.eye(3) * 1e-6, *(patch.told for patch in patches)], axis=0))
+        cov = np.linalg.inv(np.sum([np.eye(3) * 1e-6, *(patch.info for patch in patches)], axis=0))
         if cov[0, 0] + cov[1, 1] > _LEAST_M**2 or cov[2, 2] > _LEAST_RAD**2:
             return np.zeros((0, 12))
         self._places[number] = _with_patches(None, patches, np.zeros(3))
@@ -166,6 +153,7 @@ class Places:
     def _lasting(self, pose: Array) -> float:
         """Return what :func:`.matching.lasting` does of the way since a scan was last held against a place."""
         dx, dy, turn = (pose - self._last).tolist()
+        self._last = pose.copy()
         return lasting(math.hypot(dx, dy), wrap_scalar(turn), key_m=_LASTS_M, key_rad=_LASTS_RAD, most=_STILL)
 
     def _near(self, x: Array, marks: Array) -> tuple[Indices, float]:
@@ -185,6 +173,11 @@ class Places:
         away += _TURN_M * blind * np.abs(wrap(np.arctan2(dy, dx) - x[2]))
         k = int(np.argmin(away))
         return rows[first[k] : first[k] + 2], float(away[k])
+
+    def _grow(self, number: int, ends: BeamEnds, new: NDArray[np.bool_], at: Array) -> None:
+        """Add to a place what these beams ``(n,)`` of a scan from ``at`` ``(3,)`` in its frame show besides."""
+        if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
+            self._places[number] = _with_patches(self._places[number], patches, at)
 
 
 def _rows_of(cov: Array, number: int, offset: float) -> Array:

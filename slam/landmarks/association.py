@@ -233,8 +233,7 @@ def nearest_neighbour(
         px, py = sx + z[k, 0] * math.cos(bearing), sy + z[k, 0] * math.sin(bearing)
         kind, turn, end, of_wall = z[k, 5], z[k, 6] + x[2], z[k, 7], z[k, 5] == LINE
         ends = _ends(sx, sy, x[2], z[k]) if of_wall else (0.0, 0.0, 0.0, 0.0)
-        reach = math.hypot(z[k, 0], max(abs(z[k, 8]), abs(z[k, 9]))) if of_wall else z[k, 0]
-        window = 0.3 + 4.0 * (spread + reach * math.sqrt(p[2, 2]))
+        window = 0.3 + 4.0 * (spread + z[k, 0] * math.sqrt(p[2, 2]))
         candidates, surface = 0, -1
         for i in range(marks.shape[0]):
             dx, dy = x[3 + 2 * i] - px, x[4 + 2 * i] - py

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
-from slam.landmarks.curved_walls import lengthen
 from slam.landmarks.wall_evidence import DOUBT
 from slam.settings import Config, Count, Gap, NotNegative
 from slam.types import LINE, VIRTUAL, Array, Scan
@@ -185,7 +184,7 @@ class LandmarkBook:
             self._new = np.zeros(len(z), np.int64)
         seen = scan or _NO_SCAN
         count, self._tentative_count, doubtful = _review(
-            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, seen.range_max, self._now,
+            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, self._now,
             self._marks[: self.count], self._tentative, self._tentative_count, self._limits, at_once, self._new,
         )  # fmt: skip
         return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
@@ -213,6 +212,19 @@ def _seen_at(
             seen[count, 2] = marks[row, _KIND] == LINE
             count += 1
     return rows[:count], seen_ids[:count], seen[:count]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lengthen(x: Array, offset: float, z: Array, row: int, mark: Array) -> None:
+    """Stretch wall ``row`` to the piece of it that is seen, and take over its direction from the state."""
+    alpha = x[3 + 2 * row]
+    nx, ny = math.cos(alpha), math.sin(alpha)
+    sx, sy = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
+    c, s = math.cos(x[2] + z[1]), math.sin(x[2] + z[1])
+    for e in range(8, 10):
+        t = nx * (sy + z[0] * s + z[e] * c) - ny * (sx + z[0] * c - z[e] * s)
+        mark[_FROM], mark[_TO] = min(mark[_FROM], t), max(mark[_TO], t)
+    mark[_DIRECTION] = alpha
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -253,10 +265,9 @@ def _sightings(
     for k in range(z.shape[0]):
         if match[k] >= 0:
             marks[match[k], _SEEN] += 1.0
-            if z[k, KIND] == LINE:
-                lately = now - marks[match[k], LAST_SEEN] <= RECENT
-                lengthen(x, offset, z[k], match[k], marks[match[k]], lately)
             marks[match[k], LAST_SEEN] = now
+            if z[k, KIND] == LINE:
+                _lengthen(x, offset, z[k], match[k], marks[match[k]])
     for k in range(z.shape[0]):
         if match[k] != UNMATCHED:
             continue
@@ -323,8 +334,8 @@ def _sightings(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_through(
-    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, range_max: float, now: int,
-    marks: Array, limits: Array,
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
+    limits: Array,
 ) -> bool:  # fmt: skip
     """Count, for each point near by, whether three beams pass it or one ends at it; tell of any doubt."""
     margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
@@ -340,10 +351,10 @@ def _look_through(
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy
-        rho = math.sqrt(d2)
-        # Farther away, an uncertain heading moves the beams past a corner that is there, and a short lidar's end.
-        if rho > min(5.0, range_max - margin):
+        # Farther away, an uncertain heading moves the beams past a corner that is there.
+        if d2 > 25.0:
             continue
+        rho = math.sqrt(d2)
         b = round(wrap_scalar(math.atan2(dy, dx) - x[2] - angle_min) / increment)
         if b < 0:
             b += circle
@@ -370,12 +381,12 @@ def _look_through(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _review(
     x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
-    increment: float, range_max: float, now: int, marks: Array, tentative: Array, n: int, limits: Array,
-    at_once: bool, new: NDArray[np.int64],
+    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, at_once: bool,
+    new: NDArray[np.int64],
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Do what :meth:`LandmarkBook.review` does; return the numbers of new and of tentative ones, and of doubts."""
     found, kept = _sightings(x, offset, z, match, now, marks, tentative, n, limits, at_once, new)
-    return found, kept, _look_through(x, offset, ranges, angle_min, increment, range_max, now, marks, limits)
+    return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

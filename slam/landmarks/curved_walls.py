@@ -22,13 +22,8 @@ from numpy.typing import NDArray
 from slam.features.extraction import FeatureConfig
 from slam.types import LINE, Array
 
-__all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "forget", "lengthen", "straighten"]
+__all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "forget", "straighten"]
 
-_DIRECTION, _FROM, _TO = (
-    1,
-    6,
-    7,
-)  # columns of a landmark's marks: of its normal [rad]; where it begins and ends [m]
 _INFO, _PULL, _AT = 8, 9, 10  # Σ 1/σκ² [m²]; Σ κ/σκ² [m]; where along the wall it is tangent to its line [m]
 _KAPPA, _VAR_KAPPA = 10, 11  # columns of an observation row
 
@@ -128,25 +123,3 @@ def forget(z: Array, match: NDArray[np.int64], marks: Array) -> None:
         if match[k] >= 0 and z[k, 5] == LINE:
             marks[match[k], _INFO] -= 1.0 / z[k, _VAR_KAPPA]
             marks[match[k], _PULL] -= z[k, _KAPPA] / z[k, _VAR_KAPPA]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def lengthen(x: Array, offset: float, z: Array, row: int, mark: Array, lately: bool) -> None:
-    """Stretch wall ``row`` to the piece of it that is seen, and take over its direction from the state.
-
-    Places along a wall are told from its foot, which may be a hundred metres away and moves as the wall turns. One
-    that was seen ``lately`` has turned about where the robot is: what is there stays where it is.
-    """
-    alpha, before = x[3 + 2 * row], mark[_DIRECTION]
-    sx, sy = x[0] + offset * math.cos(x[2]), x[1] + offset * math.sin(x[2])
-    here = along_wall(sx, sy, alpha)
-    if lately:
-        moved = here - along_wall(sx, sy, before)
-        mark[_FROM] += moved
-        mark[_TO] += moved
-        mark[_AT] += moved
-    lean = x[2] + z[1] - alpha
-    for e in range(8, 10):
-        t = here + z[0] * math.sin(lean) + z[e] * math.cos(lean)
-        mark[_FROM], mark[_TO] = min(mark[_FROM], t), max(mark[_TO], t)
-    mark[_DIRECTION] = alpha

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
@@ -25,9 +24,8 @@ _SIGHTINGS = 3  # two points or walls say where the robot is; one more, should t
 
 
 def seen_from(
-    x: Array, marks: Array, offset: float, pose: Array, cov: Array, *,
-    drawn: NDArray[np.bool_] | bool = True, since: float = -math.inf,
-) -> tuple[Array, Indices]:  # fmt: skip
+    x: Array, marks: Array, offset: float, pose: Array, cov: Array, *, since: float = -math.inf
+) -> tuple[Array, Indices]:
     """Return observation rows ``(k, 12)`` of the landmarks seen last, and which they are ``(k,)``; of one none.
 
     Parameters
@@ -38,14 +36,12 @@ def seen_from(
         The sensor's, ahead of the robot's centre [m].
     pose, cov
         Where a scan fits the map that is drawn of these landmarks ``(3,)``, and its covariance there ``(3, 3)``.
-    drawn
-        Which landmarks there were when the map was drawn ``(n,)``: it says nothing of later ones.
     since
         The update, of those counted by the marks, that the landmarks were seen at or later.
     """
-    real = np.flatnonzero((marks[:, 0] != VIRTUAL) & (marks[:, LAST_SEEN] >= since) & drawn)
+    real = np.flatnonzero((marks[:, 0] != VIRTUAL) & (marks[:, LAST_SEEN] >= since))
     match = real[np.argsort(-marks[real, LAST_SEEN], kind="stable")[:_SIGHTINGS]]
-    if len(match) == 1:  # which does not say where the robot is
+    if len(match) == 1:  # which may be the newest, that was not there when the map was drawn
         match = match[:0]
     return sightings(x, marks, match, offset, pose, cov), match
 

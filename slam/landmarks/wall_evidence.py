@@ -81,11 +81,11 @@ def take_evidence(
         s00, s01, s11 = add_expected(row[2], row[3], row[4], p, match[k], h)
         off, turned = row[0] - rho, wrap_scalar(row[1] - bearing)
         nis = (s11 * off * off - 2.0 * s01 * off * turned + s00 * turned * turned) / (s00 * s11 - s01 * s01)
+        mark[DOUBT] = max(mark[DOUBT] + min(0.5 * nis, _MOST) - _ALLOWED, 0.0)
         row[2:5] *= factor
         if counted[match[k]]:
             continue  # another piece of the same wall, with the same error of the pose
         counted[match[k]] = True
-        mark[DOUBT] = max(mark[DOUBT] + min(0.5 * nis, _MOST) - _ALLOWED, 0.0)
         innovation = min(max(turned / math.sqrt(s11), -_CLIP), _CLIP)
         if now - mark[_LAST_SEEN] > _GAP:
             mark[_MEAN] = 0.0

@@ -127,59 +127,6 @@ def test_the_points_say_no_more_than_the_scan() -> None:
     assert np.linalg.eigvalsh(both).min() > 0.0, "two points say all three of the pose"
 
 
-def test_a_place_grows_by_what_is_accepted_alone() -> None:
-    rng = np.random.default_rng(3)
-    here = np.array([0.2, 0.1, 0.3])
-    half = scan_from(here, rng, view=math.pi)
-    places, _, state, marks = one_place(half, here)
-    extractor, scan = FeatureExtractor(FeatureConfig()), scan_from(here, rng)
-    extractor.extract(scan)
-
-    def points() -> int:
-        return len(places._places[4].surfaces.points)
-
-    had = points()
-    first = places.seen(state, marks, places.ends(scan, extractor))[0]
-    assert first is not None and points() == had
-    again = places.seen(state, marks, places.ends(scan, extractor))[0]  # which the filter has refused, so far
-    assert again is not None
-    np.testing.assert_array_equal(again[0], first[0])
-    places.accept()
-    assert points() > had + 20
-    later = places.seen(state, marks, places.ends(scan, extractor))[0]
-    assert later is not None and (later[0][:, 2] > first[0][:, 2]).all(), "from here it says the same again"
-
-
-@pytest.mark.parametrize("walls", [(1.2, -1.2), (1.2,)])
-def test_walls_alone_say_nothing_of_where_along_them(walls: tuple[float, ...]) -> None:
-    """A scan of them makes no place, and what fits to one along them is not told."""
-    rng, beams = np.random.default_rng(0), 360
-    bearings = -math.pi + 2.0 * math.pi / beams * np.arange(beams)
-
-    def scan(x: float, end: float = math.inf) -> Scan:
-        with np.errstate(divide="ignore"):
-            ranges = np.full(beams, math.inf) if math.isinf(end) else (end - x) / np.cos(bearings)
-            ranges = np.where(ranges > 0.0, ranges, math.inf)
-            for y in walls:
-                away = y / np.sin(bearings)
-                ranges = np.minimum(ranges, np.where(away > 0.0, away, math.inf))
-        ranges += SIGMA * rng.standard_normal(beams)
-        return Scan(np.where(ranges > REACH, math.inf, ranges), -math.pi, 2.0 * math.pi / beams, REACH)
-
-    extractor, places = FeatureExtractor(FeatureConfig()), Places(OFFSET, SIGMA)
-    extractor.extract(scan(0.0))
-    assert len(places.make(4, places.ends(scan(0.0), extractor))) == 0
-    places, _, state, marks = one_place(scan(0.0, end=3.0), np.zeros(3))
-    assert len(marks) == 2
-    open_end = scan(0.0)
-    extractor.extract(open_end)
-    seen = places.seen(state, marks, places.ends(open_end, extractor))[0]
-    if seen is not None:
-        told = information(seen[0], state)
-        assert told[0, 0] < 0.1, "along"
-        assert told[1, 1] > 1e3, "across"
-
-
 def test_a_scan_of_elsewhere_does_not_fit() -> None:
     rng = np.random.default_rng(5)
     places, _, state, marks = one_place(scan_from(np.array([2.0, 0.0, 0.0]), rng), np.zeros(3))

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import slam
-from slam import LINE, Observations, Odometry
+from slam import Observations, Odometry
 from slam.gaussian.stacked_update import NO_LIMITS
 from slam.geometry import compose, inverse, wrap
 from slam.landmarks.association import IGNORED, nearest_neighbour, predicted
@@ -178,19 +178,3 @@ def test_a_loop_closes_by_joint_compatibility_where_nearest_neighbour_fails(
     monkeypatch.setattr("slam.ekf.JOINT_LIMITS", NO_LIMITS)
     _, nearest_alone = close_a_loop("nearest", name)
     assert nearest_alone > 0.08  # matched one post too far
-
-
-@pytest.mark.parametrize(("ahead", "sigma", "off"), [(8.0, 0.04, 0.06), (15.0, 0.015, 0.03)])
-def test_a_piece_of_wall_far_ahead_is_looked_for_as_far_aside_as_its_place_is_unsure(
-    ahead: float, sigma: float, off: float
-) -> None:
-    """The wall's foot is a metre aside; the piece that is seen is not."""
-    x, p = np.array([0.0, 0.0, 0.0, 0.5 * math.pi, 1.0]), np.diag([1e-6, 1e-6, sigma**2, 1e-8, 1e-8])
-    marks, z = np.zeros((1, MARKS)), np.zeros((1, 12))
-    marks[0, :8] = LINE, 0.5 * math.pi, 50, 0, 0, 9, -ahead - 5.0, 2.0
-    middle = 1.0 - ahead
-    z[0, :6] = 1.0, 0.5 * math.pi + off, 1e-4 + middle**2 * 1e-5, middle * 1e-5, 1e-5, LINE
-    z[0, 6:10] = z[0, 1], 0.0, -ahead, 2.0 - ahead
-    match, distance = np.zeros(1, np.int64), np.zeros(1)
-    nearest_neighbour(x, p, 0.0, z, marks, 11.83, 0.2, math.radians(35.0), True, match, distance)
-    assert match[0] == 0 and distance[0] < 5.0

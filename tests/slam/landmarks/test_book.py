@@ -3,7 +3,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from slam import LINE, Scan
 from slam.landmarks.association import IGNORED, UNMATCHED
@@ -46,29 +45,6 @@ def test_a_far_piece_of_a_wall_is_no_second_one_once_the_gap_is_closed() -> None
     rows = np.array([far, wall(2.0, -1.6, 0.6)])  # the piece between, seen at last, is the wall's
     assert book.review(x, 0.0, rows, np.array([UNMATCHED, 0]))[0] == []
     assert book.marks[0, 6:8].tolist() == [-1.6, 2.0]
-
-
-@pytest.mark.parametrize(("unseen", "follows"), [(1, True), (50, False)])
-def test_a_wall_that_turns_where_the_robot_is_stays_there(unseen: int, follows: bool) -> None:
-    """Its foot, from which places along it are told, is a hundred metres away and moves by one."""
-    turn, y = 0.01, 100.0
-    book = LandmarkBook(LandmarkPolicy())
-    book.add(LINE, math.pi, None, extent=(-y - 2.0, -y + 2.0), bend=(1.0, 0.0, -y))  # x = -100, beside the robot
-    for _ in range(unseen - 1):
-        book.review(POSE, 0.0, np.zeros((0, 10)), np.zeros(0, np.int64))
-    alpha = math.pi + turn
-    at = np.array([-100.0, y])  # the wall x = -100 has turned about this point
-    x = np.array([-98.0, y, 0.0, alpha, math.cos(alpha) * at[0] + math.sin(alpha) * at[1]])
-    seen = wall(2.0 * math.cos(turn), -1.0, 1.0)
-    seen[[1, 6]] = alpha
-    book.review(x, 0.0, seen[None], np.array([0]))
-    middle = math.cos(alpha) * at[1] - math.sin(alpha) * at[0]
-    assert abs(middle + y) > 0.9, "as far as the foot has moved"
-    begin, end, tangent = book.marks[0, [6, 7, 10]]
-    if follows:
-        np.testing.assert_allclose([begin, end, tangent], middle + np.array([-2.0, 2.0, 0.0]), atol=0.03)
-    else:  # who knows what it has turned about since it was seen
-        np.testing.assert_allclose([begin, end, tangent], [-y - 2.0, -y + 2.0, -y], atol=0.1)
 
 
 def test_what_the_first_scan_shows_is_a_landmark_at_once() -> None:
@@ -162,14 +138,3 @@ def test_the_landmarks_just_seen_are_those_of_the_last_update() -> None:
         np.testing.assert_array_equal(ids, 3 * rows)
         np.testing.assert_array_equal(seen[:, :2], points[rows])
         np.testing.assert_array_equal(seen[:, 2], rows % 5 == 0)
-
-
-def test_a_corner_that_is_out_of_the_lidar_s_reach_stays() -> None:
-    """Beams that return nothing tell of what is within their range alone."""
-    x = np.array([0.0, 0.0, 0.0, 4.6, 0.0])
-    for reach, stays in ((4.0, True), (4.7, True), (8.0, False)):
-        book = LandmarkBook(LandmarkPolicy())
-        book.add(1.0, 0.0, None)
-        scan = Scan(np.full(360, math.inf), angle_min=ANGLE_MIN, angle_increment=INCREMENT, range_max=reach)
-        gone = [book.review(x, 0.0, np.zeros((0, 10)), np.zeros(0, np.int64), scan)[1] for _ in range(40)]
-        assert any(gone) != stays

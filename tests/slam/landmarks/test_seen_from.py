@@ -97,9 +97,3 @@ def test_points_that_no_scan_shows_are_no_landmarks() -> None:
     x, _, marks = world()
     marks[1, 0], marks[1, LAST_SEEN] = VIRTUAL, -np.inf
     assert seen_from(x, marks, OFFSET, POSE, COV)[1].tolist() == [0, 2, 3]
-
-
-def test_landmarks_that_came_after_the_drawing_are_left_out() -> None:
-    x, _, marks = world()
-    drawn = np.array([True, False, True, True])
-    assert seen_from(x, marks, OFFSET, POSE, COV, drawn=drawn)[1].tolist() == [0, 2, 3]

@@ -109,19 +109,6 @@ def test_a_wall_that_is_two_is_found_out() -> None:
     assert min(highest(seed, 2.0, 100) for seed in range(5)) > LandmarkPolicy().contradicted_after
 
 
-def test_pieces_of_a_wall_do_not_contradict_it_together() -> None:
-    """Five in a scan share the error of the pose, which is as P says."""
-    rng, marks, p, turned = np.random.default_rng(0), np.zeros((1, MARKS)), P.copy(), 3.0 * SIGMAS[1]
-    p[2, 2] = turned**2
-    most = 0.0
-    for now in range(2000):
-        z = np.vstack([sighting(rng, 0.0) for _ in range(5)])
-        z[:, 1] += turned * rng.standard_normal()
-        take_evidence(X, p, 0.0, z, np.zeros(5, np.int64), marks, now, np.zeros(2))
-        most = max(most, float(marks[0, DOUBT]))
-    assert most < LandmarkPolicy().contradicted_after
-
-
 def test_one_sighting_says_little() -> None:
     assert highest(0, 50.0, 1) < LandmarkPolicy().contradicted_after
 
