@@ -6,8 +6,8 @@ says nothing more. Several that agree do, and a gate that went on refusing them 
 
 - Nearly all is refused for a while, and three landmarks or more agree on one pose other than the believed one.
   Then the robot is elsewhere (its wheels spun, it was pushed).
-- Sightings of one landmark agree on a place, and are more than those that were ever believed, while others are
-  where they should be. Then the place was wrong, for it was put there by a misread label. One that was never seen
+- Most sightings of one landmark agree on a place, and are more than those that were ever believed, while others
+  are where they should be. Then the place was wrong, for it was put there by a misread label. One that was never seen
   again where it was put says nothing of others, so that nothing is lost by putting it elsewhere.
 """
 
@@ -45,6 +45,12 @@ class _Sighting(NamedTuple):
     believed: int  # how often the gate had let the landmark through before
 
 
+class _Refusal(NamedTuple):
+    place: Array  # (2,) where the landmark would be
+    slack: float  # [m]
+    number: int  # of refusals since the landmark was last believed, this one included
+
+
 class Elsewhere(NamedTuple):
     """A pose at which the landmarks lately refused would be where they are."""
 
@@ -60,8 +66,7 @@ class KnownIds:
         self._offset = offset
         self._lately: deque[_Sighting] = deque(maxlen=_LATELY)
         self._held: dict[int, int] = {}
-        # Places (2,) and their slack [m] since a landmark was last believed.
-        self._refused: dict[int, list[tuple[Array, float]]] = {}
+        self._refused: dict[int, deque[_Refusal]] = {}  # of each landmark, since it was last believed
 
     def note(self, ids: Sequence[int], z: Array, match: NDArray[np.int64], pose: Array) -> None:
         """Take note of observations ``(m, 12)`` from a pose ``(3,)``, and of those that were refused."""
@@ -75,18 +80,22 @@ class KnownIds:
                 self._refused.pop(landmark, None)
             else:
                 place = transform_points(pose, self._point(z[k])[None])[0]
-                self._refused.setdefault(landmark, []).append((place, _slack(z[k])))
+                refused = self._refused.setdefault(landmark, deque(maxlen=_LATELY))
+                refused.append(_Refusal(place, _slack(z[k]), refused[-1].number + 1 if refused else 1))
 
     def misplaced(self) -> list[int]:
         """Return the landmarks whose place is wrong, and forget what was known of them."""
         found = []
         for landmark, refused in self._refused.items():
-            held = self._held.get(landmark, 0)
-            if len(refused) > held and (held == 0 or self._others_hold(landmark, len(refused))):
-                places = np.array([place for place, _ in refused])
-                off = np.hypot(*(places - np.median(places, axis=0)).T)
-                if np.all(off < [slack for _, slack in refused]):
-                    found.append(landmark)
+            held, count = self._held.get(landmark, 0), refused[-1].number
+            if count <= held:
+                continue
+            places = np.array([r.place for r in refused])
+            off = np.hypot(*(places - np.median(places, axis=0)).T)
+            agree = int(np.count_nonzero(off < [r.slack for r in refused]))
+            strays = len(refused) - agree  # labels that were misread in between
+            if agree > strays and count - strays > held and (held == 0 or self._others_hold(landmark, count)):
+                found.append(landmark)
         for landmark in found:
             self._held.pop(landmark, None)
             del self._refused[landmark]

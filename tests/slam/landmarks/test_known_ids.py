@@ -138,6 +138,48 @@ def test_two_landmarks_alone_do_not_say_that_the_robot_is_elsewhere():
             np.testing.assert_allclose(other.pose, true, atol=1e-5)
 
 
+def refusals(known, places, believed=0):
+    """Believe landmark 7 so often at (3, 0), then refuse it at places (n, 2); return when it was misplaced.
+
+    Landmark 8 is where it should be all along.
+    """
+
+    def row(x, y):
+        z = np.zeros((1, 12))
+        z[0, :5] = math.hypot(x, y), math.atan2(y, x), COV[0, 0], 0.0, COV[1, 1]
+        return z
+
+    held, refused, pose = np.array([0]), np.array([IGNORED]), np.zeros(3)
+    for _ in range(3):
+        known.note([8], row(2.0, 1.0), held, pose)
+    for _ in range(believed):
+        known.note([7], row(3.0, 0.0), held, pose)
+    for k, (x, y) in enumerate(places):
+        known.note([7], row(x, y), refused, pose)
+        known.note([8], row(2.0, 1.0), held, pose)
+        if known.misplaced() == [7]:
+            return k + 1
+    return None
+
+
+@pytest.mark.parametrize("believed", [2, 40])
+@pytest.mark.parametrize("strays", [0, 1, 3])
+def test_a_misread_label_in_between_does_not_hold_a_wrong_place(believed, strays):
+    """It is dropped once those that agree outnumber the believed ones, and the strays among the last 24."""
+    places = [(1.0, -2.0 - k) for k in range(strays)] + [(4.0, 2.0)] * 100
+    found = refusals(KnownIds(0.0), places, believed)
+    # Strays that are longer ago than 24 refusals are counted with the others.
+    expected = max(believed, strays) + 1 + (strays if believed + 1 < 24 else 0)
+    assert found == expected
+
+
+def test_refusals_that_agree_on_nothing_drop_no_landmark_and_take_no_memory():
+    known = KnownIds(0.0)
+    scattered = np.random.default_rng(1).uniform([-8.0, -8.0], [8.0, 8.0], (500, 2))
+    assert refusals(known, scattered, believed=2) is None
+    assert len(known._refused[7]) == 24
+
+
 def test_the_gate_of_particles_is_that_of_their_mixture():
     """Against drawn samples of what is expected: the squared distance by their mean and covariance."""
     rng = np.random.default_rng(2)
