@@ -231,7 +231,8 @@ class Atlas:
         )  # fmt: skip
         if candidate is None:
             return False
-        self._candidates.append(candidate)
+        recent = [c for c in self._candidates if candidate.way_m - c.way_m <= config.closing.recent_m]
+        self._candidates = [*recent, candidate]
         self._rest = config.closing.every_m
         self._look_at = self._way + self._rest
         group = agreeing(self._candidates, config.closing)

@@ -11,6 +11,7 @@ from mecanum_env.sensing.raycast import beam_directions, cast_rays
 from slam import Observations, Odometry, Scan
 from slam.features.extraction import FeatureConfig, FeatureExtractor
 from slam.geometry import compose, exp, relative, wrap
+from slam.graph.atlas import Atlas
 from slam.graph.graph_slam import GraphSlam
 from slam.graph.loop_closing import Candidate, ClosingConfig, agreeing, find_candidate
 from slam.graph.matching import Links, SurfaceMap
@@ -222,6 +223,24 @@ def test_candidates_are_taken_only_where_several_from_places_apart_agree() -> No
     assert agreeing([*row, candidate(4, wrong)], settings) == []
     assert agreeing([candidate(0, right)] * 5, settings) == []  # from one place
     assert agreeing([*row[:3], candidate(30, right)], settings) == []  # long ago
+
+
+def test_only_candidates_that_may_still_agree_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = GraphSlamConfig()
+    atlas = Atlas(config, np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
+    nothing = Links(np.zeros(0, int), *[np.zeros(0)] * 3)
+    monkeypatch.setattr(Atlas, "_charted", lambda *_: (None, None))
+    ways = [0.0, 1.0, 12.0, 12.9, 20.0]
+    kept = []
+    for k, way in enumerate(ways):  # corrections that do not agree
+        candidate = Candidate(
+            k, way, np.array([way, 0.0]), np.array([float(k), 0.0, 0.0]), nothing, np.zeros(0, int)
+        )
+        monkeypatch.setattr("slam.graph.atlas.find_candidate", lambda *_, found=candidate, **__: found)
+        assert not atlas._close_loop(None, np.zeros(0, int), np.eye(3))  # type: ignore[arg-type]
+        kept.append([c.node for c in atlas._candidates])
+    assert config.closing.recent_m == 12.0
+    assert kept == [[0], [0, 1], [0, 1, 2], [1, 2, 3], [2, 3, 4]]
 
 
 def test_wheels_that_spin_are_not_believed() -> None:
