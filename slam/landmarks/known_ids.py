@@ -7,8 +7,8 @@ says nothing more. Several that agree do, and a gate that went on refusing them 
 - Nearly all is refused for a while, and three landmarks or more agree on one pose other than the believed one.
   Then the robot is elsewhere (its wheels spun, it was pushed).
 - Most sightings of one landmark agree on a place, and are more than those that were ever believed, while others
-  are where they should be. Then the place was wrong, for it was put there by a misread label. One that was never seen
-  again where it was put says nothing of others, so that nothing is lost by putting it elsewhere.
+  are where they should be. Then the place was wrong, for it was put there by a misread label. One that was never
+  seen again where it was put says nothing of others, so that nothing is lost by putting it elsewhere.
 """
 
 from __future__ import annotations

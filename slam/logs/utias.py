@@ -6,8 +6,8 @@ robot's centre reads bar codes; Vicon gives the truth. Subjects 1-5 are the robo
 
 What is recorded is not yet what the columns' names say, in the same way on every robot that was measured:
 
-- The range is a depth along the camera's axis, stretched: ρ = (z / cos φ − 0.0385 m) / 1.0152, and too long off the
-  axis, by 0.15 m (1 − cos φ).
+- The range is a depth along the camera's axis, stretched: ρ = (z / cos φ − 0.0385 m) / 1.0152, and too long off
+  the axis, by 0.15 m (1 − cos φ).
 - An observation's stamp is 0.03 s late.
 - Rows of zeros come in between, one or two at a time: nothing stops for them.
 - The base follows its commands 0.19 s later, and not quite: v = 1.038 ṽ − 0.09 m |ω̃|, never backwards (turning,
