@@ -50,11 +50,13 @@ def test_sound_files_are_read(name: str, tmp_path: Path) -> None:
     reader.use(tmp_path / entry)
 
 
-def test_the_same_number_is_the_same_file() -> None:
+def test_the_same_number_is_the_same_file(monkeypatch: pytest.MonkeyPatch) -> None:
     reader = READERS["carmen"]
-    first = [reader.case(3, k) for k in range(200, 210)]
-    assert first == [reader.case(3, k) for k in range(200, 210)]
-    assert first != [reader.case(4, k) for k in range(200, 210)]
+    first = [reader.case(3, k) for k in range(200, 240)]
+    monkeypatch.setattr(time, "time", lambda: 2e9)  # whenever it is made: packed files can hold the hour
+    assert any(case.entry.endswith(".gz") for case in first)
+    assert first == [reader.case(3, k) for k in range(200, 240)]
+    assert first != [reader.case(4, k) for k in range(200, 240)]
 
 
 def test_every_mutation_changes_something() -> None:

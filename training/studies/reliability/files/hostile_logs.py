@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import gzip
 from collections.abc import Callable, Mapping
 from functools import cache
 
 from training.studies.reliability.files import samples
-from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, Sound, one
+from training.studies.reliability.files.samples import Files, Hostile, Link, Pipe, Sound, one, packed
 
 __all__ = ["CARMEN", "DPSLAM", "PARK", "UTIAS"]
 
@@ -19,7 +18,7 @@ _NUMBERS = (
 @cache
 def _bomb(piece: bytes, megabytes: int) -> bytes:
     """Return gzip that unpacks to so many megabytes of the same."""
-    return gzip.compress(piece * (2**20 // len(piece))) * megabytes
+    return packed(piece * (2**20 // len(piece))) * megabytes
 
 
 def _lines(name: str, sound: Callable[[], Sound]) -> list[bytes]:
@@ -58,12 +57,12 @@ def _any(name: str, line: bytes) -> dict[str, Callable[[], Files]]:
         "gzip of 600 MB without a line": lambda: {name: _bomb(b"\0", 600)},
         "gzip of 600 MB of empty lines": lambda: {name: _bomb(b"\n", 600)},
         "gzip of 600 MB of lines": lambda: {name: _bomb(line + b"\n", 600)},
-        "gzip within gzip": lambda: {name: gzip.compress(_bomb(b"\0", 100))},
+        "gzip within gzip": lambda: {name: packed(_bomb(b"\0", 100))},
         "gzip, cut": lambda: {name: _bomb(line + b"\n", 2)[:1000]},
-        "gzip, nothing within": lambda: {name: gzip.compress(b"")},
+        "gzip, nothing within": lambda: {name: packed(b"")},
         "gzip, its header alone": lambda: {name: b"\x1f\x8b"},
         "gzip with a name of 10 MB": lambda: {name: b"\x1f\x8b\x08\x08\0\0\0\0\0\xff" + b"a" * 10_000_000},
-        "gzip with rubbish behind": lambda: {name: gzip.compress(line + b"\n") + b"rubbish" * 100},
+        "gzip with rubbish behind": lambda: {name: packed(line + b"\n") + b"rubbish" * 100},
         "a line of 2 MB": lambda: {name: line[:6] + b" " + b"1 " * 1_000_000},
         "a line without words": lambda: {name: b" " * 2_000_000},
         "null bytes": lambda: {name: bytes(1_000_000)},

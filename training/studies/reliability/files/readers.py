@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import importlib.util
 import tempfile
 import zlib
@@ -29,7 +28,7 @@ from training.studies.reliability.files import (
 )
 from training.studies.reliability.files.forked import load_command, run_forked
 from training.studies.reliability.files.mutations import mutated, mutated_cells
-from training.studies.reliability.files.samples import Files, Hostile, Sound, put
+from training.studies.reliability.files.samples import Files, Hostile, Sound, packed, put
 
 __all__ = ["READERS", "Case", "Reader"]
 
@@ -126,8 +125,8 @@ def _damaged(name: str, data: bytes, rng: np.random.Generator) -> tuple[str, byt
     if name.endswith((".clf", ".log", ".dat", ".txt")) and rng.random() < _LOG_PACKED:
         if rng.random() < 0.5:
             damaged, what = mutated(data, rng)
-            return f"{name}.gz", gzip.compress(damaged, 1), ["packed", *what]
-        damaged, what = mutated(gzip.compress(data, 1), rng)
+            return f"{name}.gz", packed(damaged, 1), ["packed", *what]
+        damaged, what = mutated(packed(data, 1), rng)
         return f"{name}.gz", damaged, ["gzip", *what]
     return name, *mutated(data, rng)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import os
@@ -22,7 +23,7 @@ from slam.landmarks.database import write_landmark_map
 
 __all__ = [
     "Files", "Hostile", "Link", "Pipe", "Sound", "as_json", "carmen", "configs", "dpslam", "images", "landmarks",
-    "one", "park", "policies", "put", "ros_map", "utias",
+    "one", "packed", "park", "policies", "put", "ros_map", "utias",
 ]  # fmt: skip
 
 
@@ -97,6 +98,11 @@ def images() -> Sound:
 
 
 # ---- logs ------------------------------------------------------------------------------------------------------
+
+
+def packed(data: bytes, level: int = 9) -> bytes:
+    """Return gzip that is the same at any time: its header tells no hour."""
+    return gzip.compress(data, level, mtime=0)
 
 
 def _circle(n: int) -> NDArray[np.float64]:
