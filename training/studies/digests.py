@@ -87,25 +87,39 @@ def _feed(made: Any, value: Any) -> None:
 
 
 def study(
-    out: Annotated[Path, typer.Option(help="The digests, as JSON.")] = Path("out/digests.json"),
+    out: Annotated[Path, typer.Option(dir_okay=False, help="The digests, as JSON.")] = Path("out/digests.json"),
     against: Annotated[
         Path | None, typer.Option(exists=True, dir_okay=False, help="Digests to compare with.")
     ] = None,
 ) -> None:
     """Digest episodes over every backend, agent and room, and compare with the digests of another commit."""
+    # What cannot be used is told before the minutes that the episodes take.
+    before = None if against is None else _read(against)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise typer.BadParameter(f"cannot write {out}: {error.strerror}", param_hint="--out") from error
     found: dict[str, str] = {}
     for episode in episodes():
         name = " ".join(map(str, episode))
         found[name] = digest(episode)
         print(name, found[name][:16], file=sys.stderr, flush=True)
-    out.parent.mkdir(parents=True, exist_ok=True)
     atomic_write(out, (json.dumps(found, indent=1) + "\n").encode())
-    if against is not None:
-        before: dict[str, str] = json.loads(against.read_text())
+    if before is not None:
         other = sorted(name for name in {*found, *before} if found.get(name) != before.get(name))
         print("\n".join([f"{len(found) - len(other)} of {len(found)} episodes are the same", *other]))
         if other:
             raise typer.Exit(1)
+
+
+def _read(path: Path) -> dict[str, str]:
+    try:
+        before = json.loads(path.read_bytes())
+    except ValueError:
+        before = None
+    if not isinstance(before, dict):
+        raise typer.BadParameter(f"{path} holds no digests; give what --out wrote", param_hint="--against")
+    return before
 
 
 if __name__ == "__main__":

@@ -44,3 +44,21 @@ def test_the_command_compares(
     before.write_text(json.dumps(found | {changed: "0"}))
     assert main(["study", "digests", "--out", str(tmp_path / "now.json"), "--against", str(before)]) == 1
     assert changed in capsys.readouterr().out
+
+
+def test_what_cannot_be_used_is_told_before_any_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def never() -> None:
+        raise AssertionError("an episode was begun")
+
+    monkeypatch.setattr(digests, "episodes", never)
+    file, good = tmp_path / "file", tmp_path / "good.json"
+    file.write_text("[1")
+    good.write_text("{}")
+    out = str(tmp_path / "now.json")
+    assert main(["study", "digests", "--out", out, "--against", str(file)]) == 2
+    assert "holds no digests" in capsys.readouterr().err
+    assert main(["study", "digests", "--out", str(file / "now.json"), "--against", str(good)]) == 2
+    assert "--out" in capsys.readouterr().err
+    assert main(["study", "digests", "--out", str(tmp_path)]) == 2
