@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -87,7 +88,12 @@ def run_dungeons(
     files = {digests[path]: path for path in paths}
     asked = [(path, (name, digests[path], scan, sensor)) for path in paths for name in dict.fromkeys(agent_names)]
     done = resume(out / _STORE, [job for _, job in asked], partial(_run, files), workers=workers, what="episodes")
-    rows = [done[job] | {"map": path.stem, "layout": layouts[path]} for path, job in asked]
+    stems = Counter(path.stem for path in paths)
+    rows = [
+        # 1.png and 1.PNG are two maps.
+        done[job] | {"map": path.stem if stems[path.stem] == 1 else path.name, "layout": layouts[path]}
+        for path, job in asked
+    ]
     summary = {"settings": settings, "published": PUBLISHED, "agents": summarise(rows)}
     shown = [{name: row[name] for name in _COLUMNS} for row in rows]
     atomic_write(out / _CSV, csv_table(shown, _COLUMNS, digits=6))
@@ -192,7 +198,8 @@ def _maps(folder: Path) -> list[Path]:
     paths = [path for path in folder.iterdir() if path.suffix.lower() == ".png" and path.is_file()]
     if not paths:
         raise BadInput(f"--maps {folder} holds no PNG maps; give the folder that does")
-    return sorted(paths, key=lambda p: (not p.stem.isdigit(), int(p.stem) if p.stem.isdigit() else 0, p.stem))
+    # Decimal digits alone: to isdigit() a superscript is one, too, of which int() makes nothing.
+    return sorted(paths, key=lambda p: (not p.stem.isdecimal(), int(p.stem) if p.stem.isdecimal() else 0, p.name))
 
 
 def _run(files: Mapping[str, Path], job: _Job) -> Row:

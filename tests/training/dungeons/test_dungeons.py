@@ -292,6 +292,15 @@ def test_bad_input_is_one_line(change, says, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_maps_of_odd_names_come_after_the_numbers_and_each_counts(tmp_path):
+    write(tmp_path, **{"10": hall(), "2": hall(), "²": hall()})
+    cv2.imwrite(str(tmp_path / "2.PNG"), hall()[:, ::-1])
+    summary = run_dungeons(tmp_path, [NEAREST], out=tmp_path / "out")
+    assert summary["agents"][NEAREST]["maps"] == 4
+    lines = (tmp_path / "out" / "rows.csv").read_text("utf-8").splitlines()[1:]
+    assert [line.split(",")[1] for line in lines] == ["2.PNG", "2.png", "10", "²"]
+
+
 def test_the_ratio_is_of_means_and_has_an_interval():
     def row(agent, name, path_m):
         return {
