@@ -13,6 +13,7 @@ from slam.files import quoted
 from slam.settings import PositiveShare, Seed, checked, require
 from training.episodes.team import read_team
 from training.runs.errors import BadInput
+from training.views.episode_files import spare_the_plan
 from training.views.team_files import kind_of
 
 __all__ = ["Explored", "explore"]
@@ -95,6 +96,7 @@ def explore(
         )  # fmt: skip
         kind = kind_of(team)
         episode = kind.prepare(**given)
+        spare_the_plan(episode)
     except BadInput as error:
         raise ValueError(str(error)) from error
     recorder = kind.recorder()

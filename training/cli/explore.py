@@ -83,7 +83,7 @@ def explore(
     from training.episodes import explore as single
     from training.episodes import team as several
     from training.runs.signals import interrupt_flag
-    from training.views.episode_files import Saver, check_extras
+    from training.views.episode_files import Saver, check_extras, spare_the_plan
     from training.views.film import filmed
     from training.views.team_files import kind_of
 
@@ -99,6 +99,7 @@ def explore(
     check_extras(extras)
     kind = kind_of(team)
     episode, recorder = kind.prepare(**given), kind.recorder()
+    spare_the_plan(episode)
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
     with interrupt_flag() as late, ExitStack() as stack:
         witnesses: list[Any] = [recorder, Saver(episode, lambda: kind.write(episode, recorder.recording()))]

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import tomli_w
 
+from mecanum_env.rooms.files.importers import MAP_SUFFIXES, image_of
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
 from slam.accounts.landmarks import write_landmarks
 from slam.files import plain_name
@@ -20,6 +21,7 @@ from training.episodes.explore import ENDINGS, EXTRAS, FILES, Course, Episode
 from training.episodes.recording import Recording
 from training.episodes.team import FILES as TEAM_FILES
 from training.episodes.team import ROBOT_FILE, TeamEpisode
+from training.runs.errors import BadInput
 from training.runs.running import versions, write_json, written_together
 from training.views.film import check_video
 from training.views.mcap_file import check_mcap, write_mcap
@@ -27,7 +29,8 @@ from training.views.report_page import episode_page
 from training.views.rerun_file import check_rerun, write_rerun
 
 __all__ = [
-    "Saver", "check_extras", "config_text", "episode_folder", "place_of", "who_of", "write_episode",
+    "Saver", "check_extras", "config_text", "episode_folder", "place_of", "spare_the_plan", "who_of",
+    "write_episode",
 ]  # fmt: skip
 
 
@@ -36,6 +39,29 @@ def check_extras(extras: Collection[str]) -> None:
     for extra, check in (("video", check_video), ("mcap", check_mcap), ("rerun", check_rerun)):
         if extra in extras:
             check()
+
+
+def spare_the_plan(episode: Course) -> None:
+    """Raise :class:`training.runs.errors.BadInput` where the episode's files would replace the plan it is of.
+
+    ROS names its maps map.yaml and map.pgm, too: a surveyed one was lost for what a robot made of it.
+    """
+    plan = episode.config.floor_plan
+    if plan is None:
+        return
+    files = [Path(plan)]
+    if files[0].suffix.lower() in MAP_SUFFIXES:
+        files.append(image_of(files[0]))
+    for file in map(Path.resolve, files):
+        if file.parent == episode.out.resolve() and _ours(file.name):
+            raise BadInput(
+                f"{episode.out} holds the floor plan {file.name}, which would be lost; choose another --out"
+            )
+
+
+def _ours(name: str) -> bool:
+    """Whether a file is one that episodes write, or take away where it is another's."""
+    return name in {*FILES, *EXTRAS.values(), *TEAM_FILES} or ROBOT_FILE.fullmatch(name) is not None
 
 
 def write_episode(
@@ -55,9 +81,8 @@ def episode_folder(
     out: Path, files: Collection[str], extras: Collection[str], film: Path | None
 ) -> Iterator[Path]:
     """Give a folder whose files, with the film, come into ``out`` together; those of another episode go."""
-    known, kept = {*FILES, *EXTRAS.values(), *TEAM_FILES}, {*files, *(EXTRAS[extra] for extra in extras)}
-    names = {path.name for path in out.glob("*")} - kept
-    others = sorted(name for name in names if name in known or ROBOT_FILE.fullmatch(name))
+    kept = {*files, *(EXTRAS[extra] for extra in extras)}
+    others = sorted(name for name in {path.name for path in out.glob("*")} - kept if _ours(name))
     with written_together(out, without=others) as folder:
         yield folder
         if film is not None:

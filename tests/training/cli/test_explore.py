@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+import training
 from agents.base import Goal
 from mecanum_env.arguments import make_config
 from mecanum_env.config import from_toml
@@ -180,6 +181,25 @@ def test_a_folder_where_a_file_goes_is_found_before_the_episode(
     assert main(["explore", "--rooms", "rectangular", "--out", str(tmp_path)]) == 2
     assert "map.png: it is a folder" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["map.png"]
+
+
+@pytest.mark.parametrize("robots", [[], ["--robots", "2"]])
+def test_the_plan_that_is_explored_is_not_overwritten(
+    robots: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_room(tmp_path / "map.pgm")
+    Path("map.yaml").write_text(
+        "image: map.pgm\nresolution: 0.05\norigin: [0, 0, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.2\n"
+    )
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for plan in ("map.yaml", str(tmp_path / "map.pgm")):
+        assert main(["explore", "--floor-plan", plan, "--max-steps", "2", "--out", ".", *robots]) == 2
+        assert "would be lost; choose another --out" in capsys.readouterr().err
+        with pytest.raises(ValueError, match="would be lost"):
+            training.explore(floor_plan=plan, max_steps=2, out=".")
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert main(["explore", "--floor-plan", "map.yaml", "--max-steps", "2", "--out", "out"]) == 0
 
 
 def test_ctrl_c_keeps_the_episode_so_far(tmp_path: Path) -> None:
