@@ -188,7 +188,7 @@ def train(
         sums = np.zeros(2)
         for k in range(batches):
             rows = order[k * config.batch : (k + 1) * config.batch]
-            told = rng.random(config.batch) >= config.untold
+            told = rng.random(len(rows)) >= config.untold
             batch = turned(batch_of(lessons, rows, told), int(rng.integers(4)), bool(rng.integers(2)))
             share = (epoch * batches + k) / (config.epochs * batches)
             for group in optimiser.param_groups:

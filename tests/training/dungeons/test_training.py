@@ -226,6 +226,13 @@ def test_training_goes_on_where_it_stopped(run_folder, tmp_path):
         np.testing.assert_array_equal(again.state_dict()[name], value, err_msg=name)
 
 
+def test_of_fewer_lessons_than_a_batch_one_batch_is_made(run_folder, tmp_path):
+    (tmp_path / "round-1").mkdir()
+    (tmp_path / "round-1" / "lessons").symlink_to(run_folder / "round-1" / "lessons")
+    _, curve = train(tmp_path, TrainingConfig(plans=1, validation_plans=1, epochs=1, batch=1000))
+    assert len(curve) == 1
+
+
 def test_training_may_begin_with_a_policy_and_trusts_the_tour_more(run_folder, tmp_path):
     from safetensors.numpy import load_file
 
