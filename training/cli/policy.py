@@ -98,6 +98,8 @@ def _join(sources: list[Path], target: Path) -> None:
     for path in (*sources, target):
         if path.suffix != ".safetensors":
             raise BadInput(f"cannot join {path}; several .safetensors become one .safetensors")
+    if target.resolve() in map(Path.resolve, sources):
+        raise BadInput(f"{target} is one of those that are joined, and would be lost; name another target")
     check_writable(target.parent, [target.name])
     with needs_extra("train"):
         from training.learning import policies

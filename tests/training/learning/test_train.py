@@ -170,6 +170,16 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_policy_that_is_joined_with_others_is_not_overwritten(tmp_path, capsys):
+    one, two = tmp_path / "one.safetensors", tmp_path / "two.safetensors"
+    for path in (one, two):
+        for suffix in (".safetensors", ".json"):
+            path.with_suffix(suffix).write_bytes(SHIPPED.with_suffix(suffix).read_bytes())
+    assert main(["policy", str(one), str(two), str(tmp_path / "." / "one.safetensors")]) == 2
+    assert "would be lost" in capsys.readouterr().err
+    assert one.read_bytes() == SHIPPED.read_bytes()
+
+
 def same_weights(one, other):
     assert one.keys() == other.keys()
     for name, weights in one.items():
