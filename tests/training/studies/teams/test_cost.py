@@ -19,3 +19,5 @@ def test_a_step_is_measured_for_each_number_of_robots(capsys: pytest.CaptureFixt
     assert "mean ms a robot" in capsys.readouterr().out
     assert main(["study", "team-cost", "--robots", "0"]) == 2
     assert "must be whole numbers in 1 … 64" in capsys.readouterr().err
+    assert main([*argv[:2], "--robots", "64", "--seeds", "0", "--rooms", "rectangular", "--steps", "21"]) == 2
+    assert "has room for 24 robots, not for 64" in capsys.readouterr().err
