@@ -37,10 +37,6 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 12, 24, 40  # margins
 _MOST = 1.6  # times the highest figure: what lies beyond is cut off
 _PANEL, _ROOM_ABOVE = (240, 260), 1.25  # of the picture: a chart's size [px]; room above the slowest robot alone
 _APART = 5.0  # of lines at one number of robots, that their intervals do not lie on each other [px] …
-_PANEL, _ROOM_ABOVE = (
-    (240, 260),
-    1.25,
-)  # [px] a chart of the picture; how far it goes beyond the slowest robot alone
 _SPREAD = 44.0  # … less, where there are many of them: so wide are all together [px]
 
 
@@ -231,7 +227,7 @@ def team_chart(suites: Mapping[str, Sequence[Scaling]]) -> bytes:
                 there = [(n, time.value) for n, time, also in every_n if also["reached_95"].value >= 1.0]
                 axes.plot(
                     [n for n, _ in there], [t for _, t in there], "--o" if k >= len(charts.COLOURS) else "-o",
-                    color=charts.COLOURS[k % len(charts.COLOURS)], markersize=3.5, label=s.agent,
+                    color=charts.COLOURS[k % len(charts.COLOURS)], markersize=3.5, label=charts.told(s.agent),
                 )  # fmt: skip
         if alone:
             fastest = min(alone)

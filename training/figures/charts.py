@@ -8,7 +8,7 @@ from io import BytesIO
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["COLOURS", "INK", "chart", "label", "png"]
+__all__ = ["COLOURS", "INK", "chart", "label", "png", "told"]
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#444444")
 """Told apart by those who do not see red and green apart, too (Okabe and Ito 2008)."""
@@ -41,6 +41,11 @@ def label(axes: Axes, title: str, x: str, y: str, *, log: str = "") -> None:
     axes.set_yscale("log" if "y" in log else "linear")
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize="small")
+
+
+def told(name: str) -> str:
+    """Return a name from outside as charts show it: what stands between two $ is no formula."""
+    return name.replace("$", r"\$")
 
 
 def png(figure: Figure) -> bytes:

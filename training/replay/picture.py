@@ -12,7 +12,7 @@ from mecanum_env.views.pictures import draw_map
 from slam.belief import Belief
 from slam.grids.occupancy import UNKNOWN
 from slam.types import Array
-from training.figures.charts import COLOURS, INK, chart, label
+from training.figures.charts import COLOURS, INK, chart, label, told
 
 __all__ = ["draw_belief", "draw_replay"]
 
@@ -43,7 +43,7 @@ def draw_replay(
     axes.plot(reckoned[:, 0], reckoned[:, 1], color=COLOURS[4], linewidth=1, label="odometry", zorder=1)
     axes.axis(shown)
     axes.set_aspect("equal")
-    label(axes, title.replace("$", r"\$"), "x [m]", "y [m]")  # no formula
+    label(axes, told(title), "x [m]", "y [m]")
     return figure
 
 

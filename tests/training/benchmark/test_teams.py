@@ -220,6 +220,8 @@ def test_a_picture_has_a_chart_for_each_suite_and_model() -> None:
     found = cv2.imdecode(np.frombuffer(team_chart(suites), np.uint8), cv2.IMREAD_COLOR)
     assert found.shape == (610, 540, 3) and found.std() > 10.0
     assert team_chart(suites) == team_chart(suites)
+    # A policy's file may be called anything: this would be a formula, and none that can be set.
+    assert team_chart({"rooms": [replace(line, agent="a$_$.safetensors") for line in lines]})
 
 
 def test_charts_keep_many_lines_within_and_need_one_robot_for_gains() -> None:

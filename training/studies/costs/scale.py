@@ -23,7 +23,7 @@ from mecanum_env.views.pictures import draw_map, episode_view
 from slam.formats import atomic_write
 from slam.types import Array
 from training.episodes.explore import Episode, prepare, run, run_whole
-from training.figures.charts import chart, label, png
+from training.figures.charts import chart, label, png, told
 from training.figures.tables import number, text_table
 from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import BadInput, bad_input
@@ -158,7 +158,8 @@ def _chart(found: Sequence[dict[str, Any]]) -> bytes:
         area = [row["area_m2"] for row in one["rows"]]
         for axis, key in zip(axes, ("step_ms", "decision_ms"), strict=True):
             times = [row[key]["median"] if row[key] else np.nan for row in one["rows"]]
-            axis.plot(area, times, "o-", label=f"{one['plan']}, {one['agent']}" if key == "decision_ms" else None)
+            name = told(f"{one['plan']}, {one['agent']}") if key == "decision_ms" else None
+            axis.plot(area, times, "o-", label=name)
     label(axes[0], "A step, median", "explored [m²]", "ms", log="x")
     label(axes[1], "A decision, median", "explored [m²]", "ms", log="x")
     for axis in axes:

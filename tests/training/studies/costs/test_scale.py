@@ -52,3 +52,8 @@ def test_what_was_typed_wrong_is_told_in_a_line(tmp_path: Path, capsys: pytest.C
     assert not out.exists()
     assert main(["study", "scale", str(plan), "--agent", "brisk", "--out", str(tmp_path)]) == 2
     assert "brisk-tour" in capsys.readouterr().err
+
+
+def test_a_plan_may_be_called_what_a_chart_would_take_for_a_formula() -> None:
+    rows = [{"area_m2": 10.0, "step_ms": {"median": 1.0}, "decision_ms": None}]
+    assert scale._chart([{"plan": "a$_$", "agent": "tour", "rows": rows}])
