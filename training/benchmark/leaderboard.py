@@ -7,7 +7,7 @@ of the marks stays as it is.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,8 +46,7 @@ def tables(summary: Summary) -> str:
     parts = ["### Time to 95 % coverage [s], IQM\n"]
     parts += [markdown(table) for table in overview(suites, versus, config["baseline"], limits=False)]
     for suite, found in suites.items():
-        seeds = config["seeds"][suite]
-        parts.append(f"### {suite}\n\nSeeds {min(seeds)} to {max(seeds)}.\n")
+        parts.append(f"### {suite}\n\nSeeds {_ranges(config['seeds'][suite])}.\n")
         parts.append(markdown(figures_table(ranked(found), _COLUMNS, limits=_WITH_LIMITS)))
         ends = {agent: words for agent, words in summary["ends"][suite].items() if set(words) != {"covered"}}
         if ends:
@@ -58,6 +57,17 @@ def tables(summary: Summary) -> str:
     )
     parts.append(f"Backend {', '.join(config['backends'])}; {versions}.\n")
     return "\n".join(parts)
+
+
+def _ranges(seeds: Sequence[int]) -> str:
+    """Return seeds as ``0 to 9, 12``."""
+    ends: list[list[int]] = []
+    for seed in sorted(seeds):
+        if ends and seed == ends[-1][-1] + 1:
+            ends[-1][1:] = [seed]
+        else:
+            ends.append([seed])
+    return ", ".join(" to ".join(map(str, part)) for part in ends)
 
 
 def _counted(words: Mapping[str, int]) -> str:

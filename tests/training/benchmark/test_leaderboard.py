@@ -42,6 +42,10 @@ def test_tables_rank_the_agents_and_tell_the_whole_story():
     assert "`lost` time 1, stuck 1" in suite and "`slow` covered" not in suite
     overview = text.split("### apartments\n")[0]
     assert "-20.0 % [-30.0, -10.0]" in overview and "apartments-slippery" in overview
+    assert "Seeds 10000 to 10001." in suite
+    chosen = SUMMARY["config"] | {"seeds": {"apartments": [7, 0, 2, 1], "apartments-slippery": [5]}}
+    told = tables(SUMMARY | {"config": chosen})
+    assert "Seeds 0 to 2, 7." in told and "Seeds 5." in told, "not those between them"
     assert "numpy 2.4" in text and "baseline slow" not in text
 
 
