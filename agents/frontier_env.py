@@ -139,7 +139,8 @@ class ExploreFrontierEnv(ChoiceEnv):
     takes the first, the cheapest to reach.
 
     ``terminated``: as in the environment beneath, or the robot has found nothing left to choose for two seconds
-    (``info["end"]`` says why). ``truncated``: after ``time_limit_s`` of the configuration.
+    (``info["end"]`` says why); the observation is blank. ``truncated``: after ``time_limit_s`` of the
+    configuration; the observation shows what there was to choose.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - declared so by gymnasium.Env
@@ -221,6 +222,10 @@ class ExploreFrontierEnv(ChoiceEnv):
                 if self._choice is not None and len(self._choice.index) > 1:
                     break
                 self._take(0)
+        if truncated and not terminated:
+            # Whoever learns estimates from the last observation what would have followed: it shows what there is
+            # to choose, though no choice is due.
+            self._choice = agent.survey(self.base.belief)
         info["duration_s"] = steps * config.step_s
         if terminated or truncated:
             covered = bool(info.get("is_success", False))

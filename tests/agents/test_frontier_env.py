@@ -64,6 +64,16 @@ def test_an_episode_adds_up(rooms):
         assert (np.diff(ways) >= 0).all()  # cheapest first
 
 
+def test_out_of_time_the_last_observation_shows_what_would_follow():
+    """Who bootstraps from it is not told of a blank map at the time 0."""
+    env = gymnasium.make(ID, rooms="apartment", config={"time_limit_s": 3.0})
+    observation, _, info = play(env, 3)[-1]
+    assert info["end"] == "time" and observation["present"].any()
+    assert env.observation_space.contains(observation)
+    assert observation["state"][STATE.index("time")] == pytest.approx(3.0 / 300.0, abs=1e-3)
+    np.testing.assert_array_equal(env.unwrapped.action_masks(), observation["present"] > 0.5)
+
+
 def test_the_masks_are_those_of_the_candidates():
     env = gymnasium.make(ID, rooms="apartment").unwrapped
     observation, _ = env.reset(seed=0)
