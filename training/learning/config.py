@@ -6,6 +6,8 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import slam as backends
+from agents.learned.chooser import ChooserConfig
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import NOISE_PRESETS
 from slam.settings import (
@@ -16,10 +18,12 @@ from slam.settings import (
     Finite,
     NotNegative,
     Seed,
+    SettingError,
     Share,
     Span,
     Within,
     check_name,
+    from_mapping,
     require,
 )
 
@@ -55,6 +59,7 @@ class RoomsConfig(Config):
         super().__post_init__()
         require(len(self.rooms) > 0, f"{type(self).__name__}.rooms must name some")
         check_names(f"{type(self).__name__}.rooms", self.rooms, room_registry.names())
+        check_names(f"{type(self).__name__}.slam", [self.slam], backends.names())
 
     @property
     def reward(self) -> dict[str, float]:
@@ -70,12 +75,16 @@ class WorldConfig(RoomsConfig):
     """Where view points are chosen: with one noise an environment in turn."""
 
     noises: tuple[str, ...] = ("nominal",)
-    driver: Mapping[str, Any] = field(default_factory=dict)
+    driver: Mapping[str, Any] = field(default_factory=dict)  # laid over ChooserConfig
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(len(self.noises) > 0, f"{type(self).__name__}.noises must name some")
         check_names(f"{type(self).__name__}.noises", self.noises, NOISE_PRESETS)
+        try:
+            from_mapping(ChooserConfig, self.driver)
+        except SettingError as error:
+            raise SettingError(type(self).__name__, f"driver.{error.path}", error.problem) from None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +103,16 @@ class PpoConfig(Config):
     clip_range: Annotated[float, Within("[0, 1000]")] = 0.2
     target_kl: Annotated[float, Within("[0, 1000]")] = 0.03
     chunk: Count = 16  # rollouts between two checkpoints
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rollout = self.n_steps * self.environments
+        # Advantages are divided by their spread in a batch, and one alone has none: weights would be NaN.
+        require(
+            self.batch_size > 1 and rollout % self.batch_size != 1,
+            f"{type(self).__name__}.batch_size must be 2 at least and leave no single decision of a rollout's "
+            f"{rollout} (n_steps times environments), got {self.batch_size}",
+        )
 
     @property
     def size(self) -> int:
@@ -157,3 +176,10 @@ class TrainConfig(Config):
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            self.width % self.heads == 0,
+            f"{type(self).__name__}.width must be a multiple of heads, got {self.width} and {self.heads}",
+        )

@@ -154,6 +154,11 @@ def test_the_configurations_that_come_with_the_package_are_valid(path):
         (["--config", "{folder}/seeds.toml"], "in [0, 999]"),
         (["--config", "{folder}/rooms.toml"], "rooms must be a list"),
         (["--config", "{folder}/three.toml"], "seeds must be a list of 2"),
+        (["--config", "{folder}/heads.toml"], "width must be a multiple of heads, got 64 and 5"),
+        (["--config", "{folder}/alone.toml"], "PpoConfig.batch_size must be 2 at least"),
+        (["--config", "{folder}/left.toml"], "leave no single decision of a rollout's 16"),
+        (["--config", "{folder}/slam.toml"], "did you mean 'ekf'?"),
+        (["--config", "{folder}/driver.toml"], "driver.choice.patch_cells must be a whole number"),
         (["--resume"], "holds no run to go on with"),
     ],
 )
@@ -163,6 +168,11 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     (tmp_path / "seeds.toml").write_text("[world]\nseeds = [0, 10000]")
     (tmp_path / "rooms.toml").write_text("[world]\nrooms = 5")
     (tmp_path / "three.toml").write_text("[world]\nseeds = [0, 1, 2]")
+    (tmp_path / "heads.toml").write_text("heads = 5")
+    (tmp_path / "alone.toml").write_text("[ppo]\nbatch_size = 1")
+    (tmp_path / "left.toml").write_text("[ppo]\nn_steps = 8\nenvironments = 2\nbatch_size = 15")
+    (tmp_path / "slam.toml").write_text("[world]\nslam = 'ekff'")
+    (tmp_path / "driver.toml").write_text("[world.driver.choice]\npatch_cells = 300")
     arguments = [a.format(folder=tmp_path) for a in arguments]
     assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
