@@ -22,13 +22,15 @@ from agents.learned.policy_files import read_policy
 from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
-from slam.settings import Config, Duration, Positive
+from slam.settings import Config, Duration, Gap, Length, Positive, checked, require
 from slam.types import Array
 
 __all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
 
 FORMAT = "mecanum-slam drive policy 2"
 SHIPPED = Path(__file__).parent / "policies" / "ppo.safetensors"
+
+_PLANNING = {"goal_m": Length, "keep_m": Gap, "stall_m": Gap}  # what each of PlanSettings may be
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,12 +48,15 @@ class PpoConfig(Config):
 
 def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
     """Read a policy: the network, and what the JSON file says of its training; see :func:`read_policy`."""
+    return read_policy(path, FORMAT, _made)
 
-    def made(weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]) -> DriveNetwork:
-        settings = PlanSettings(**{key: float(value) for key, value in described["planning"].items()})
-        return DriveNetwork(weights, settings, uncertainty=bool(described["uncertainty"]))
 
-    return read_policy(path, FORMAT, made)
+def _made(weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]) -> DriveNetwork:
+    told = described["planning"]
+    require(set(told) == set(_PLANNING), f"planning must have {', '.join(_PLANNING)} and nothing else")
+    settings = {name: checked(f"planning.{name}", kind, told[name]) for name, kind in _PLANNING.items()}
+    uncertainty = checked("uncertainty", bool, described["uncertainty"])
+    return DriveNetwork(weights, PlanSettings(**settings), uncertainty=uncertainty)
 
 
 class Ppo(Agent):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from agents.learned.choice_network import ChoiceEnsemble
 from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
 from slam.belief import Belief
-from slam.settings import Config, argument, from_mapping
+from slam.settings import Config, Few, argument, checked, from_mapping, require
 
 __all__ = ["FORMAT", "SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
 
@@ -46,8 +47,19 @@ def _made(
 ) -> tuple[ChoiceEnsemble, ChooserConfig]:
     if [described.get("candidate"), described.get("state")] != [list(CANDIDATE), list(STATE)]:
         raise ValueError("it was trained on other columns than this version shows; train it anew")
-    network = ChoiceEnsemble(weights, heads=int(described["heads"]))
-    return network, from_mapping(ChooserConfig, described["driver"])
+    network = ChoiceEnsemble(weights, heads=checked("heads", Few, described["heads"]))
+    driver = from_mapping(ChooserConfig, described["driver"])
+    _check_patches(network, driver)
+    return network, driver
+
+
+def _check_patches(network: ChoiceEnsemble, driver: ChooserConfig) -> None:
+    """Raise ``ValueError`` unless patches are as large as those that the networks were trained on."""
+    side = math.isqrt(network.patch_numbers // 4)
+    require(
+        driver.choice.patch_cells == side,
+        f"choice.patch_cells must be {side}, as it was trained with, got {driver.choice.patch_cells}",
+    )
 
 
 class PpoFrontier(Chooser):
@@ -68,6 +80,7 @@ class PpoFrontier(Chooser):
         self._network, driver, self.about = load_choice_policy(self.policy_path)
         with argument("config.driver"):
             driver = from_mapping(ChooserConfig, settings.driver, base=driver)
+            _check_patches(self._network, driver)
         super().__init__(driver, **body)
 
     def choose(self, belief: Belief) -> Goal | None:

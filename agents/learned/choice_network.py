@@ -83,6 +83,8 @@ class ChoiceNetwork(Layers):
             "row": (width, len(CANDIDATE)), "state": (width, len(STATE)), "patch_1": (2 * width, seen),
             "patch_2": (width, 2 * width), "token": (width, width), "score": (1, width),
         }  # fmt: skip
+        if width % self._heads:
+            raise ValueError(f"heads {self._heads} do not divide the width {width}")
         norms = ["norm"]
         for k in range(self._layers):
             norms += [f"layers.{k}.norm_1", f"layers.{k}.norm_2"]
@@ -112,7 +114,14 @@ class ChoiceEnsemble:
 
     def __init__(self, weights: Mapping[str, Floats], *, heads: int) -> None:
         self.members = [ChoiceNetwork(own, heads=heads) for own in apart(weights)]
+        if len({own._layers for own in self.members}) > 1:
+            raise ValueError("networks that choose together must have as many layers")
         self._all = _Together(self.members, heads=heads)
+
+    @property
+    def patch_numbers(self) -> int:
+        """How many numbers each network takes for a patch."""
+        return int(self.members[0]._weights["patch_1.weight"].shape[-1])
 
     def scores(self, choice: Choice) -> Floats:
         """Return the mean of the log-probabilities of each candidate ``(m,)``, of all networks and both views."""

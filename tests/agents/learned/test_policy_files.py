@@ -11,10 +11,11 @@ import pytest
 from safetensors.numpy import load_file
 
 import agents
-from agents.learned.choice_network import ChoiceNetwork, apart
+from agents.learned.choice_network import ChoiceEnsemble, ChoiceNetwork, apart, joined
 from agents.ppo import SHIPPED
 
 POLICIES = SHIPPED.parent
+PLANNING = {"goal_m": 8.0, "keep_m": 1.5, "stall_m": 4.0}
 
 
 @pytest.fixture
@@ -68,6 +69,10 @@ def test_weights_of_another_kind_are_refused(kind: str, policy: Path) -> None:
     "values",
     [
         {"planning": []}, {"planning": {"goal_m": [1]}}, {"planning": {"goal_m": 10**400}}, {"planning": None},
+        {"planning": {}}, {"planning": PLANNING | {"goal_m": float("nan")}},
+        {"planning": PLANNING | {"keep_m": -1.0}}, {"planning": PLANNING | {"stall_m": "4"}},
+        {"planning": PLANNING | {"more": 1.0}},
+        {"uncertainty": "no"}, {"uncertainty": None}, {"uncertainty": 1},
         {"format": "a\nb\x1b"}, {"format": "x" * 10_000}, {"format": []},
         {"format": "mecanum-slam station policy 2"}, {"format": "mecanum-slam choice policy 1"},
     ],
@@ -76,6 +81,39 @@ def test_descriptions_that_do_not_fit_are_refused(values: dict[str, object], pol
     about = policy.with_suffix(".json")
     about.write_text(json.dumps(json.loads(about.read_text()) | values))
     refused(policy)
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"heads": 4.7}, "heads must be a whole number"), ({"heads": "4"}, "heads must be a whole number"),
+        ({"heads": 5}, "heads 5 do not divide the width 64"),
+        ({"driver": {"choice": {"patch_cells": 8}}}, "patch_cells must be 16, as it was trained with, got 8"),
+    ],
+)  # fmt: skip
+def test_a_choice_policy_whose_description_is_of_other_networks_is_refused(
+    values: dict[str, object], words: str, policy: Path
+) -> None:
+    for suffix in (".safetensors", ".json"):
+        shutil.copy(POLICIES / f"ppo-frontier{suffix}", policy.with_suffix(suffix))
+    about = policy.with_suffix(".json")
+    about.write_text(json.dumps(json.loads(about.read_text()) | values))
+    refused(policy, words)
+
+
+def test_patches_of_another_size_than_it_was_trained_with_are_refused_before_the_first_choice() -> None:
+    with pytest.raises(
+        ValueError, match=r"^config\.driver: choice\.patch_cells must be 16, as it was trained with"
+    ):
+        agents.make("ppo-frontier", config={"driver": {"choice": {"patch_cells": 8}}})
+
+
+def test_networks_that_choose_together_have_as_many_layers() -> None:
+    weights = apart(load_file(POLICIES / "ppo-frontier.safetensors"))[0]
+    heads = json.loads((POLICIES / "ppo-frontier.json").read_text())["heads"]
+    fewer = {name: w for name, w in weights.items() if not name.startswith("layers.1.")}
+    with pytest.raises(ValueError, match="as many layers"):
+        ChoiceEnsemble(joined([fewer, weights]), heads=heads)
 
 
 @pytest.mark.parametrize("text", [b"[" * 100_000, b"\xff", b"", b"9" * 5000])
