@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
@@ -56,10 +57,24 @@ def read_policy(
         raise ValueError(f"policy {path} does not fit together: {quoted(_words(error), 300)[1:-1]}") from error
 
 
-def write_policy(path: Path, weights: Mapping[str, NDArray[Any]], described: Mapping[str, Any]) -> None:
-    """Write a policy's weights, in half precision, and the JSON file beside them."""
+def write_policy(
+    path: Path, weights: Mapping[str, NDArray[Any]], described: Mapping[str, Any],
+    check: Callable[[Path], object] | None = None,
+) -> None:  # fmt: skip
+    """Write a policy's weights, in half precision, and the JSON file beside them.
+
+    ``check`` reads them first, under another name: a ``ValueError`` of its leaves an earlier policy as it was.
+    """
     # Safetensors writes memory as it lies, whatever its order.
     halved = {name: np.asarray(value, dtype=np.float16, order="C") for name, value in weights.items()}
+    if check is not None:
+        with TemporaryDirectory() as folder:
+            trial = Path(folder) / path.name
+            write_policy(trial, weights, described)
+            try:
+                check(trial)
+            except ValueError as error:
+                raise ValueError(str(error).replace(str(trial), str(path))) from error
     atomic_write(path, save(halved))
     atomic_write(path.with_suffix(".json"), json.dumps(described, indent=1, ensure_ascii=False) + "\n")
 

@@ -6,6 +6,8 @@ import io
 import math
 import pickle
 import zipfile
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,6 +21,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from torch import Tensor, nn
 
 from agents.learned.choice import CANDIDATE, STATE
+from slam.files import quoted
 
 __all__ = ["ChoiceExtractor", "ChoiceNetwork", "ChoicePolicy", "read_zip"]
 
@@ -176,9 +179,13 @@ def read_zip(path: Path) -> dict[str, NDArray[np.float32]]:
             state = torch.load(io.BytesIO(archive.read("policy.pth")), weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
         raise ValueError(f"{path} holds more than weights, which is not read: it may be code") from error
-    except (OSError, KeyError, zipfile.BadZipFile, RuntimeError) as error:
+    except (OSError, LookupError, EOFError, ValueError, zipfile.BadZipFile, zlib.error, RuntimeError) as error:
         raise ValueError(f"{path} is no zip that stable-baselines3 wrote: {error}") from error
-    weights = {name.removeprefix(_INSIDE): value for name, value in state.items() if name.startswith(_INSIDE)}
+    named = {str(name): value for name, value in state.items()} if isinstance(state, Mapping) else {}
+    weights = {name.removeprefix(_INSIDE): value for name, value in named.items() if name.startswith(_INSIDE)}
     if not weights:
         raise ValueError(f"{path} holds another policy than training.learning.networks.ChoicePolicy")
-    return {name: value.numpy() for name, value in weights.items()}
+    for name, value in weights.items():
+        if not (isinstance(value, Tensor) and value.dtype == torch.float32 and value.layout == torch.strided):
+            raise ValueError(f"{path} holds {quoted(name)}, which is no array of numbers in single precision")
+    return {name: value.detach().numpy() for name, value in weights.items()}

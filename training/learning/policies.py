@@ -42,6 +42,11 @@ def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, trai
         Where to.
     training
         What else the JSON file says; ``config``, the training's, among it: it says how the policy drives.
+
+    Raises
+    ------
+    ValueError
+        Where weights and configuration do not fit together; an earlier policy there stays.
     """
     config = training["config"]
     driver = to_mapping(from_mapping(ChooserConfig, config["world"]["driver"]))
@@ -49,8 +54,7 @@ def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, trai
         "format": ppo_frontier.FORMAT, "heads": config["heads"], "candidate": list(CANDIDATE),
         "state": list(STATE), "driver": driver, **training,
     }  # fmt: skip
-    write_policy(target, weights, described)
-    ppo_frontier.load_choice_policy(target)  # it is read back
+    write_policy(target, weights, described, check=ppo_frontier.load_choice_policy)
 
 
 def export_run(run: Path, target: Path) -> None:
@@ -104,7 +108,7 @@ def join_policies(sources: Sequence[Path], target: Path) -> None:
             "training_seeds": described[0].get("training_seeds"),
             "curve": [{"run": k} | line for k, it in enumerate(described, 1) for line in it.get("curve", [])],
         }  # fmt: skip
-    except TypeError as error:
+    except (OverflowError, TypeError) as error:
         raise ValueError(f"what a policy's JSON file says of its training is of another form: {error}") from error
     export_policy(joined(members), target, training)
 
@@ -136,7 +140,11 @@ def write_zip(source: Path, target: Path, member: int | None = None) -> None:
     model = make_model(config, env, config.ppo)
     network = cast("ChoicePolicy", model.policy).network
     weights = apart(load_file(source))[(member or 1) - 1]
-    network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
+    try:
+        network.load_state_dict({name: torch.as_tensor(value) for name, value in weights.items()})
+    except RuntimeError as error:
+        about = source.with_suffix(".json")
+        raise ValueError(f"the config in {about} is of other networks than {source}: {error}") from error
     save_model(model, target)
     env.close()
 
@@ -149,8 +157,7 @@ def _export_drive(run: Path, target: Path, progress: Mapping[str, Any], curve: A
         "planning": {name: config[name] for name in PlanSettings._fields},
         **_training(progress, curve),
     }  # fmt: skip
-    write_policy(target, load_file(run / "best.safetensors"), described)
-    ppo.load_drive_policy(target)  # it is read back
+    write_policy(target, load_file(run / "best.safetensors"), described, check=ppo.load_drive_policy)
 
 
 def _training(progress: Mapping[str, Any], curve: Any) -> dict[str, Any]:

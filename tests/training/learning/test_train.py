@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import zipfile
@@ -315,6 +316,26 @@ def test_members_are_trained_apart_and_choose_together(tmp_path, capsys):
     assert not (tmp_path / "x.zip").exists()
 
 
+def test_what_does_not_fit_is_refused_and_leaves_the_policy_that_was_there(tmp_path, capsys):
+    about = json.loads(SHIPPED.with_suffix(".json").read_text())
+    zipped, mine, like = tmp_path / "one.zip", tmp_path / "mine.safetensors", tmp_path / "like.json"
+    assert main(["policy", str(SHIPPED), str(zipped), "--member", "1"]) == 0
+    assert main(["policy", str(zipped), str(mine), "--like", str(SHIPPED.with_suffix(".json"))]) == 0
+    before = [mine.with_suffix(suffix).read_bytes() for suffix in (".safetensors", ".json")]
+    capsys.readouterr()
+    like.write_text(json.dumps(about | {"config": about["config"] | {"heads": 2}}))
+    assert main(["policy", str(zipped), str(mine), "--like", str(like)]) == 2
+    error = capsys.readouterr().err
+    assert f"policy {mine} does not fit together" in error and len(error.splitlines()) == 1
+    assert [mine.with_suffix(suffix).read_bytes() for suffix in (".safetensors", ".json")] == before
+    # The weights are of another width than the file beside them says.
+    mine.with_suffix(".json").write_text(json.dumps(about | {"config": about["config"] | {"width": 32}}))
+    assert main(["policy", str(mine), str(tmp_path / "x.zip")]) == 2
+    error = capsys.readouterr().err
+    assert "is of other networks than" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "x.zip").exists()
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
 def test_what_is_learned_on_a_gpu_goes_on_on_a_processor(tmp_path):
     with pytest.raises(Killed):
@@ -346,3 +367,33 @@ def test_a_damaged_policy_is_named(tmp_path):
         load_choice_policy(target)
     with pytest.raises(ValueError, match="is missing"):
         load_choice_policy(tmp_path / "none.safetensors")
+
+
+INSIDE = "features_extractor.network.a"
+NO_WEIGHTS = [
+    [1, 2], {3: 3}, torch.zeros(3), {INSIDE: 3}, {INSIDE: torch.zeros(3, dtype=torch.bfloat16)},
+    {INSIDE: torch.eye(3).to_sparse()},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("what", [b"", b"abc" * 100, *NO_WEIGHTS], ids=range(2 + len(NO_WEIGHTS)))
+def test_a_zip_of_anything_else_is_refused(what, tmp_path):
+    if not isinstance(what, bytes):
+        buffer = io.BytesIO()
+        torch.save(what, buffer)
+        what = buffer.getvalue()
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("policy.pth", what)
+    with pytest.raises(ValueError, match=r"a\.zip (holds|is no zip)"):
+        read_zip(tmp_path / "a.zip")
+
+
+def test_a_damaged_zip_is_refused(tmp_path):
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policy.pth", np.random.default_rng(0).integers(0, 9, 5000).astype(np.uint8).tobytes())
+    data = bytearray(path.read_bytes())
+    data[100:140] = bytes(40)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match="is no zip that stable-baselines3 wrote"):
+        read_zip(path)
