@@ -22,7 +22,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from slam.files import read_json
+from slam.files import quoted, read_json
 from slam.formats import atomic_write, replacing
 from slam.settings import to_mapping
 from training.learning.config import PpoConfig
@@ -63,10 +63,20 @@ class FolderRun:
         }  # fmt: skip
         path = out / "progress.json"
         if path.exists():
-            self._progress |= read_json(path, nan=True)
+            self._progress |= self._noted(path)
             self._catch_up()
         if self._progress["config"] != settings:
             raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+
+    def _noted(self, path: Path) -> dict[str, Any]:
+        """Return what an earlier process noted; ``ValueError`` where the file says nothing of the kind."""
+        found = read_json(path, nan=True)
+        kinds: dict[str, Any] = {"best": (int, float, type(None)), "wall_s": (int, float)}
+        for name, usual in self._progress.items():
+            value: Any = found.get(name, usual) if isinstance(found, dict) else None
+            if not isinstance(value, kinds.get(name, type(usual))) or (type(usual) is int and value < 0):
+                raise ValueError(f"{path} is damaged: {name} is {quoted(value)}; choose another --out")
+        return dict(found)
 
     def _catch_up(self) -> None:
         """Take the last chunk for learned where the run was killed after its checkpoint, before the note of it."""

@@ -141,6 +141,13 @@ def test_a_checkpoint_that_is_none_is_refused(tmp_path):
         run(tmp_path, workers=1)
 
 
+@pytest.mark.parametrize("note", ["null", "[]", '"x"', '{"chunk": "a"}', '{"chunk": -3}', '{"wall_s": null}'])
+def test_a_note_that_is_none_is_refused(tmp_path, note):
+    (tmp_path / "progress.json").write_text(note)
+    with pytest.raises(ValueError, match=r"progress\.json is damaged: .*; choose another --out$"):
+        run(tmp_path)
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_the_configurations_that_come_with_the_package_are_valid(path):
     _read(path.stem, None)
