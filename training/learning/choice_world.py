@@ -18,7 +18,7 @@ from training.learning.jump_world import JumpWorld
 from training.runs.processes import start_worker
 from training.truth.places import TruePlaces
 
-__all__ = ["Families", "Rehearsal", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
+__all__ = ["Families", "Rehearsal", "Whole", "make_rehearsal", "make_world", "mirrored", "world_of_worker"]
 
 
 class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -66,12 +66,27 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         return masks
 
 
+class Whole(Families):
+    """Families of rooms explored in ``ExploreFrontier-v0``.
+
+    An episode that ends with nothing left to choose before 95 % are mapped is charged with the time until the
+    limit, as in rehearsals and trials: else to give up would pay.
+    """
+
+    def step(self, action: SupportsInt) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated and not info["is_success"]:
+            reward += self._world.time_1_s * (self._world.time_limit_s - info["time_s"])
+        return observation, reward, terminated, truncated, info
+
+
 class Rehearsal(Families):
     """Families of rooms explored in jumps: every other episode, by chance, in a mirror, and the reward shaped.
 
     The shaping is the difference of a potential (Ng, Harada and Russell, ICML 1999), what is still to go by
-    hindsight, 0 at the end: what is best to do stays the same, and a choice's part in how long it takes is felt
-    at once.
+    hindsight, 0 at the end, discounted as what follows is, by ``gamma`` a second: what is best to do stays the
+    same, and a choice's part in how long it takes is felt at once.
     """
 
     env: JumpWorld
@@ -124,7 +139,7 @@ def make_world(world: WorldConfig, index: int = 0) -> Families:
         rooms=world.rooms[0], slam=world.slam, noise=world.noises[index % len(world.noises)],
         driver=dict(world.driver), reward=world.reward, config={"time_limit_s": world.time_limit_s},
     )  # fmt: skip
-    return Families(env, world)
+    return Whole(env, world)
 
 
 def make_rehearsal(world: WorldConfig, rehearsal: RehearsalConfig) -> Rehearsal:

@@ -16,7 +16,7 @@ from agents.frontier_env import as_observation, choice_space  # noqa: E402
 from agents.learned import choice_network  # noqa: E402
 from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored  # noqa: E402
 from agents.learned.chooser import ChooserConfig  # noqa: E402
-from training.learning.choice_world import make_world  # noqa: E402
+from training.learning.choice_world import Whole, make_world  # noqa: E402
 from training.learning.config import WorldConfig  # noqa: E402
 from training.learning.networks import ChoiceNetwork  # noqa: E402
 from training.learning.semi_markov import Durations, SemiMarkovBuffer  # noqa: E402
@@ -164,6 +164,26 @@ def test_where_an_episode_is_broken_off_its_value_is_discounted_by_time():
     assert abs(value) > 1e-3
     model.learn(4, callback=Durations())
     np.testing.assert_allclose(model.rollout_buffer.rewards.ravel(), [0, gamma**3 * value] * 2, rtol=1e-4)
+
+
+class _GivenUp(gymnasium.Env):
+    """An episode that ends after 20 s, of which each has cost 0.1."""
+
+    def __init__(self, success: bool, truncated: bool) -> None:
+        self._ended = {"time_s": 20.0, "duration_s": 20.0, "is_success": success}, truncated
+
+    def step(self, action):
+        info, truncated = self._ended
+        return {}, -2.0, not truncated, truncated, info
+
+
+@pytest.mark.parametrize(
+    ("success", "truncated", "charged"), [(True, False, -2.0), (False, True, -2.0), (False, False, -10.0)]
+)
+def test_giving_up_costs_the_time_until_the_limit(success, truncated, charged):
+    world = Whole(_GivenUp(success, truncated), WorldConfig(time_1_s=-0.1, time_limit_s=100.0))
+    assert world.step(0)[1] == pytest.approx(charged)
+    assert isinstance(make_world(WorldConfig()), Whole)
 
 
 def test_a_room_serves_as_many_episodes_as_it_is_told_to():
