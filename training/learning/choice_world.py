@@ -91,9 +91,9 @@ class Rehearsal(Families):
 
     env: JumpWorld
 
-    def __init__(self, env: JumpWorld, world: WorldConfig, *, shaping_s_m: float) -> None:
+    def __init__(self, env: JumpWorld, world: WorldConfig, *, shaping_s_m: float, gamma: float = 1.0) -> None:
         super().__init__(env, world)
-        self._shaping, self._mirrored = world.time_1_s * shaping_s_m, False
+        self._shaping, self._gamma, self._mirrored = world.time_1_s * shaping_s_m, gamma, False
         self._places: dict[tuple[str, int], TruePlaces] = {}
 
     def reset(
@@ -110,7 +110,7 @@ class Rehearsal(Families):
         """Step; the reward is shaped by what is still to go."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._potential = self._potential, 0.0 if terminated else self._worth(observation)
-        shaped = float(reward) + self._potential - before
+        shaped = float(reward) + self._gamma ** info["duration_s"] * self._potential - before
         return self._seen(observation), shaped, terminated, truncated, info
 
     def _seen(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -148,7 +148,7 @@ def make_rehearsal(world: WorldConfig, rehearsal: RehearsalConfig) -> Rehearsal:
     env = JumpWorld(
         driver={**world.driver, "patience": patience}, time_limit_s=world.time_limit_s, time_1_s=world.time_1_s
     )
-    return Rehearsal(env, world, shaping_s_m=rehearsal.shaping_s_m)
+    return Rehearsal(env, world, shaping_s_m=rehearsal.shaping_s_m, gamma=rehearsal.gamma)
 
 
 def world_of_worker(make: Callable[[], Families]) -> Families:

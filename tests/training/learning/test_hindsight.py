@@ -51,20 +51,23 @@ def test_no_tour_is_shorter_than_the_best_of_all_orders():
     assert min(ratios) >= 1.0 - 1e-9 and np.mean(ratios) < 1.15
 
 
-def _rehearsal(shaping_s_m, rooms="rectangular"):
+def _rehearsal(shaping_s_m, rooms="rectangular", gamma=1.0):
     world = WorldConfig(rooms=(rooms,), time_1_s=-0.1)
-    return make_rehearsal(world, RehearsalConfig(shaping_s_m=shaping_s_m))
+    return make_rehearsal(world, RehearsalConfig(shaping_s_m=shaping_s_m, gamma=gamma))
 
 
-def test_shaping_adds_up_to_what_there_was_to_go_at_the_beginning():
+@pytest.mark.parametrize("gamma", [1.0, 0.9])
+def test_shaping_adds_up_to_what_there_was_to_go_at_the_beginning(gamma):
+    """Discounted as PPO discounts: else it would tell what is best to do."""
     totals = []
-    for world in (_rehearsal(0.0), _rehearsal(2.0)):
+    for world in (_rehearsal(0.0), _rehearsal(2.0, gamma=gamma)):
         world.reset(options={"rooms": "rectangular", "room_seed": 3})
         first = world.price_from_here()
-        total, done = 0.0, False
+        total, weight, done = 0.0, 1.0, False
         while not done:
-            _, reward, terminated, truncated, _ = world.step(0)
-            total += reward
+            _, reward, terminated, truncated, info = world.step(0)
+            total += weight * reward
+            weight *= gamma ** info["duration_s"]
             done = terminated or truncated
         totals.append(total)
     assert first > 1.0
