@@ -116,7 +116,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self.config, room_seed_of(options, episode_seed),
             given=options.get("floor_plan", self._plan), start=options.get("start_pose"),
         )  # fmt: skip
-        self._step_limit = _time_limit_of_caller() or (self.spec.max_episode_steps if self.spec else None)
+        self._step_limit = _time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
         self._set_up(plan, episode_seed)
         info = self.first_look()
         self._viewer.show(self)
@@ -337,19 +337,20 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         )
 
 
-def _time_limit_of_caller() -> int | None:
-    """Return the step limit of the ``TimeLimit`` wrapper that this very reset came through, if any.
+def _time_limit_of_caller(env: gymnasium.Env[Any, Any]) -> int | None:
+    """Return the least step limit of the ``TimeLimit`` wrappers of ``env`` that this very reset came through.
 
-    ``gym.make(…, max_episode_steps=N)`` tells nobody but that wrapper, yet ``progress`` and the last step's
+    ``gym.make(…, max_episode_steps=N)`` tells nobody but such a wrapper, yet ``progress`` and the last step's
     ``episode_metrics`` depend on it; a wrapper of our own to pass it on would rule out ``vector_entry_point``.
     """
+    limits = set()
     frame = inspect.currentframe()
     while frame is not None:
         wrapper = frame.f_locals.get("self")
-        if isinstance(wrapper, TimeLimit):
-            return int(wrapper._max_episode_steps)
+        if isinstance(wrapper, TimeLimit) and wrapper.unwrapped is env:  # else another's, that steps this one
+            limits.add(int(wrapper._max_episode_steps))
         frame = frame.f_back
-    return None
+    return min(limits, default=None)
 
 
 @njit(cache=True, nogil=True)

@@ -196,6 +196,16 @@ def test_the_last_step_carries_the_metrics() -> None:
     assert metrics["time_to_95_s"] is None or metrics["time_to_95_s"] <= 0.4
 
 
+def test_the_least_of_several_step_limits_is_the_last_step() -> None:
+    env = gym.wrappers.TimeLimit(make(config={"coverage_target": 1.0}), 2)  # beside one of 3000
+    env.reset(seed=0)
+    env.step(np.zeros(3, np.float32))
+    observation, _, _, truncated, info = env.step(np.zeros(3, np.float32))
+    assert truncated
+    assert observation["progress"][0] == 1.0
+    assert info["is_success"] is False and info["episode_metrics"]["steps"] == 2
+
+
 def test_reaching_the_target_terminates_with_success() -> None:
     env = make(config={"coverage_target": 0.05})
     env.reset(seed=0)
