@@ -48,8 +48,11 @@ def register_envs() -> None:
         gymnasium.register("mecanum_env/ExploreFrontier-v0", entry_point="agents.frontier_env:ExploreFrontierEnv")
 
 
-def parallel_env(robots: int = 3, **settings: Any) -> ExploreParallelEnv:
-    """Return several robots as a PettingZoo environment (:mod:`mecanum_env.team`); needs the extra ``multi``."""
+def parallel_env(robots: int | None = None, **settings: Any) -> ExploreParallelEnv:
+    """Return several robots as a PettingZoo environment (:mod:`mecanum_env.team`); needs the extra ``multi``.
+
+    ``robots`` is how many; left out, what ``team`` says of the settings, else 3.
+    """
     from mecanum_env.team.parallel_env import ExploreParallelEnv
 
     return ExploreParallelEnv(robots=robots, **settings)

@@ -94,3 +94,8 @@ def test_all_are_done_together_when_the_target_is_covered() -> None:
     assert terminated == {"robot_0": True, "robot_1": True}
     assert env.agents == []
     assert all(info["is_success"] for info in infos.values())
+
+
+def test_the_team_s_settings_say_how_many_robots_there_are_where_the_argument_does_not() -> None:
+    made = (mecanum_env.parallel_env(**given) for given in ({}, {"team": {"robots": 2}}, {"robots": 4}))
+    assert [len(env.possible_agents) for env in made] == [3, 2, 4]
