@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -38,13 +39,25 @@ class Fleet:
     def __init__(self, worlds: Sequence[World]) -> None:
         self.worlds = tuple(worlds)
         robots = [world.robot for world in self.worlds]
-        self._space = build_space(self.worlds[0].plan)
-        self._bodies = add_robots(self._space, robots)
+        self._build_space()
         self._radii = np.array([robot.circumscribed_radius_m for robot in robots])
         self._halves = 0.5 * np.array([(robot.length_m, robot.width_m) for robot in robots])
         self._fastest = np.array([world.fastest_m_s for world in self.worlds])
         self._near = np.zeros(len(robots), np.bool_)  # of others, in the last step
         self._check_starts()
+
+    def _build_space(self) -> None:
+        self._space = build_space(self.worlds[0].plan)
+        self._bodies = add_robots(self._space, [world.robot for world in self.worlds])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return for a copy or a pickle all but what is pymunk's; see :class:`World`."""
+        return {name: value for name, value in vars(self).items() if name not in ("_space", "_bodies")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make a copy whole."""
+        vars(self).update(state)
+        self._build_space()
 
     def _check_starts(self) -> None:
         for world, (body, _) in zip(self.worlds, self._bodies, strict=True):

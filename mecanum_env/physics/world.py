@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pymunk
@@ -134,11 +134,26 @@ class World:
         self._work[POSE] = plan.start
         self._wrap_pose()
         self._contacts = Contacts()
-        self._space = build_space(plan)
-        ((self._body, self._touch),) = add_robots(self._space, (robot,))
-        self._body_is_behind = True
+        self._build_space()
         self._forgotten = _PERSISTENCE  # pymunk's steps since it last found a contact
         self._check_start()
+
+    def _build_space(self) -> None:
+        self._space = build_space(self.plan)
+        ((self._body, self._touch),) = add_robots(self._space, (self.robot,))
+        self._body_is_behind = True
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return for a copy or a pickle all but what is pymunk's, which is built anew.
+
+        A space that pymunk copies reports contacts to the original, and its walls have lost their neighbours.
+        """
+        return {name: value for name, value in vars(self).items() if name not in ("_space", "_body", "_touch")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make a copy whole."""
+        vars(self).update(state)
+        self._build_space()
 
     def put(self, pose: ArrayLike) -> bool:
         """Put the robot at rest at another pose ``(3,)`` of the world frame; tell whether it fits there.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 import subprocess
 import sys
 import warnings
@@ -204,6 +206,26 @@ def test_the_least_of_several_step_limits_is_the_last_step() -> None:
     assert truncated
     assert observation["progress"][0] == 1.0
     assert info["is_success"] is False and info["episode_metrics"]["steps"] == 2
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_goes_on_as_the_original_does(duplicate: Any) -> None:
+    """Into walls, too: pymunk's own copies report contacts to the original."""
+    env = make(slam="ekf")
+    env.reset(seed=1)
+    env.step(np.zeros(3, np.float32))
+    twin = duplicate(env)
+    for k in range(60):
+        action = np.array([1.0, -0.2, 0.1 if k % 2 else -0.1], np.float32)
+        (observation, *rest, info), (other, *other_rest, other_info) = env.step(action), twin.step(action)
+        assert rest == other_rest and all(np.array_equal(observation[key], other[key]) for key in other)
+        assert np.array_equal(info["true_pose"], other_info["true_pose"])
+    assert info["collisions"] == other_info["collisions"] > 0
+    before = twin.unwrapped.truth.pose
+    env.step(-action)
+    assert np.array_equal(twin.unwrapped.truth.pose, before)
+    again, other_again = env.reset()[0], twin.reset()[0]  # the next episode is the same, too
+    assert all(np.array_equal(again[key], other_again[key]) for key in again)
 
 
 def test_reaching_the_target_terminates_with_success() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium
@@ -99,3 +100,19 @@ def test_all_are_done_together_when_the_target_is_covered() -> None:
 def test_the_team_s_settings_say_how_many_robots_there_are_where_the_argument_does_not() -> None:
     made = (mecanum_env.parallel_env(**given) for given in ({}, {"team": {"robots": 2}}, {"robots": 4}))
     assert [len(env.possible_agents) for env in made] == [3, 2, 4]
+
+
+def test_a_copy_goes_on_as_the_original_does() -> None:
+    env = mecanum_env.parallel_env(robots=2, rooms="apartment")
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    goes = {name: np.array([1.0, 0.3, 0.0], np.float32) for name in env.agents}
+    for _ in range(40):
+        observations, rewards, *_, infos = env.step(goes)
+        others, other_rewards, *_, other_infos = twin.step(goes)
+        assert rewards == other_rewards
+        for name, observation in observations.items():
+            assert all(np.array_equal(observation[key], others[name][key]) for key in observation)
+    contacts = [[info[key] for key in ("collisions", "robot_collisions")] for info in infos.values()]
+    assert [[info[key] for key in ("collisions", "robot_collisions")] for info in other_infos.values()] == contacts
+    assert np.sum(contacts) > 0
