@@ -57,7 +57,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
     copy : bool
         Whether ``reset`` and ``step`` return copies of the observations; else views, until the next step.
     max_episode_steps : int, optional
-        Steps after which an episode is truncated.
+        Steps after which an episode is truncated; None or -1: none.
     context : str, optional
         How processes are started (``"fork"``, ``"forkserver"``, ``"spawn"``); the platform's way if left out.
     make : callable, optional
@@ -88,6 +88,8 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         num_envs = checked("num_envs", Environments, num_envs)
         workers = cores if workers is None else checked("workers", Environments, workers)
+        if isinstance(max_episode_steps, int) and max_episode_steps == -1:  # as gym.make has it
+            max_episode_steps = None
         limit = None if max_episode_steps is None else checked("max_episode_steps", Steps, max_episode_steps)
         copy = checked("copy", bool, copy)
         if context is not None:
@@ -149,13 +151,12 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         return self._observations(page), infos
 
     def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
-        """Step every environment by its row of the actions ``(num_envs, a)``."""
+        """Step every environment by its row of the actions ``(num_envs, a)``, in the action space's precision."""
         board = self._board
         if np.shape(actions) != board.actions.shape:
             raise ValueError(f"actions must be {board.actions.shape}, got {np.shape(actions)}")
-        if not np.isfinite(actions).all():  # before any environment has stepped
+        if not _taken(actions, board.actions):  # before any environment has stepped
             raise ValueError(f"actions must be finite numbers in [-1, 1], got {quoted(actions)}")
-        board.actions[:] = actions
         number = self._turn()
         page, infos = board.pages[number], self._infos(number, self._step(number))
         return (
@@ -251,6 +252,18 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
             for row, more in rest.items():
                 infos = self._add_info(infos, more, row)
         return infos
+
+
+def _taken(actions: Any, into: NDArray[Any]) -> bool:
+    """Write actions into an array of their shape; tell whether they are finite numbers, as that one has them."""
+    if np.iscomplexobj(actions):
+        return False
+    try:
+        with np.errstate(over="ignore"):
+            into[:] = actions
+    except (TypeError, ValueError):
+        return False
+    return bool(np.isfinite(into).all())
 
 
 def _make(settings: dict[str, Any]) -> gymnasium.Env[Any, Any]:

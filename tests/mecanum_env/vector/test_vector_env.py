@@ -211,12 +211,23 @@ def test_what_one_raises_the_caller_raises_and_goes_on(envs: ExploreVectorEnv) -
 def test_an_action_that_is_refused_has_moved_nobody(envs: ExploreVectorEnv) -> None:
     theirs = like()
     assert_same(envs.reset(seed=7), theirs.reset(seed=7))
-    bad = np.full((3, 3), 0.5, np.float32)
-    bad[2, 1] = np.inf
-    with pytest.raises(ValueError, match=r"actions must be finite numbers in \[-1, 1\], got"):
-        envs.step(bad)
+    for wrong in (np.inf, 1e300, 1j, "left", None):  # 1e300 is infinite in single precision
+        bad = np.full((3, 3), 0.5, np.result_type(type(wrong)) if isinstance(wrong, float | complex) else object)
+        bad[2, 1] = wrong
+        with pytest.raises(ValueError, match=r"actions must be finite numbers in \[-1, 1\], got"):
+            envs.step(bad)
     assert_same(envs.step(np.full((3, 3), 0.5, np.float32)), theirs.step(np.full((3, 3), 0.5, np.float32)))
     theirs.close()
+
+
+def test_minus_one_is_no_step_limit_as_for_a_single_environment() -> None:
+    envs = gym.make_vec(ID, num_envs=1, **SETTINGS | {"max_episode_steps": -1, "workers": 1})
+    envs.reset(seed=0)
+    for _ in range(3):
+        observation, _, _, truncated, _ = envs.step(np.zeros((1, 3), np.float32))
+    assert not truncated.any()
+    assert observation["progress"][0, 0] == np.float32(3 / 3000)  # of time_limit_s
+    envs.close()
 
 
 def test_other_processes_warn_of_no_more_than_this_one(capfd: pytest.CaptureFixture[str]) -> None:
