@@ -70,6 +70,9 @@ class ExploreVecEnv(VecEnv):
         each, done = self._of_each(infos), terminated | truncated
         for k in np.flatnonzero(done).tolist():
             each[k] = final[k] | {"terminal_observation": last[k]}
+            if "episode_metrics" in each[k]:  # what one did not reach is NaN in an array of those that others did
+                metrics = each[k]["episode_metrics"]
+                each[k]["episode_metrics"] = {m: None if v != v else v for m, v in metrics.items()}
         for info, over, cut in zip(each, terminated.tolist(), truncated.tolist(), strict=True):
             info["TimeLimit.truncated"] = cut and not over
         return observations, rewards.astype(np.float32), done, each
@@ -84,7 +87,10 @@ class ExploreVecEnv(VecEnv):
                 continue
             if id(mask) not in rows:
                 rows[id(mask)] = np.flatnonzero(mask).tolist()
-            parts = self._of_each(values) if isinstance(values, dict) else values.tolist()
+            if isinstance(values, dict):
+                parts = self._of_each(values)
+            else:
+                parts = values.tolist() if values.ndim == 1 else [*values.copy()]
             for k in rows[id(mask)]:
                 each[k][key] = parts[k]
         return each

@@ -44,6 +44,8 @@ def test_every_bit_is_that_of_stable_baselines_own() -> None:
             assert info.keys() == other.keys()
             assert info["TimeLimit.truncated"] == other["TimeLimit.truncated"]
             assert info["coverage"] == other["coverage"] and info["reward_terms"] == other["reward_terms"]
+            assert type(info["true_pose"]) is type(other["true_pose"])
+            assert np.array_equal(info["true_pose"], other["true_pose"])
             if "terminal_observation" in other:
                 ended += 1
                 last, their_last = info["terminal_observation"], other["terminal_observation"]
@@ -52,6 +54,17 @@ def test_every_bit_is_that_of_stable_baselines_own() -> None:
     assert ended >= 6
     ours.close()
     theirs.close()
+
+
+def test_what_one_episode_did_not_reach_is_none_beside_one_that_did() -> None:
+    settings: dict[str, Any] = {"slam": "ekf", "max_episode_steps": 80, "config": {"coverage_target": 1.0}}
+    ours = ExploreVecEnv(2, seed=10, workers=1, **settings)
+    ours.reset()
+    for _ in range(80):
+        *_, infos = ours.step(np.tile(np.array([0.6, 0.0, 0.6], np.float32), (2, 1)))
+    ours.close()
+    reached, not_reached = (info["episode_metrics"]["time_to_50_s"] for info in infos)
+    assert reached > 0.0 and not_reached is None
 
 
 def _turned() -> gymnasium.Env[Any, Any]:
