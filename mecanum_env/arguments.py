@@ -31,7 +31,9 @@ from slam.registry import config_type
 from slam.registry import make as make_slam
 from slam.settings import Within, argument, check_name, checked, from_mapping, require
 
-__all__ = ["Settings", "check_arguments", "make_backend", "make_config", "make_plan", "room_seed_of"]
+__all__ = [
+    "Settings", "check_arguments", "make_backend", "make_config", "make_plan", "reset_options", "room_seed_of",
+]  # fmt: skip
 
 Settings = str | Mapping[str, Any]
 """A name, or a mapping that configures what it names."""
@@ -118,10 +120,18 @@ def check_arguments(given: Iterable[str], *takers: Callable[..., Any]) -> None:
         check_name("argument", name, valid)
 
 
+def reset_options(given: Mapping[str, Any] | None, names: Iterable[str]) -> dict[str, Any]:
+    """Return the options of a reset, of those that there are, less what is None: that is left out."""
+    given = {} if given is None else given
+    require(isinstance(given, Mapping), f"options must be a mapping, got {quoted(given)}")
+    for key in given:
+        check_name("reset option", key, names)
+    return {key: value for key, value in given.items() if value is not None}
+
+
 def room_seed_of(options: Mapping[str, Any], seed: int) -> int:
     """Return the seed that the room is drawn by: the option ``room_seed`` of a reset, else the episode's."""
-    given = options.get("room_seed")
-    return seed if given is None else int(checked("room_seed", RoomSeed, given))
+    return int(checked("room_seed", RoomSeed, options["room_seed"])) if "room_seed" in options else seed
 
 
 def make_plan(

@@ -14,7 +14,14 @@ from gymnasium.wrappers import TimeLimit
 from numba import njit
 from numpy.typing import NDArray
 
-from mecanum_env.arguments import check_arguments, make_backend, make_config, make_plan, room_seed_of
+from mecanum_env.arguments import (
+    check_arguments,
+    make_backend,
+    make_config,
+    make_plan,
+    reset_options,
+    room_seed_of,
+)
 from mecanum_env.episode import EpisodeRecord, Truth
 from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation, observation_space, observe
@@ -108,9 +115,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
         self._ready = False
-        options = options or {}
-        for key in options:
-            check_name("reset option", key, ("floor_plan", "start_pose", "room_seed"))
+        options = reset_options(options, ("floor_plan", "start_pose", "room_seed"))
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         plan = make_plan(
             self.config, room_seed_of(options, episode_seed),

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 from numpy.typing import NDArray
 
-from mecanum_env.arguments import check_arguments, make_config, make_plan, room_seed_of
+from mecanum_env.arguments import check_arguments, make_config, make_plan, reset_options, room_seed_of
 from mecanum_env.config import EnvConfig, Steps
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.observation import Observation
@@ -28,7 +28,7 @@ from slam.files import quoted
 from slam.gaussian.settings import EkfLinesConfig
 from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
-from slam.settings import argument, check_name, checked, from_mapping, require
+from slam.settings import argument, checked, from_mapping
 from slam.teams.centralised import JointEkf
 from slam.types import Array
 
@@ -116,10 +116,7 @@ class Team:
         ``options`` are ``floor_plan``, ``start_poses`` ``(robots, 3)`` in the plan's frame and ``room_seed``.
         """
         self.active = []
-        options = {} if options is None else options
-        require(isinstance(options, Mapping), f"options must be a mapping, got {quoted(options)}")
-        for key in options:
-            check_name("reset option", key, _OPTIONS)
+        options = reset_options(options, _OPTIONS)
         if seed is not None:
             self._rng, _ = np_random(seed)
         seed = int(self._rng.integers(2**31)) if seed is None else int(seed)
