@@ -18,6 +18,10 @@ from slam.types import Array
 __all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
 
 
+_APART_M = 1e-6  # between a polygon's vertices at least
+_DENT_M = 2e-6  # of a polygon at most: coordinates are rounded to a micrometre
+
+
 class FloorPlanError(ValueError):
     """A plan that cannot be used: no free space, a start inside a wall, a damaged file."""
 
@@ -46,13 +50,13 @@ class FloorPlan:
     Raises
     ------
     FloorPlanError
-        If an array is misshapen or not finite, nothing is free, or the start is not in free space, at least
-        ``start_clearance_m`` from every surface.
+        If an array is misshapen or not finite, a polygon is not convex, nothing is free, or the start is not in
+        free space, at least ``start_clearance_m`` from every surface.
     """
 
     name: str
     walls: Array  # (w, 4) segments x1, y1, x2, y2
-    polygons: tuple[Array, ...] = ()  # obstacles: (k, 2) vertices each, convex, counter-clockwise
+    polygons: tuple[Array, ...] = ()  # obstacles: (k, 2) vertices each, convex; kept counter-clockwise
     circles: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) obstacles: x, y, radius
     free: NDArray[np.bool_]  # (rows, cols) True where a point is in free space; row 0 at the lowest y
     resolution: float  # [m] of a cell of ``free``
@@ -62,7 +66,7 @@ class FloorPlan:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "walls", _array(self, "walls", self.walls, 4))
-        polygons = tuple(_array(self, "polygons", polygon, 2) for polygon in self.polygons)
+        polygons = tuple(_convex(self, _array(self, "polygons", polygon, 2)) for polygon in self.polygons)
         object.__setattr__(self, "polygons", polygons)
         object.__setattr__(self, "circles", _array(self, "circles", self.circles, 3))
         object.__setattr__(self, "free", np.ascontiguousarray(self.free, dtype=np.bool_))
@@ -70,8 +74,6 @@ class FloorPlan:
         self._check_start()
 
     def _check_shapes(self) -> None:
-        if any(len(polygon) < 3 for polygon in self.polygons):
-            raise FloorPlanError(f"plan {self.name}: a polygon needs at least 3 vertices")
         if self.circles.size and not np.all(self.circles[:, 2] > 0):
             raise FloorPlanError(f"plan {self.name}: every circle needs a radius > 0")
         if not (np.isfinite(self.resolution) and self.resolution > 0):
@@ -214,3 +216,25 @@ def _array(plan: FloorPlan, what: str, values: Array, columns: int) -> Array:
     if not np.all(np.isfinite(array)):
         raise FloorPlanError(f"plan {plan.name}: {what} must be finite; remove the NaN or infinite coordinates")
     return array
+
+
+def _convex(plan: FloorPlan, polygon: Array) -> Array:
+    """Return a polygon ``(k, 2)`` counter-clockwise.
+
+    Of one with a dent the robot would touch the hull, and the lidar see the dent.
+    """
+    if len(polygon) < 3:
+        raise FloorPlanError(f"plan {plan.name}: a polygon needs at least 3 vertices")
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    lengths = np.hypot(*edges.T)
+    if lengths.min() < _APART_M:
+        raise FloorPlanError(f"plan {plan.name}: a polygon has two vertices in one place; leave one out")
+    after = np.roll(edges, -1, axis=0)
+    turns = np.arctan2(edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0], np.einsum("ij,ij->i", edges, after))
+    clockwise = turns.sum() < 0.0
+    # A vertex may lie that far within the line of its neighbours, as rounding has it.
+    bends = turns * np.minimum(lengths, np.roll(lengths, -1)) * (-1.0 if clockwise else 1.0)
+    once_round = abs(abs(turns.sum()) - 2.0 * np.pi) < 1e-6
+    if not once_round or bends.min() < -_DENT_M or np.abs(turns).max() > np.pi - 1e-6:
+        raise FloorPlanError(f"plan {plan.name}: a polygon must be convex, of some area; give it in convex parts")
+    return polygon[::-1].copy() if clockwise else polygon

@@ -120,6 +120,11 @@ def test_distance_to_surfaces_is_exact():
         ({"walls": np.array([[0.0, 0.0, math.inf, 1.0]])}, "walls must be finite"),
         ({"walls": np.zeros((2, 3))}, r"walls must have shape \(n, 4\)"),
         ({"polygons": (np.zeros((2, 2)),)}, "3 vertices"),
+        ({"polygons": (box(2.0, 3.0, 3.0, 4.0)[[0, 0, 1, 2, 3]],)}, "two vertices in one place"),
+        ({"polygons": (np.array([(2.0, 3.0), (3.0, 4.0), (4.0, 5.0)]),)}, "convex, of some area"),
+        ({"polygons": (box(2.0, 3.0, 3.0, 4.0)[[0, 2, 1, 3]],)}, "convex"),  # crosses itself
+        # A dent that the lidar would see, while the robot touched the hull.
+        ({"polygons": (np.array([(2.0, 3.0), (4.0, 3.0), (4.0, 3.3), (2.3, 3.3), (2.0, 4.5)]),)}, "convex"),
         ({"circles": np.array([[3.0, 3.0, 0.0]])}, "radius > 0"),
         ({"circles": np.array([[3.0, 3.0, math.nan]])}, "circles must be finite"),
         ({"resolution": 0.0}, "resolution"),
