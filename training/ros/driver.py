@@ -45,6 +45,7 @@ __all__ = ["Driver", "lidar_of"]
 
 _LOST = 0.1  # health of a belief below which it is no good for driving, as to the agents
 _KEPT = 1000  # odometry messages: seconds of the fastest
+_WAITING = 100  # scans that are newer than all odometry so far: of the fastest lidar, two seconds
 _TOO_FAST = 3.0  # times its limits: no robot's motion, but odometry that began anew
 _LEAST_S = 0.1  # in which so much way is no jump: stamps of single messages may lie closer
 _FARTHEST_M = 100.0  # that a lidar of the agents sees
@@ -103,7 +104,8 @@ class Driver:
         self._odometry: deque[tuple[float, Array]] = deque(maxlen=_KEPT)
         self._since_jumps = np.zeros(3)  # what its poses are moved by, for jumps to be no motion
         self._older_since = math.inf  # when messages began to be older than the last one that was taken
-        self._pending: tuple[float, str, Scan] | None = None
+        # Scans that odometry has not come up to: it may be later than one by more than a sweep.
+        self._waiting: deque[tuple[float, str, Scan]] = deque(maxlen=_WAITING)
         self._heard = {"odometry": -math.inf, "scan": -math.inf}
         self._backend: Backend | None = None
         self._agent: Agent
@@ -135,7 +137,7 @@ class Driver:
             self._odometry[-1] = at - 1e-3, self._odometry[-1][1]
             while len(self._odometry) > 1:
                 self._odometry.popleft()
-            self._pending = None
+            self._waiting.clear()
             if self._backend is not None:
                 self._at = at - 1e-3, self._at[1]
         self._older_since = math.inf
@@ -148,7 +150,7 @@ class Driver:
     @_guarded
     def hear_scan(self, message: Any, now_s: float) -> None:
         """Take a ``sensor_msgs/LaserScan`` that came at a time of the caller's clock [s]."""
-        self._pending = stamp_of(message), message.header.frame_id.lstrip("/"), scan_of(message)
+        self._waiting.append((stamp_of(message), message.header.frame_id.lstrip("/"), scan_of(message)))
         self._advance(now_s)
 
     def _without_jumps(self, at: float, pose: Array) -> Array:
@@ -167,10 +169,14 @@ class Driver:
     # ---- what it believes ----------------------------------------------------------------------------------
 
     def _advance(self, now_s: float) -> None:
-        """Go on to the last scan, once odometry has come as far."""
-        if self._pending is None or not self._odometry or self._odometry[-1][0] < self._pending[0]:
+        """Go on to the last scan that odometry has come up to; older ones are left out."""
+        newest = self._odometry[-1][0] if self._odometry else -math.inf
+        due = [k for k, (at, _, _) in enumerate(self._waiting) if at <= newest]
+        if not due:
             return
-        (at, frame, scan), self._pending = self._pending, None
+        at, frame, scan = self._waiting[due[-1]]
+        for _ in range(due[-1] + 1):
+            self._waiting.popleft()
         pose = self._odometry_at(at)
         if pose is None or (self._backend is not None and at <= self._at[0]):
             return

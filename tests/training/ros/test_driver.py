@@ -201,6 +201,19 @@ def test_a_scan_waits_for_the_odometry_of_its_time() -> None:
     assert not np.array_equal(backend.pose, before)
 
 
+def test_odometry_may_be_later_than_the_next_scan() -> None:
+    drive = begun(0)
+    late: list[Any] = []
+    for _ in range(30):
+        late.append(drive.robot.odometry())
+        drive.driver.hear_scan(drive.robot.scan(), drive.now_s)
+        if len(late) > 2:
+            drive.driver.hear_odometry(late.pop(0), drive.now_s)
+        drive.step(scans=False, odometry=False)
+    assert drive.driver.backend is not None and drive.driver.status == "driving"
+    assert drive.driver._at[0] == pytest.approx(drive.robot.clock_s - 0.3)  # that of the odometry that came last
+
+
 def test_names_that_are_not_known() -> None:
     with pytest.raises(ValueError, match="agent"):
         Driver(make_config(), "nobody")
