@@ -88,14 +88,24 @@ class GraphSlam(SurfaceBackend):
         if self._begun:
             self._follow(ends, min(scan.range_max, config.reach_m))
         else:
-            atlas.begin(ends)
-            self._begun = True
+            atlas = self._begin(ends)
         self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
         self._at.append(atlas.key)
         self._from.append(relative(atlas.window.pose[None], self._mean[None])[0])
         if atlas.solutions > solutions:
             self._redraw_if_moved()
         self._draw_it(scan)
+
+    def _begin(self, ends: BeamEnds) -> Atlas:
+        """Make the first scan the first key scan, where the wheels have led the robot by then."""
+        if self._motion.any() or self._upper.any():
+            pose, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
+            self.atlas = Atlas(self.config, pose, 0.5 * (rows[:, :3] + rows[:, :3].T))
+            self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
+            self._last, self._mean, self._cov = pose.copy(), pose.copy(), self.atlas.window.cov[:3, :3].copy()
+        self.atlas.begin(ends)
+        self._begun = True
+        return self.atlas
 
     def _follow(self, ends: BeamEnds, reach_m: float) -> None:
         """Correct the belief by a scan."""

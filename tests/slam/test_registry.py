@@ -83,6 +83,19 @@ def test_a_start_may_be_known_exactly(name: str) -> None:
     assert np.all(np.isfinite(backend.pose_cov))
 
 
+@pytest.mark.parametrize("name", [name for name in slam.names() if name != "truth"])
+def test_a_robot_that_has_moved_before_its_first_scan_is_where_it_moved_to(name: str) -> None:
+    backend, true, rng = slam.make(name), np.array([2.0, 2.0, 0.3]), np.random.default_rng(0)
+    backend.reset(true)
+    twist = circle_twist(0)
+    for k in range(25):
+        backend.predict(Odometry(twist, 0.1))
+        true = compose(true, exp(twist * 0.1))
+        if k >= 15:
+            backend.update(room_scan(compose(true, np.array([0.2, 0.0, 0.0])), rng))
+    assert np.hypot(*(backend.pose - true)[:2]) < 0.03 and backend.pose_nees(true) < 20.0
+
+
 @pytest.mark.parametrize("name", slam.names())
 def test_the_map_takes_no_more_memory_where_it_begins_far_from_the_origin(name: str) -> None:
     shapes, known = [], []
