@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from slam.geometry import wrap_scalar
-from slam.landmarks.association import IGNORED, UNMATCHED
+from slam.landmarks.association import IGNORED, UNMATCHED, own_reach
 from slam.types import Array, Indices
 
 __all__ = ["ParticleMaps", "associate", "correct_landmark", "innovation", "own", "refresh_extents"]
@@ -237,7 +237,7 @@ def associate(
     candidates = np.empty(n, np.int64)
     distance = np.empty((particles, m))
     for k in range(m):
-        window = 0.3 + 4.0 * (spread + z[k, 0] * turn)
+        window = 0.3 + 4.0 * (spread + z[k, 0] * turn) + own_reach(z[k])
         ahead, left = offset + z[k, 0] * math.cos(z[k, 1]), z[k, 0] * math.sin(z[k, 1])
         x0 = y0 = math.inf
         x1 = y1 = -math.inf

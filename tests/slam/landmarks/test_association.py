@@ -122,6 +122,22 @@ def test_a_changed_view_is_not_taken_for_wheels_that_spin() -> None:
         backend.predict(Odometry(odometry.twist, odometry.dt))
 
 
+@pytest.mark.parametrize("name", ["ekf", "compressed-ekf", "fastslam1", "fastslam2"])
+def test_what_is_seen_metres_off_is_a_landmark_that_is_known(name: str) -> None:
+    """Each by its own covariance: of a robot that knows where it is, too."""
+    backend = slam.make(name, config={"landmarks": {"confirm_after": 5, "tentative_gate_m": 1.5}})
+    backend.reset()
+    rng, cov = np.random.default_rng(0), np.diag([1.5**2, math.radians(2.8) ** 2])
+    trees = np.array([[20.0, 0.0], [15.0, 12.0], [10.0, -9.0]])
+    for _ in range(100):
+        backend.predict(Odometry((0.0, 0.0, 0.0), 0.1))
+        seen = observe_landmarks(backend.pose, trees, OFFSET, cov, rng)
+        backend.observe(Observations(seen.range_bearing, seen.cov))
+    assert backend.landmark_count == 3
+    apart = np.hypot(*(backend.belief.landmarks[:, None] - trees).transpose(2, 0, 1)).min(axis=1)
+    assert apart.max() < 0.6
+
+
 @pytest.mark.parametrize("name", ["ekf", "invariant-ekf"])
 def test_a_misread_label_is_refused_where_there_is_a_gate(name: str) -> None:
     """Two landmarks known well; then one is reported in the place of the other."""
