@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from slam.files import BagMessage, bag_messages, plain_name, quoted
-from slam.geometry import wrap
-from slam.logs.scans import SETTINGS, ScanLog, moved_by, rising
+from slam.geometry import relative, wrap
+from slam.logs.scans import SETTINGS, ScanLog, chain, moved_by, rising
 from slam.ros import Frames, Mount, mount_of, odometry_of, pose_of, resampled, scan_of, stamp_of, transforms_of
 from slam.types import Array, Scan
 
@@ -31,6 +31,8 @@ _TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
 _MOST_RANGES = 2**28  # of all scans together: a gibibyte
 _REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
 _LONGEST_JUMP_M = 1e3  # from one odometry to the next
+_FASTEST_M_S, _FASTEST_RAD_S = 25.0, 20.0  # beyond is no motion, but odometry that began anew …
+_LEAST_S = 0.04  # … where not just two stamps lie too close together
 _MOST_TOPICS = 12  # that an error lists
 
 
@@ -96,6 +98,7 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     """Read a ROS 2 bag: a folder of ``ros2 bag record``, or one of its files (MCAP or SQLite).
 
     Scans before the first odometry and after the last are left out; at the others the odometry is interpolated.
+    Where that jumps, as when its driver was started again, it goes on from where it was.
     Scans whose beams lie otherwise than the first one's take, at each of its bearings, the nearest beam.
 
     Raises
@@ -116,6 +119,8 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     jump = np.hypot(*np.diff(odometry[:, :2], axis=0).T).max(initial=0.0)
     if jump > _LONGEST_JUMP_M:
         raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump:.4g} m; correct the log")
+    odometry, jumps = _without_jumps(odometry_times, odometry)
+    left_out = f"; jumps of the odometry that are left out: {jumps}" if jumps else ""
     stamps = np.array([stamp for stamp, _ in found.scans[scan_topic]])
     covered = np.flatnonzero((stamps >= odometry_times[0]) & (stamps <= odometry_times[-1]))
     if not len(covered):
@@ -132,7 +137,8 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
         stamps=stamps, ranges=ranges, angle_min=first.angle_min, angle_increment=first.angle_increment,
         range_max=first.range_max, odometry_poses=poses, start_pose=poses[0].copy(), reference_times=np.zeros(0),
         reference_poses=np.zeros((0, 3)), reference_gap_s=_REFERENCE_GAP_S,
-        settings=SETTINGS | {"lidar_offset_m": mount.x_m}, note="no reference; give one with --reference-topic",
+        settings=SETTINGS | {"lidar_offset_m": mount.x_m},
+        note=f"no reference; give one with --reference-topic{left_out}",
     )  # fmt: skip
     if topics.reference is None:
         return log
@@ -141,7 +147,7 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     rows = _bracketed(stamps, reference_times)
     if not len(rows):
         raise ValueError(f"{where}: {topics.reference} has no pose within {_REFERENCE_GAP_S} s of a scan")
-    note = f"reference: {topics.reference}; the start pose is the reference's"
+    note = f"reference: {topics.reference}; the start pose is the reference's{left_out}"
     at = _beside(_at(stamps[rows], reference_times, reference), mount)
     return log.with_reference(rows, at, plain_name(note))
 
@@ -275,6 +281,20 @@ def _ranges(scans: list[Scan], mount: Mount) -> tuple[Any, Scan]:
         for s in levelled
     )
     return np.stack([np.asarray(row, np.float32) for row in rows]), first
+
+
+def _without_jumps(times: Array, poses: Array) -> tuple[Array, int]:
+    """Return poses ``(n, 3)`` without motions that no robot makes, headings unwrapped, and how many there were."""
+    steps, span = relative(poses[:-1], poses[1:]), np.maximum(np.diff(times), _LEAST_S)
+    jumped = (np.hypot(steps[:, 0], steps[:, 1]) > _FASTEST_M_S * span) | (
+        np.abs(steps[:, 2]) > _FASTEST_RAD_S * span
+    )
+    if not jumped.any():
+        return poses, 0
+    steps[jumped] = 0.0
+    whole = chain(poses[0], steps)
+    whole[:, 2] = np.unwrap(whole[:, 2])
+    return whole, int(np.count_nonzero(jumped))
 
 
 def _at(stamps: Array, times: Array, poses: Array) -> Array:

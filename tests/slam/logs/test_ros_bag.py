@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from slam.geometry import compose, relative
+from slam.geometry import compose, exp, inverse, relative
 from slam.logs import BagTopics, ScanLog, open_log, parse_mount, with_reference
 from slam.ros import Mount, odometry_message, scan_message, transform_message
 from tests.slam.logs.logs_on_disk import data_folder
@@ -58,6 +58,25 @@ def refused(path: Path, **topics: Any) -> str:
 
 
 STORAGES = [("mcap", ""), ("mcap", "storage"), ("sqlite3", ""), ("sqlite3", "message"), ("mcap", "message")]
+
+
+def test_odometry_that_begins_anew_moves_nobody(tmp_path: Path) -> None:
+    """Neither by the jump itself, nor at the scan in the middle of it."""
+    twist, anew = np.array([0.5, 0.0, 0.2]), np.array([-3.0, 8.0, 2.0])
+    true = np.array([exp(twist * 0.1 * k) for k in range(41)])
+    messages = [mounted(0.0, 0.0, 0.0)]
+    for k, pose in enumerate(true):
+        said = pose if k <= 20 else compose(anew, compose(inverse(true[21]), pose))
+        messages.append(("/odom", ODOMETRY, 0.1 * k, odometry_message(0.1 * k, "odom", "base_link", said, twist)))
+        at = 0.1 * k + 0.05
+        messages.append(("/scan", SCAN, at, scan_message(at, "laser", scan(np.full(90, 2.0)))))
+    found = bag(write_bag(tmp_path / "anew", messages))
+    assert "jumps of the odometry that are left out: 1" in found.note
+    moved = relative(found.odometry_poses[:-1], found.odometry_poses[1:])
+    usual = exp(twist * 0.1)
+    assert np.allclose(moved[:19], usual, atol=1e-3) and np.allclose(moved[22:], usual, atol=1e-3)
+    assert np.hypot(*moved[:, :2].T).max() < 0.06  # the step across the jump is the only one that is missing
+    assert np.hypot(*(found.odometry_poses[-1] - true[-1])[:2]) < 0.15
 
 
 @pytest.mark.parametrize(("storage", "mode"), STORAGES)
