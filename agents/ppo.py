@@ -134,6 +134,8 @@ class Ppo(Agent):
             return scan
         angles = -math.pi + np.arange(BEAMS) * (2.0 * math.pi / BEAMS)
         nearest = np.round((angles - lidar.angle_min) / lidar.angle_increment).astype(np.int64)
+        if lidar.field_of_view_deg == 360.0:
+            nearest %= lidar.beams  # behind the last beam comes the first
         inside = (nearest >= 0) & (nearest < lidar.beams)
         out = np.ones(BEAMS, np.float32)
         hit = scan[np.where(inside, nearest, 0)]

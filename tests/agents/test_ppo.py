@@ -16,6 +16,7 @@ import mecanum_env
 from agents.learned.drive_network import DriveNetwork
 from agents.learned.drive_plan import EDGES, descend, distances, gradient, node_prices
 from agents.ppo import SHIPPED, Ppo
+from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from tests.agents import grids
 
@@ -97,6 +98,11 @@ def test_the_agent_drives_and_keeps_to_the_network():
             break
     assert info["coverage"] > 0.6 and info["collisions"] == 0
     assert agent.goal is not None and np.hypot(*(agent.goal.path[0] - env.unwrapped.belief.pose[:2])) < 0.2
+
+
+def test_a_full_circle_has_no_gap_between_its_last_beam_and_its_first():
+    agent = agents.make("ppo", lidar=LidarConfig(beams=180))
+    assert (agent._scan(np.full(180, 0.25, np.float32)) < 1.0).all()
 
 
 def ends_after(config: dict[str, float], *beliefs: Belief) -> float:

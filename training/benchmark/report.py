@@ -29,9 +29,10 @@ from training.figures.page import html_page, name_html, text_html
 from training.figures.statistics import Comparison
 from training.truth.known_map import KNOWN_MAPS
 
-__all__ = ["FILE", "page", "worst_first", "write_report"]
+__all__ = ["FILE", "TEAMS", "page", "worst_first", "write_report"]
 
 FILE = "report.html"
+TEAMS = "teams.png"
 
 _CASES = 6  # maps shown of an agent in a suite
 _READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
@@ -49,7 +50,7 @@ def write_report(out: Path, report: Report) -> None:
     atomic_write(out / FILE, page(report, config_text=text))
     if report.has_teams:
         scalings = {suite: report.scalings(suite) for suite in report.suites()}
-        atomic_write(out / "teams.png", team_chart(scalings))
+        atomic_write(out / TEAMS, team_chart(scalings))
 
 
 def page(report: Report, *, config_text: str) -> str:

@@ -133,8 +133,10 @@ def benchmark(
     from training.benchmark import run as task
     from training.benchmark.output import Report, table
     from training.benchmark.output import as_json as as_mapping
+    from training.benchmark.parquet import FILE as PARQUET
     from training.benchmark.parquet import require, write_parquet
-    from training.benchmark.report import write_report
+    from training.benchmark.report import FILE as PAGE
+    from training.benchmark.report import TEAMS, write_report
     from training.benchmark.suites import teams_of
 
     plan = task.BenchmarkPlan.parse(
@@ -148,6 +150,8 @@ def benchmark(
         require()
 
     def write(result: Report) -> None:
+        for name in (PAGE, TEAMS, PARQUET):  # of an earlier run: they show other episodes than the tables
+            (out / name).unlink(missing_ok=True)
         if report:
             write_report(out, result)
         if parquet:

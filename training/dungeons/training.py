@@ -54,7 +54,7 @@ class TrainingConfig(Config):
     plans: Annotated[int, Within("[1, 1000000]")] = 1000  # seeds 0 … of the first round
     # Seeds 0 … of the others: a network takes more time to drive than the tour.
     later_plans: Annotated[int, Within("[1, 1000000]")] = 380
-    validation_plans: Annotated[int, Within("[1, 1000000]")] = 60  # seeds 1000 …
+    validation_plans: Annotated[int, Within("[1, 9000]")] = 60  # seeds 1000 …
     epochs: Annotated[int, Within("[1, 1000000]")] = 12
     batch: Annotated[int, Within("[1, 1000000]")] = 64
     rate: Annotated[float, Within("[1e-9, 1]")] = 1.5e-3
@@ -254,7 +254,7 @@ def study(
     ] = 2,
     plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the first round, seeds 0 ….")] = 1000,
     later_plans: Annotated[int, typer.Option(min=1, max=_VALIDATION, help="Of the others, seeds 0 ….")] = 380,
-    validation_plans: Annotated[int, typer.Option(min=1, max=1_000_000, help=f"Seeds {_VALIDATION} ….")] = 60,
+    validation_plans: Annotated[int, typer.Option(min=1, max=9_000, help=f"Seeds {_VALIDATION} ….")] = 60,
     epochs: Annotated[int, typer.Option(min=1, max=1_000_000)] = 12,
     batch: Annotated[int, typer.Option(min=1, max=1_000_000)] = 64,
     rate: Annotated[float, typer.Option(min=1e-9, max=1, help="Of learning.")] = 1.5e-3,

@@ -24,8 +24,8 @@ def step_averages(profiles: Sequence[ArrayLike]) -> tuple[Array, Array, Array]:
     values = np.full((len(runs), steps), np.nan)
     for row, run in zip(values, runs, strict=True):
         row[: len(run)] = run[:steps]
-    going_on = [sum(len(run) > k for run in runs) for k in range(steps)]
-    bands = {count: nees_band(3, count) for count in set(going_on)}
+    going_on = (~np.isnan(values)).sum(axis=0).tolist()  # a robot of a team may have ended before its team
+    bands = {count: nees_band(3, max(count, 1)) for count in set(going_on)}
     low, high = np.array([bands[count] for count in going_on]).reshape(-1, 2).T
     return anees(values, axis=0), low, high
 

@@ -31,6 +31,9 @@ from training.runs.running import plain, versions, write_json, written_together
 __all__ = ["metrics", "summary", "surveyed_places", "write"]
 
 
+_MAP = ("map.pgm", "map.yaml", "map.png")
+
+
 def metrics(replay: Replay) -> dict[str, Any]:
     """Return the contents of ``metrics.json``."""
     times, true, est = replay.trajectories()
@@ -85,8 +88,8 @@ def surveyed_places(replay: Replay, ids: NDArray[np.int64]) -> Array:
 
 
 def write(replay: Replay) -> dict[str, Any]:
-    """Write every file of a replay and return its metrics."""
-    with written_together(replay.out) as folder:
+    """Write every file of a replay and return its metrics. A map is taken away where it is another's."""
+    with written_together(replay.out, without=_MAP) as folder:
         return _write_into(folder, replay)
 
 

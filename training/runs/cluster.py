@@ -37,7 +37,7 @@ RETRIES = 5
 """How often an item is begun anew where its worker, or the node, died under it."""
 
 LOCAL, RUNNING = "local", "auto"
-_WITHIN_S = 10.0
+_WITHIN_S = 30.0
 _REMEDY = (
     "start one by ray start --head and give the address that it names, set RAY_AUTH_MODE=token if it asks for "
     "one, or leave the address out for a Ray of this machine alone"

@@ -53,8 +53,11 @@ def test_json_has_the_contract_s_keys_and_the_files_are_there(
     }  # fmt: skip
     lines = (tmp_path / "episodes.csv").read_text("utf-8").splitlines()
     assert lines[0].startswith("suite,place,seed,agent,slam,coverage,") and len(lines) == 7
+    (tmp_path / "episodes.parquet").touch()
     assert main(small(tmp_path)) == 0
     assert "nearest-frontier" in capsys.readouterr().out
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == names - {"report.html"}, "what shows other episodes than the tables goes"
 
 
 @pytest.mark.usefixtures("here")

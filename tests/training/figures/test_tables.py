@@ -75,3 +75,7 @@ def test_runs_that_end_early_leave_the_average_to_the_others() -> None:
     assert found["nees_over_3_mean"] == pytest.approx((1 + 1 + 100) / 3)
     assert found["fraction_in_band"] == pytest.approx(2 / 3)
     assert consistency_figures([[]])["nees_over_3_mean"] is None
+    # So does a robot that ended while its team went on: the band is that of those that are left.
+    one, ended = [[3.0, 6.0]], [[3.0, np.nan]]
+    assert consistency_figures(one * 10 + ended * 90)["fraction_in_band"] == pytest.approx(0.5)
+    assert consistency_figures(one + ended * 99)["fraction_in_band"] == pytest.approx(1.0)

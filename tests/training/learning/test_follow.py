@@ -13,7 +13,7 @@ pytest.importorskip("torch")
 pytest.importorskip("sb3_contrib")
 
 from slam.settings import from_mapping
-from tests.training.learning.test_train import SMALL, Killed, curve
+from tests.training.learning.small_runs import SMALL, Killed, curve
 from training.cli import main
 from training.learning.config import TrainConfig
 from training.learning.follow import Follow

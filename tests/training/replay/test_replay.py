@@ -56,6 +56,9 @@ def test_a_replay_writes_every_file_of_one_run(
     logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "deep" / "out"
+    out.mkdir(parents=True)
+    for name in ("map.pgm", "map.yaml", "map.png"):
+        (out / name).touch()  # of a log of scans
     found = replayed([str(logs / "utias" / "Robot1_Odometry.dat"), "--out", str(out), "--seed", "3"], capsys)
     assert sorted(p.name for p in out.iterdir()) == sorted(task.FILES)
     assert found == json.loads((out / "metrics.json").read_text("utf-8"))
