@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -225,16 +226,21 @@ def _convex(plan: FloorPlan, polygon: Array) -> Array:
     """
     if len(polygon) < 3:
         raise FloorPlanError(f"plan {plan.name}: a polygon needs at least 3 vertices")
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    lengths = np.hypot(*edges.T)
-    if lengths.min() < _APART_M:
+    points = polygon.tolist()
+    edges = [(bx - ax, by - ay) for (ax, ay), (bx, by) in zip(points, points[1:] + points[:1], strict=True)]
+    lengths = [math.hypot(*edge) for edge in edges]
+    if min(lengths) < _APART_M:
         raise FloorPlanError(f"plan {plan.name}: a polygon has two vertices in one place; leave one out")
-    after = np.roll(edges, -1, axis=0)
-    turns = np.arctan2(edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0], np.einsum("ij,ij->i", edges, after))
-    clockwise = turns.sum() < 0.0
+    turns, bends = [], []  # at each vertex; how far off the line that passes it by
+    for k, (ux, uy) in enumerate(edges):
+        vx, vy = edges[k - 1]
+        turns.append(math.atan2(vx * uy - vy * ux, vx * ux + vy * uy))
+        bends.append(turns[-1] * min(lengths[k - 1], lengths[k]))
+    turned = sum(turns)
+    clockwise = turned < 0.0
     # A vertex may lie that far within the line of its neighbours, as rounding has it.
-    bends = turns * np.minimum(lengths, np.roll(lengths, -1)) * (-1.0 if clockwise else 1.0)
-    once_round = abs(abs(turns.sum()) - 2.0 * np.pi) < 1e-6
-    if not once_round or bends.min() < -_DENT_M or np.abs(turns).max() > np.pi - 1e-6:
+    dent = max(bends) if clockwise else -min(bends)
+    once = abs(abs(turned) - 2.0 * math.pi) < 1e-6
+    if not once or dent > _DENT_M or max(map(abs, turns)) > math.pi - 1e-6:
         raise FloorPlanError(f"plan {plan.name}: a polygon must be convex, of some area; give it in convex parts")
     return polygon[::-1].copy() if clockwise else polygon
