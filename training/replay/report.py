@@ -88,8 +88,9 @@ def surveyed_places(replay: Replay, ids: NDArray[np.int64]) -> Array:
 
 
 def write(replay: Replay) -> dict[str, Any]:
-    """Write every file of a replay and return its metrics. A map is taken away where it is another's."""
-    with written_together(replay.out, without=_MAP) as folder:
+    """Write every file of a replay and return its metrics. The map of an earlier one there is taken away."""
+    earlier = (replay.out / "metrics.json").is_file()  # else it is somebody's own
+    with written_together(replay.out, without=_MAP if earlier else ()) as folder:
         return _write_into(folder, replay)
 
 

@@ -57,7 +57,7 @@ def test_a_replay_writes_every_file_of_one_run(
 ) -> None:
     out = tmp_path / "deep" / "out"
     out.mkdir(parents=True)
-    for name in ("map.pgm", "map.yaml", "map.png"):
+    for name in ("metrics.json", "map.pgm", "map.yaml", "map.png"):
         (out / name).touch()  # of a log of scans
     found = replayed([str(logs / "utias" / "Robot1_Odometry.dat"), "--out", str(out), "--seed", "3"], capsys)
     assert sorted(p.name for p in out.iterdir()) == sorted(task.FILES)
