@@ -11,11 +11,20 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from agents.driving.follow import WINDOW_M, Motors, Pace, aim, send
-from agents.driving.safety import Guard, LocalMap, footprint, local_map, scan_points, scan_shares
+from agents.driving.safety import (
+    Guard,
+    LocalMap,
+    escape_twist,
+    footprint,
+    local_map,
+    scan_points,
+    scan_shares,
+)
 from agents.driving.sides import parting_lines
 from agents.ways.cost_map import position_sigma
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
+from slam.geometry import rotation
 from slam.settings import Angle, Config, Duration, Length, Rate, Within
 from slam.types import Array
 
@@ -178,6 +187,16 @@ class PathFollower:
         near, gap = local_map(belief, WINDOW_M), self._map_gap(belief)
         return self._send(velocity, turn, observation, belief, near, gap)
 
+    def escape(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
+        """Return the twist ``(3,)`` that gets the body to more room, whichever way that is; zero if none does."""
+        near, pose = local_map(belief, WINDOW_M), np.asarray(belief.pose, dtype=np.float64)
+        hits = scan_points(observation, self._lidar)
+        twist: Array = escape_twist(
+            pose, near, self._map_gap(belief), hits, self._sides(belief, near), self._guard, self._floors
+        )
+        self._velocity, self._turn = rotation(float(pose[2])) @ twist[:2], float(twist[2])
+        return twist
+
     def creep(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
         """Return a slow twist ``(3,)`` to where the scan shows room, whatever the map says, and rather back.
 
@@ -226,6 +245,12 @@ class PathFollower:
         sigma = position_sigma(belief.pose_cov)
         return self.config.map_gap_m + min(2.0 * sigma, self.config.max_sigma_gap_m)
 
+    def _sides(self, belief: Belief, near: LocalMap) -> Array:
+        """Return the lines ``(k, 3)`` that part the body from other robots."""
+        return parting_lines(
+            belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s
+        )
+
     def _send(
         self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief, near: LocalMap,
         gap: float,
@@ -233,12 +258,9 @@ class PathFollower:
         """Smooth, bound and check a wanted velocity (belief frame) and turn rate; remember what goes out."""
         speed = math.hypot(*velocity)
         velocity = velocity * min(1.0, self._fastest / speed) if speed > 0.0 else velocity
-        sides = parting_lines(
-            belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s
-        )
         sent, self._velocity, self.blocked = send(
             velocity, turn, self._velocity, self._turn, np.asarray(belief.pose, dtype=np.float64), near, gap,
-            scan_points(observation, self._lidar), sides, self._motors, self._guard,
+            scan_points(observation, self._lidar), self._sides(belief, near), self._motors, self._guard,
             self._floors,
         )  # fmt: skip
         self._turn = float(sent[2])

@@ -213,12 +213,16 @@ class Driver(Agent):
             trouble.failures += 1  # else it was another robot that stood in the way
 
     def _back_off(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:
-        """Move to where there is more room, turning a little: what stood in the way is then seen anew."""
+        """Move to where there is more room, turning a little: what stood in the way is then seen anew.
+
+        Where that does not go, any other way: askew in a door a body may have no other than the one it came.
+        """
         pose = np.asarray(belief.pose, dtype=np.float64)
         angles = np.arange(16) * (math.pi / 8.0)
         away = np.stack([np.cos(angles), np.sin(angles)], axis=1)
         room = self._follower.room(belief, pose[:2] + 0.3 * away)
-        return self._follower.drive(0.15 * away[int(np.argmax(room))], 0.4, observation, belief)
+        twist = self._follower.drive(0.15 * away[int(np.argmax(room))], 0.4, observation, belief)
+        return twist if twist.any() else self._follower.escape(observation, belief)
 
     def _path(self, cost_map: CostMap, travel: TravelCosts, cell: tuple[int, int], belief: Belief) -> Array:
         spacing = self.config.planner.path_spacing_m

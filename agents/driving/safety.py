@@ -21,8 +21,8 @@ from slam.belief import Belief
 from slam.types import Array
 
 __all__ = [
-    "Guard", "LocalMap", "body_gaps", "clearance_at", "footprint", "local_map", "safe_twist", "scan_points",
-    "scan_shares",
+    "Guard", "LocalMap", "body_gaps", "clearance_at", "escape_twist", "footprint", "local_map", "safe_twist",
+    "scan_points", "scan_shares",
 ]  # fmt: skip
 
 _SCAN_WITHIN_M = 2.0
@@ -32,6 +32,8 @@ _MOST_POSES = 1000  # a body that takes minutes to stop turning is not worth mor
 _SPEEDS = (1.0, 0.7, 0.45, 0.25, 0.1)  # shares of the wanted twist that are tried
 _SIDESTEPS = (0.6, -0.6, 1.2, -1.2)  # [rad] off the wanted direction, tried after that
 _SIDESTEP_M_S = 0.12
+_ESCAPE_M_S = 0.1  # along any of 16 directions, where nothing else goes, …
+_ESCAPE_RAD_S = (-0.4, -0.1, 0.0, 0.1, 0.4)  # … turning so
 _SLACK_M = 0.002  # by which what is drawn and measured of a wall differs from step to step
 
 
@@ -160,6 +162,35 @@ def safe_twist(
         if clear and (len(sides) == 0 or _keeps_side(candidate, sides, guard)):
             return candidate
     return np.zeros(3)
+
+
+@njit(cache=True, nogil=True)
+def escape_twist(
+    pose: Array, near: LocalMap, map_gap: float, hits: Array, sides: Array, guard: Guard, floors: Array
+) -> Array:
+    """Return the slow twist ``(3,)`` that ends with the widest gaps; zero where none ends with wider ones.
+
+    For a body that is askew in a door, too near on both sides: what it is sent to, :func:`safe_twist` refuses,
+    and most else. Arguments as there; what it refuses is not sent from here, either.
+    """
+    best, here = np.zeros(3), np.zeros(2)
+    here[0], here[1] = _gaps_at(0.0, 0.0, 0.0, pose, near, hits, guard)
+    least_map = min(map_gap, here[0] - _slack(here[0], map_gap, floors, 0))
+    least_scan = min(guard.scan_gap_m, here[1] - _slack(here[1], guard.scan_gap_m, floors, 1))
+    widest = min(here[0] - map_gap, here[1] - guard.scan_gap_m)
+    for turn in _ESCAPE_RAD_S:
+        for k in range(17):  # the last stays where it is
+            speed, angle = (_ESCAPE_M_S if k < 16 else 0.0), k * math.pi / 8.0
+            candidate = np.array([speed * math.cos(angle), speed * math.sin(angle), turn])
+            _, map_ahead, _, scan_ahead = body_gaps(candidate, pose, near, hits, guard)
+            if map_ahead < least_map or scan_ahead < least_scan:
+                continue
+            x, y, turned = _braking_way(candidate, guard)[-1]
+            map_end, scan_end = _gaps_at(x, y, turned, pose, near, hits, guard)
+            room = min(map_end - map_gap, scan_end - guard.scan_gap_m)
+            if room > widest and (len(sides) == 0 or _keeps_side(candidate, sides, guard)):
+                best, widest = candidate, room
+    return best
 
 
 @njit(cache=True, nogil=True)

@@ -105,6 +105,30 @@ def test_a_body_too_near_a_wall_comes_no_nearer_step_by_step(wish):
         assert body_gap(classes, pose, ROBOT) > first - 0.006  # 2 mm, and what cells and rim points leave out
 
 
+@pytest.mark.parametrize("seed", [0, 6, 15, 21, 56, 69, 108, 203])
+def test_askew_in_a_door_it_gets_away_by_what_way_there_is(seed):
+    """Too near on both sides it is refused all that it is led to, as once a robot was, for minutes."""
+    rng, limits = np.random.default_rng(seed), np.array([0.8, 0.8, 1.5])
+    classes = room(4.0, 4.0)
+    fill(classes, 1.85, 0.0, 2.05, 1.65)
+    fill(classes, 1.85, 2.35, 2.05, 4.0)
+    pose = np.array([1.95 + rng.uniform(-0.15, 0.15), 2.0 + rng.uniform(-0.02, 0.02), -0.5 * math.pi])
+    control, gap = follower(), 0.043
+
+    def now():
+        return belief_of(classes, tuple(pose), sigma=0.0015)
+
+    for _ in range(40):  # led in, and turned there
+        velocity = np.array([-0.1 * rng.random(), 0.02 * rng.normal()])
+        twist = control.drive(velocity, 0.5 * rng.random(), None, now())
+        pose = drive(pose, twist / limits, ROBOT)
+    assert not twist.any() and body_gap(classes, pose, ROBOT) < gap
+    for _ in range(15):
+        pose = drive(pose, control.escape(None, now()) / limits, ROBOT)
+        assert body_gap(classes, pose, ROBOT) > 0.03
+    assert body_gap(classes, pose, ROBOT) > gap + 0.01  # straight in the door, 0.06 m on either side
+
+
 def test_a_body_wider_than_long_goes_sideways_through_a_door():
     robot, classes = RobotConfig(length_m=0.38, width_m=0.7), two_rooms(0.7)
     for config, start in ((ControlConfig(), 0.0), (ControlConfig(any_side=True), 0.4)):
