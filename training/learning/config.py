@@ -85,6 +85,8 @@ class WorldConfig(RoomsConfig):
             from_mapping(ChooserConfig, self.driver)
         except SettingError as error:
             raise SettingError(type(self).__name__, f"driver.{error.path}", error.problem) from None
+        except ValueError as error:
+            raise ValueError(f"{type(self).__name__}.driver: {error}") from None
 
 
 @dataclass(frozen=True, kw_only=True)
