@@ -199,7 +199,7 @@ class EkfSlam(HeldByMap):
         x, p = self._x.copy(), self._p.copy()
         joint.place(x, p, n, found.pose, joint.ANYWHERE_COV)
         offset, work = self.config.lidar_offset_m, (self._h, self._w, self._s)
-        dof, nis = stacked_update(x, p, n, found.rows, match, offset, *work)
+        dof, nis = stacked_update(x, p, n, found.rows, match, offset, *work, NO_LIMITS)
         if nis < chi2_quantile(0.999, dof - 3):  # three of them went into the pose
             self._place(found.pose, joint.ANYWHERE_COV)
             self._correct(found.rows, match)

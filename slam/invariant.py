@@ -158,7 +158,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
 @njit(cache=True, nogil=True, error_model="numpy")
 def invariant_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array,
-    w: Array, s: Array, delta: Array, limits: Array = NO_LIMITS,
+    w: Array, s: Array, delta: Array, limits: Array,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.
 

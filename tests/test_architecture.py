@@ -310,3 +310,11 @@ def test_no_kernel_leaves_its_rounding_to_the_compiler() -> None:
     for path in sorted(p for room in FLOORS for p in (ROOT / room).rglob("*.py")):
         for flags in re.findall(r"fastmath=(\{[^}]*\}|\w+)", path.read_text()):
             assert set(re.findall(r"\w+", flags)) <= harmless | {"False"}, f"{path}: {flags}"
+
+
+def test_no_kernel_has_default_values() -> None:
+    """One that is an array has another identity in every process, so the kernel would be compiled anew in each."""
+    for path in sorted(p for room in FLOORS for p in (ROOT / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any("njit" in ast.unparse(d) for d in node.decorator_list):
+                assert not node.args.defaults and not any(node.args.kw_defaults), f"{path}: {node.name}"

@@ -44,7 +44,7 @@ def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
 @njit(cache=True, nogil=True, error_model="numpy")
 def stacked_update(
     x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
-    limits: Array = NO_LIMITS,
+    limits: Array,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
 

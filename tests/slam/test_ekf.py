@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 import slam
 from slam import Observations, Odometry
 from slam.gaussian.joint_gaussian import add_landmark, leave_out, near_landmarks
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
 from slam.landmarks import association
 from slam.landmarks.association import IGNORED, UNMATCHED, nearest_neighbour
@@ -107,7 +107,7 @@ def test_stacked_update_is_the_textbook_one(seed: int, seen: int, landmarks: int
     gain = p @ h.T @ np.linalg.inv(s)
     want_x, want_p = x + gain @ nu, p - gain @ s @ gain.T
     state, upper = x.copy(), np.triu(p)
-    dof, nis = stacked_update(state, upper, n, z, match, OFFSET, *work_space(8, n))
+    dof, nis = stacked_update(state, upper, n, z, match, OFFSET, *work_space(8, n), NO_LIMITS)
     assert dof == 2 * seen
     assert nis == pytest.approx(nu @ np.linalg.solve(s, nu), rel=1e-8)
     np.testing.assert_allclose(np.triu(upper), np.triu(want_p), atol=1e-10)

@@ -14,7 +14,7 @@ import slam
 from slam import LINE
 from slam.features.extraction import FeatureConfig, FeatureExtractor
 from slam.gaussian.joint_gaussian import add_landmark
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.geometry import compose, inverse, wrap
 from slam.invariant import invariant_update
 from slam.landmarks.association import line_blocks
@@ -200,10 +200,10 @@ def test_invariant_update_of_lines_is_gain_retraction_and_reset(seed: int) -> No
     x, p, z, marks = state_with_lines(seed)
     work = work_space(3, 9)
     plain_x, plain_p = x.copy(), np.triu(p)
-    stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work)
+    stacked_update(plain_x, plain_p, 9, z, np.arange(3), OFFSET, *work, NO_LIMITS)
     plain_p = np.triu(plain_p) + np.triu(plain_p, 1).T
     got_x, got_p = x.copy(), np.triu(p)
-    invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros(9))
+    invariant_update(got_x, got_p, 9, z, np.arange(3), OFFSET, marks, *work, np.zeros(9), NO_LIMITS)
     got_p = np.triu(got_p) + np.triu(got_p, 1).T
     np.testing.assert_allclose(wrap(got_x[5::2] - plain_x[5::2]), 0.0, atol=1e-12)
     delta = plain_x - x
@@ -261,7 +261,7 @@ def test_a_correction_of_the_heading_alone_leaves_lines_unmoved() -> None:
     z[0, 1] -= 0.3  # the line is seen turned: it is the heading that is wrong
     z[0, 2] = 1e6
     got, cov = x.copy(), p.copy()
-    invariant_update(got, cov, 7, z, np.array([1]), OFFSET, marks, *work_space(1, 7), np.zeros(7))
+    invariant_update(got, cov, 7, z, np.array([1]), OFFSET, marks, *work_space(1, 7), np.zeros(7), NO_LIMITS)
     assert got[2] == pytest.approx(0.4, abs=1e-3)
     np.testing.assert_allclose(got[5:], x[5:], atol=1e-9)
     np.testing.assert_allclose(got[:2], x[:2], atol=1e-9)
@@ -286,7 +286,9 @@ def test_a_wall_far_from_the_start_that_few_beams_meet_is_where_it_is() -> None:
             if k == 0:
                 add_landmark(x, p, 3, z[0], OFFSET)
             else:
-                invariant_update(x, p, 5, z, np.zeros(1, np.int64), OFFSET, marks, *work_space(1, 5), np.zeros(5))
+                invariant_update(
+                    x, p, 5, z, np.zeros(1, np.int64), OFFSET, marks, *work_space(1, 5), np.zeros(5), NO_LIMITS
+                )
         piece = np.array([60.0 + OFFSET + ahead, 0.0])
         errors.append(x[4] - n_of(x[3]) @ piece)
     assert np.std(errors) < 1.5 * offset_sigma / math.sqrt(10)
@@ -311,7 +313,9 @@ def test_a_wall_that_turns_with_the_robot_stays_where_it_is_to_it() -> None:
     z[0, :6] = *predicted(x, 1), 1e2, 0.0, 1e-10, LINE
     z[0, 1] -= turn
     before = wall_from(x)
-    invariant_update(x, np.triu(p), 7, z, np.ones(1, np.int64), OFFSET, marks, *work_space(1, 7), np.zeros(7))
+    invariant_update(
+        x, np.triu(p), 7, z, np.ones(1, np.int64), OFFSET, marks, *work_space(1, 7), np.zeros(7), NO_LIMITS
+    )
     assert x[2] == pytest.approx(0.4 + turn, abs=1e-5)
     np.testing.assert_allclose(wall_from(x), before, atol=0.05 * 40.0 * turn**2 / 2)
 

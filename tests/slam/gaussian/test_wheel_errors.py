@@ -13,7 +13,7 @@ from mecanum_env.config import RobotConfig
 from mecanum_env.physics.robot import forward_matrix
 from slam import Observations, Odometry
 from slam.gaussian.joint_gaussian import add_landmark, landmark_by_pose
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap
 from slam.invariant import InvariantEkfSlam, _turn_columns, invariant_update
@@ -189,14 +189,14 @@ def test_update_and_reset_with_walls_are_those_of_one_large_state() -> None:
         x, _, z, marks = state_with_lines(seed)
         joint = 0.01 * random_covariance(15, np.random.default_rng(seed))  # a sixth error, left out below
         plain_x, plain_p = np.concatenate([x, np.zeros(6)]), np.triu(joint)
-        stacked_update(plain_x, plain_p, 15, z, np.arange(3), OFFSET, *work_space(3, 15))
+        stacked_update(plain_x, plain_p, 15, z, np.arange(3), OFFSET, *work_space(3, 15), NO_LIMITS)
         plain_p = np.triu(plain_p) + np.triu(plain_p, 1).T
         wheels = WheelErrors(LastingErrors(), 0.4, 3, 9)
         wheels.cov[:], wheels.cross[:, :9] = joint[9:14, 9:14], joint[9:14, :9]
         got, p = x.copy(), np.triu(joint[:9, :9])
         h, w, s = work_space(3, 9)
         levers = np.zeros(9)
-        rows, _ = invariant_update(got, p, 9, z, np.arange(3), OFFSET, marks, h, w, s, levers)
+        rows, _ = invariant_update(got, p, 9, z, np.arange(3), OFFSET, marks, h, w, s, levers, NO_LIMITS)
         wheels.correct(9, np.arange(3), h, w, s, rows, reset=True)
         _turn_columns(wheels.cross, 9, levers)
         gamma = transform(got, x[:2]) @ np.linalg.inv(transform(x, x[:2]))

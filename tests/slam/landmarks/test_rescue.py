@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from slam import LINE
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmarks.association import nearest_neighbour
 from slam.landmarks.rescue import match_missed
 from slam.metrics.chi_square import chi2_quantile
@@ -41,7 +41,7 @@ def associated() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.nda
     x, p, marks = corridor()
     z, match = scan(), np.zeros(3, np.int64)
     nearest_neighbour(x, p, 0.0, z, marks, GATE, 0.2, 0.6, True, match, np.zeros(3))
-    stacked_update(x, p, len(x), z, match, 0.0, *work_space(8, len(x)))
+    stacked_update(x, p, len(x), z, match, 0.0, *work_space(8, len(x)), NO_LIMITS)
     return x, p, marks, z, match
 
 
@@ -51,7 +51,7 @@ def test_the_end_of_a_corridor_is_matched_once_its_walls_have_put_the_heading_ri
     more = np.zeros(3, np.int64)
     assert match_missed(x, p, 0.0, z, marks, NOW, np.array([GATE, 0.2, 0.6]), match, more) == 1
     assert more[2] == 2 and (more[:2] < 0).all()
-    stacked_update(x, p, len(x), z, more, 0.0, *work_space(8, len(x)))
+    stacked_update(x, p, len(x), z, more, 0.0, *work_space(8, len(x)), NO_LIMITS)
     assert abs(x[0] - 0.01) < 2e-3, "it says how far along the corridor the robot is"
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from slam import LINE
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.landmarks.association import predicted
 from slam.landmarks.book import KIND, LAST_SEEN, MARKS
 from slam.landmarks.seen_from import seen_from, sightings
@@ -55,7 +55,7 @@ def test_what_is_off_along_a_wall_moves_the_pose_along_it_alone(angle: float) ->
     cov[:2, :2] = 0.5**2 * np.outer(along, along) + 0.001**2 * np.outer(across, across)
     match = np.array([0, 1])
     z = sightings(x, marks, match, OFFSET, np.array([*0.3 * along, 0.0]), cov)
-    stacked_update(x, p, len(x), z, match, OFFSET, *work_space(8, len(x)))
+    stacked_update(x, p, len(x), z, match, OFFSET, *work_space(8, len(x)), NO_LIMITS)
     assert x[:2] @ along == pytest.approx(0.3 * 0.1**2 / (0.1**2 + 0.5**2), rel=0.05)
     assert abs(x[:2] @ across) < 1e-4 and abs(x[2]) < 1e-4
 
@@ -78,7 +78,7 @@ def test_together_they_say_no_more_than_the_match() -> None:
 def test_the_pose_is_surer_among_the_landmarks_alone() -> None:
     x, p, marks = world()
     z, match = seen_from(x, marks, OFFSET, POSE, COV)
-    stacked_update(x, p, len(x), z, match, OFFSET, *work_space(8, len(x)))
+    stacked_update(x, p, len(x), z, match, OFFSET, *work_space(8, len(x)), NO_LIMITS)
     assert np.hypot(*(x[:2] - POSE[:2])) < 0.7 * np.hypot(*POSE[:2]) and abs(x[2] - POSE[2]) < 0.01
     whole = np.triu(p) + np.triu(p, 1).T
     assert np.sqrt(whole[0, 0]) > 0.9, "where all of them are is as unsure as before"
