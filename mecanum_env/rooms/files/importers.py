@@ -132,7 +132,10 @@ def _beside(path: Path, image: str, what: str) -> Path:
             return target
     except (OSError, RuntimeError) as error:  # links in a circle, a name too long
         raise FloorPlanError(f"{what}: image {quoted(image)} leads nowhere; name a file beside it") from error
-    raise FloorPlanError(f"{what}: image {quoted(image)} lies outside of its folder; put it beside the map")
+    raise FloorPlanError(
+        f"{what}: image {quoted(image)} lies outside of its folder; put it beside the map, and name it there by "
+        f"image: {quoted(Path(image).name)}"
+    )
 
 
 def from_raster(
@@ -215,6 +218,11 @@ def _read_yaml(path: Path, what: str) -> Mapping[str, Any]:
 
 def _number(value: object) -> float:
     """Return a finite number, or NaN for anything else."""
+    if isinstance(value, str):  # 1e-05, as ROS's map_saver writes it: to PyYAML a number has a point
+        try:
+            value = float(value)
+        except ValueError:
+            return math.nan
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return math.nan
     try:

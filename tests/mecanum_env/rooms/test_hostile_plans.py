@@ -41,7 +41,8 @@ def test_an_image_lies_beside_its_map(tmp_path: Path) -> None:
     path = write_map(tmp_path / "map")
     assert rooms.load(path).name == "plan"
     for image in (str(other), "../other/plan.pgm", "/etc/passwd", "/dev/zero", "a/../../other/plan.pgm"):
-        refused(write_map(tmp_path / "map", image=image), "outside of its folder; put it beside the map")
+        said = f"outside of its folder; put it beside the map, and name it there by image: '{Path(image).name}'"
+        refused(write_map(tmp_path / "map", image=image), said)
     link = tmp_path / "map" / "link.pgm"
     link.symlink_to(other)
     refused(write_map(tmp_path / "map", image="link.pgm"), "outside of its folder")

@@ -105,6 +105,15 @@ def test_negate_mode_and_thresholds(tmp_path):
     assert np.array_equal(rooms.load(write_map(tmp_path, raw, mode="raw")).free, picture()[::-1] == 254)
 
 
+def test_numbers_without_a_point_are_numbers(tmp_path):
+    """ROS 2's map_saver writes what is near 0 so; to PyYAML it is a word."""
+    plan = rooms.load(write_map(tmp_path, resolution="5e-2", origin="[-1e-05, 2e+00, -0]"))
+    assert plan.resolution == 0.05 and plan.origin == (-1e-05, 2.0)
+    refuse(write_map(tmp_path, resolution="nan"), "resolution must be above 0")
+    refuse(write_map(tmp_path, origin="[inf, 0, 0]"), "origin must be")
+    refuse(write_map(tmp_path, resolution="five"), "resolution must be above 0")
+
+
 def test_images_of_all_kinds_are_read_alike(tmp_path):
     image = np.where(picture() == 254, 255, 0).astype(np.uint8)
     expected = image[::-1] > 127
