@@ -124,7 +124,7 @@ def parse_toml(text: bytes, *, what: str) -> dict[str, Any]:
     """Return what TOML says; ``ValueError`` in one line where it is none, or nested too deep."""
     if _LONG_KEY.search(text):  # what tomllib's time and memory go by the square of
         raise ValueError(f"{what} is damaged: TOML nested too deep")
-    found: dict[str, Any] = _parsed(lambda: tomllib.loads(text.decode("utf-8")), what, "TOML")
+    found: dict[str, Any] = _parsed(lambda: tomllib.loads(text.decode("utf-8-sig")), what, "TOML")
     return found
 
 

@@ -19,6 +19,8 @@ _LONGEST_S = 2 * 86_400.0
 _LARGEST_NUMBER = 1e16  # of any column: a clock in microseconds since 1970 is at 2e15
 _LEAST_LINE = 24  # bytes that a line of a packed file counts for: ever so many short ones take their time, too
 _LONGEST_LINE = 2**20  # bytes: a scan of ten thousand beams and more
+# What editors and shells of Windows begin a text with.
+_UTF8_MARK, _UTF16_MARKS = b"\xef\xbb\xbf", (b"\xff\xfe", b"\xfe\xff")
 
 
 def find(folder: Path, name: str) -> Path:
@@ -124,6 +126,10 @@ def read_lines(path: Path) -> Iterator[tuple[int, str]]:
             if size > min(most, _LARGEST) or len(line) > _LONGEST_LINE:
                 limit = f", line {number}" if len(line) > _LONGEST_LINE else ""
                 raise ValueError(f"{path}{limit} is larger than any log's: it is no such log")
+            if number == 1 and line.startswith(_UTF16_MARKS):
+                raise ValueError(f"{path} is written in UTF-16; save it as UTF-8")
+            if number == 1:
+                line = line.removeprefix(_UTF8_MARK)
             yield number, line.decode("utf-8", "replace")
 
 

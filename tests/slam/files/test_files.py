@@ -67,6 +67,7 @@ def test_what_is_no_toml_is_refused(text: bytes, words: str) -> None:
 def test_toml_of_a_usual_depth_is_read() -> None:
     text = b"[a.b.c]\nx = [0.5, 1.5, " + b"0.25, " * 500 + b"]\n'odd key'.y = 1\n"
     assert parse_toml(text, what="config")["a"]["b"]["c"]["odd key"] == {"y": 1}
+    assert parse_toml(b"\xef\xbb\xbfslam = 'ekf'\r\n", what="config") == {"slam": "ekf"}, "as Notepad saves it"
 
 
 @pytest.mark.parametrize(

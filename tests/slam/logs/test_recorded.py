@@ -261,6 +261,18 @@ def test_files_that_are_no_logs(make, how, tmp_path):
         assert name in str(raised.value) and "\n" not in str(raised.value)
 
 
+@pytest.mark.parametrize(("make", "names"), [(write_utias, UTIAS_FILES), (write_park, PARK_FILES)])
+def test_tables_may_begin_with_a_byte_order_mark(make, names, tmp_path):
+    make(tmp_path)
+    log = open_log(tmp_path)
+    for name in names:
+        path = tmp_path / name
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    marked = open_log(tmp_path)
+    assert np.array_equal(marked.twists, log.twists) and np.array_equal(marked.range_bearing, log.range_bearing)
+    assert np.array_equal(marked.reference_poses, log.reference_poses, equal_nan=True)
+
+
 def test_what_is_no_log_at_all(tmp_path):
     (tmp_path / "notes.txt").write_text("1 2 3")
     for path, words in (
