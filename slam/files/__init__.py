@@ -4,7 +4,7 @@
 names from outside are shown.
 """
 
-from slam.files.bags import BagMessage, bag_messages, is_bag
+from slam.files.bags import ROS1_BAG, ROS1_REMEDY, BagMessage, bag_messages, is_bag
 from slam.files.databases import check_tables, open_database, trust
 from slam.files.names import plain_name, quoted, shown_path
 from slam.files.reading import (
@@ -19,6 +19,8 @@ from slam.files.reading import (
 )
 
 __all__ = [
+    "ROS1_BAG",
+    "ROS1_REMEDY",
     "BagMessage",
     "bag_messages",
     "check_file",

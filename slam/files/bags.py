@@ -18,7 +18,11 @@ from slam.files.databases import check_tables, open_database, trust
 from slam.files.names import quoted, shown_path
 from slam.files.reading import check_file
 
-__all__ = ["BagMessage", "bag_messages", "is_bag"]
+__all__ = ["ROS1_BAG", "ROS1_REMEDY", "BagMessage", "bag_messages", "is_bag"]
+
+ROS1_BAG = "#ROSBAG V"
+"""How a bag of ROS 1 begins."""
+ROS1_REMEDY = "make it one of ROS 2 by rosbags-convert --src FILE.bag --dst FOLDER (pip install rosbags)"
 
 _MIB = 2**20
 _LARGEST = 256 * _MIB  # of a record; a scan has some kilobytes, a picture some megabytes
@@ -117,6 +121,8 @@ def _of_mcap(path: Path, datatypes: Collection[str], topics: dict[str, str]) -> 
                 if isinstance(record, Schema):
                     schemas[record.id] = record.name
                 elif isinstance(record, Channel):
+                    if record.message_encoding == "ros1":
+                        raise _Refused(f"is of ROS 1; take the bag that it was made from, and {ROS1_REMEDY}")
                     channels[record.id] = record.topic, schemas[record.schema_id], record.message_encoding
                     topics[record.topic] = schemas[record.schema_id]
                 elif isinstance(record, Message):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from slam.files import is_bag
+from slam.files import ROS1_BAG, ROS1_REMEDY, is_bag
 from slam.logs import carmen, dpslam, ros_bag, utias, victoria_park
 from slam.logs.log import Event
 from slam.logs.recorded import ObservationNoise, RecordedLog
@@ -160,6 +160,8 @@ def _with_equal_stamps(stamps: list[float], of_reference: list[float]) -> tuple[
 def _reader_of(path: Path) -> Callable[[Path], ScanLog] | None:
     """Return what reads a log of scans; ``None`` where no line at its beginning is either format's."""
     for number, line in read_lines(path):
+        if number == 1 and line.startswith(ROS1_BAG):
+            raise ValueError(f"{path} is a bag of ROS 1; {ROS1_REMEDY}")
         word = "".join(line[:20].split(maxsplit=1)[:1])
         if word in _READERS or number >= _LINES_TO_KNOW_BY:
             return _READERS.get(word)

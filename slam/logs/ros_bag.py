@@ -98,7 +98,8 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     """Read a ROS 2 bag: a folder of ``ros2 bag record``, or one of its files (MCAP or SQLite).
 
     Scans before the first odometry and after the last are left out; at the others the odometry is interpolated.
-    Where that jumps, as when its driver was started again, it goes on from where it was.
+    Where that jumps, as when its driver was started again, it goes on from where it was. Messages may lie in any
+    order; their stamps tell.
     Scans whose beams lie otherwise than the first one's take, at each of its bearings, the nearest beam.
 
     Raises
@@ -121,7 +122,8 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
         raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump:.4g} m; correct the log")
     odometry, jumps = _without_jumps(odometry_times, odometry)
     left_out = f"; jumps of the odometry that are left out: {jumps}" if jumps else ""
-    stamps = np.array([stamp for stamp, _ in found.scans[scan_topic]])
+    scans = _in_order(found.scans[scan_topic])
+    stamps = np.array([stamp for stamp, _ in scans])
     covered = np.flatnonzero((stamps >= odometry_times[0]) & (stamps <= odometry_times[-1]))
     if not len(covered):
         raise ValueError(f"{where}: no scan of {scan_topic} is from the time of the odometry on {odom_topic}; "
@@ -130,7 +132,12 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
         raise ValueError(f"{where}: all scans of {scan_topic} have one time stamp; correct its driver")
     stamps = stamps[covered]
     poses = _beside(_at(stamps, odometry_times, odometry), mount)
-    ranges, first = _ranges([found.scans[scan_topic][i][1] for i in covered], mount)
+    ranges, first = _ranges([scans[i][1] for i in covered], mount)
+    if np.isnan(ranges).all():
+        within = f"range_min and range_max, {first.range_min:.4g} and {first.range_max:.4g} m"
+        raise ValueError(
+            f"{where}: every beam of {scan_topic} is lost: no range lies between {within}; correct its driver"
+        )
     times = rising(stamps)
     log = ScanLog(
         name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]), times=times - times[0],
@@ -197,7 +204,10 @@ def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
         found.ranges += len(scan.ranges)
         if found.ranges > _MOST_RANGES:
             raise ValueError(f"has more than {_MOST_RANGES} ranges; cut the bag into shorter ones")
-        found.scan_frames.setdefault(topic, decoded.header.frame_id.lstrip("/"))
+        frame = decoded.header.frame_id.lstrip("/")
+        if found.scan_frames.setdefault(topic, frame) != frame:
+            both = f"{quoted(found.scan_frames[topic])} and {quoted(frame)}"
+            raise ValueError(f"has scans in frames {both}; record a topic for each lidar")
         kept = scan._replace(ranges=scan.ranges.astype(np.float32))  # as they were recorded
         found.scans.setdefault(topic, []).append((stamp_of(decoded), kept))
         return
@@ -281,6 +291,16 @@ def _ranges(scans: list[Scan], mount: Mount) -> tuple[Any, Scan]:
         for s in levelled
     )
     return np.stack([np.asarray(row, np.float32) for row in rows]), first
+
+
+def _in_order(scans: list[tuple[float, Scan]]) -> list[tuple[float, Scan]]:
+    """Return scans by their stamps, as odometry is taken; what a merged bag has twice, once."""
+    kept: list[tuple[float, Scan]] = []
+    for stamp, scan in sorted(scans, key=lambda each: each[0]):
+        at, before = kept[-1] if kept else (math.nan, scan)
+        if stamp != at or not np.array_equal(scan.ranges, before.ranges, equal_nan=True):
+            kept.append((stamp, scan))
+    return kept
 
 
 def _without_jumps(times: Array, poses: Array) -> tuple[Array, int]:

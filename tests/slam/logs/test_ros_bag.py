@@ -192,6 +192,56 @@ def test_a_lidar_that_looks_back_sideways_and_upside_down(base: str, tmp_path: P
     assert found.settings["lidar_offset_m"] == pytest.approx(0.1)
 
 
+def test_messages_in_any_order_and_twice_are_the_same_log(tmp_path: Path) -> None:
+    messages = list(drive(mount=mounted(0.2, 0.0, 0.0)))
+    log = bag(write_bag(tmp_path / "whole", messages))
+    mixed = np.random.default_rng(0).permutation(len(messages))
+    for name, again in {
+        "mixed": [messages[k] for k in mixed],
+        "twice": [message for message in messages for _ in range(2)],
+        "merged": [*messages, *messages],
+    }.items():
+        found = bag(write_bag(tmp_path / name, again))
+        assert np.array_equal(found.stamps, log.stamps) and np.array_equal(found.times, log.times), name
+        assert np.array_equal(found.ranges, log.ranges), name
+        assert np.array_equal(found.odometry_poses, log.odometry_poses), name
+
+
+def test_scans_of_one_stamp_that_differ_are_all_kept(tmp_path: Path) -> None:
+    """A coarse clock's."""
+    messages = [(t, d, at, m) for t, d, at, m in drive(mount=mounted(0.2, 0.0, 0.0)) if t != "/scan"]
+    for k in range(20):
+        at = 1e9 + 0.5 + 0.5 * (k // 5)
+        messages.append(("/scan", SCAN, at, scan_message(at, "laser", scan(np.full(8, 1.0 + 0.1 * k)))))
+    assert len(bag(write_bag(tmp_path / "b", messages)).times) == 20
+
+
+def test_two_lidars_on_one_topic_are_refused(tmp_path: Path) -> None:
+    messages = list(drive(mount=mounted(0.2, 0.0, 0.0)))
+    rear = ("/scan", SCAN, 1e9 + 0.3, scan_message(1e9 + 0.3, "rear", scan(np.ones(8))))
+    text = refused(write_bag(tmp_path / "b", [*messages, rear]))
+    assert "topic '/scan' has scans in frames 'laser' and 'rear'; record a topic for each lidar" in text
+
+
+def test_a_lidar_that_measures_nothing_is_refused(tmp_path: Path) -> None:
+    in_mm = drive(mount=mounted(0.2, 0.0, 0.0), place=lambda _, ranges: scan(1e3 * ranges))
+    text = refused(write_bag(tmp_path / "b", in_mm))
+    assert "every beam of /scan is lost: no range lies between range_min and range_max, 0.02 and 8 m" in text
+
+
+def test_messages_of_ros_1_are_told_what_to_do(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "drive.mcap"
+    with path.open("wb") as stream:
+        writer: Any = Writer(stream)
+        writer.start(profile="ros1", library="x")
+        schema = writer.register_schema("sensor_msgs/LaserScan", "ros1msg", b"")
+        writer.add_message(writer.register_channel("/scan", "ros1", schema), 0, b"", 0)
+        writer.finish()
+    assert "is of ROS 1; take the bag that it was made from, and make it one of ROS 2" in refused(path)
+
+
 def test_scans_of_changing_beams_are_laid_on_the_first(tmp_path: Path) -> None:
     def place(number: int, ranges: Any) -> Any:
         return scan(ranges) if number % 2 == 0 else scan(np.repeat(ranges, 2), angle_min=-math.pi - math.pi / 16)
