@@ -6,7 +6,7 @@ Navigation (CARMEN) toolkit", IROS 2003::
     ODOM x y theta tv rv accel time host logger_time
     FLASER n r_1 … r_n x y theta odom_x odom_y odom_theta time host logger_time
 
-The beams of n = 180 or 181 stand 1° apart, the first at -90°.
+The number n tells where beams stand (:func:`slam.logs.scans.beam_angles`).
 """
 
 from __future__ import annotations

@@ -47,6 +47,14 @@ _NO_RETURN_CM_M = 81.8
 _HIGHEST_MM_M = 8.192
 
 
+# First bearing and step [°], where the number of beams tells them; GMapping's reader has the same steps.
+_URG = 360.0 / 1024.0
+_BEAMS = {
+    180: (-90.0, 1.0), 181: (-90.0, 1.0), 360: (-90.0, 0.5), 361: (-90.0, 0.5), 540: (-135.0, 0.5),
+    541: (-135.0, 0.5), **{beams: (-0.5 * (beams - 1) * _URG, _URG) for beams in (682, 683, 769)},
+}  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScanLog(Log):
     """Odometry and laser scans of a real robot, one odometry pose a scan.
@@ -134,6 +142,10 @@ def scan_log(
 ) -> ScanLog:
     """Return a log without a reference, of ranges ``(n, beams)`` [m] as they were recorded."""
     measured, reach = without_returns(ranges)
+    if np.isnan(measured).all():
+        raise ValueError(
+            f"{path}: no range is above 0 and below {_NO_RETURN_CM_M} m, so nothing was measured; give ranges in m"
+        )
     angle_min, increment = beam_angles(ranges.shape[1])
     return ScanLog(
         name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]),
@@ -145,14 +157,15 @@ def scan_log(
 
 
 def beam_angles(beams: int) -> tuple[float, float]:
-    """Return the bearing of the first beam and the step between beams [rad] of a half-circle laser.
+    """Return the bearing of the first beam and the step between beams [rad] of a laser with so many.
 
     180 and 181 beams: 1° from -90° on, 180 ending at 89° (on the Intel log consecutive corrected scans agree best
-    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Other numbers span -90° to
-    90°.
+    so, better than with beams centred or spread to 90°, see docs/studies/real-logs.md). Half a degree alike: 360
+    and 361 beams from -90° on, 540 and 541 from -135° on. A Hokuyo URG's 682, 683 or 769, 1024 a circle, are
+    centred. Other numbers span -90° to 90°.
     """
-    step = 1.0 if beams in (180, 181) else 180.0 / (beams - 1)
-    return math.radians(-90.0), math.radians(step)
+    first, step = _BEAMS.get(beams, (-90.0, 180.0 / (beams - 1)))
+    return math.radians(first), math.radians(step)
 
 
 def chain(start: Array, steps: Array) -> Array:

@@ -96,6 +96,19 @@ def test_beams_stand_a_degree_apart():
         assert math.degrees(first) == -90.0 and math.degrees(first + step * (beams - 1)) == pytest.approx(last)
 
 
+@pytest.mark.parametrize(
+    ("beams", "first_deg", "step_deg"),
+    [
+        (360, -90.0, 0.5), (361, -90.0, 0.5), (540, -135.0, 0.5), (541, -135.0, 0.5),
+        (682, -119.7, 360 / 1024), (683, -119.9, 360 / 1024), (769, -135.0, 360 / 1024),
+    ],
+)  # fmt: skip
+def test_beams_of_other_lasers_are_known_by_their_number(beams, first_deg, step_deg):
+    first, step = beam_angles(beams)
+    assert math.degrees(first) == pytest.approx(first_deg, abs=0.05)
+    assert math.degrees(step) == pytest.approx(step_deg)
+
+
 # ---- odometry -------------------------------------------------------------------------------------------------
 
 
@@ -279,6 +292,30 @@ def test_what_carmen_lines_may_not_be(line, words, tmp_path):
 def test_what_dpslam_lines_may_not_be(line, words, tmp_path):
     path = put_lines(tmp_path / "bad.log", [*dpslam_lines(5), line])
     with pytest.raises(ValueError, match=words):
+        open_log(path)
+
+
+@pytest.mark.parametrize("range_m", [0, 5000])
+def test_a_log_in_which_nothing_was_measured_is_refused(range_m, tmp_path):
+    line = f"FLASER 180 {f'{range_m} ' * 180}0 0 0 0 0 0 1 host 1"
+    with pytest.raises(ValueError, match="nothing was measured; give ranges in m"):
+        open_log(put_lines(tmp_path / "lost.log", [line, line]))
+
+
+def test_a_text_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "room.log"
+    scans = [line for line in GOOD if line.startswith("FLASER")]
+    path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(scans).encode())
+    assert len(scan_log(path).times) == len(scans)
+    path.write_bytes("\n".join(GOOD).encode("utf-16"))
+    with pytest.raises(ValueError, match="is written in UTF-16; save it as UTF-8"):
+        open_log(path)
+
+
+def test_a_bag_of_ros_1_is_told_what_to_do(tmp_path):
+    path = tmp_path / "drive.bag"
+    path.write_bytes(b"#ROSBAG V2.0\n" + bytes(2**21))
+    with pytest.raises(ValueError, match="is a bag of ROS 1; make it one of ROS 2 by rosbags-convert"):
         open_log(path)
 
 
