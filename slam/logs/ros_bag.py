@@ -30,6 +30,7 @@ _TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
 
 _MOST_RANGES = 2**28  # of all scans together: a gibibyte
 _REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
+_GAP_SCANS = 3.0  # intervals of scans, across which it is one line: scans may be rarer than that
 _LONGEST_JUMP_M = 1e3  # from one odometry to the next
 _FASTEST_M_S, _FASTEST_RAD_S = 25.0, 20.0  # beyond is no motion, but odometry that began anew …
 _LEAST_S = 0.04  # … where not just two stamps lie too close together
@@ -139,11 +140,12 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
             f"{where}: every beam of {scan_topic} is lost: no range lies between {within}; correct its driver"
         )
     times = rising(stamps)
+    gap_s = max(_REFERENCE_GAP_S, _GAP_SCANS * float(np.median(np.diff(times)))) if len(times) > 1 else 0.0
     log = ScanLog(
-        name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]), times=times - times[0],
+        name=plain_name(path.absolute().name.split(".")[0]), clock_start_s=float(times[0]), times=times - times[0],
         stamps=stamps, ranges=ranges, angle_min=first.angle_min, angle_increment=first.angle_increment,
         range_max=first.range_max, odometry_poses=poses, start_pose=poses[0].copy(), reference_times=np.zeros(0),
-        reference_poses=np.zeros((0, 3)), reference_gap_s=_REFERENCE_GAP_S,
+        reference_poses=np.zeros((0, 3)), reference_gap_s=gap_s,
         settings=SETTINGS | {"lidar_offset_m": mount.x_m},
         note=f"no reference; give one with --reference-topic{left_out}",
     )  # fmt: skip

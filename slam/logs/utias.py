@@ -67,6 +67,7 @@ _OFF_AXIS_M = 0.15
 _CAMERA_LATE_S = 0.03
 _BASE_LATE_S = 0.19
 _NEAREST_M = 0.1  # of a range; the log's are above 1 m
+_FULL_TURN_RAD = 6.3
 _WIDEST_RAD = 1.2  # a bearing; the camera's go to 0.6
 _SPEED_SCALE, _HANGS_BACK_M, _TURN_SCALE = 1.038, 0.09, 0.97
 _STRAY_S = 0.12  # zeros that are shorter are the logger's, not a command
@@ -91,6 +92,13 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     measured = read_timed(
         find(folder, f"Robot{robot}_Measurement.dat"), 4, "time, bar code, range, bearing", most=1e9
     )
+    odd = np.flatnonzero((measured[:, 2] < 0.0) | (np.abs(measured[:, 3]) > _FULL_TURN_RAD))
+    if len(odd):
+        at, _, distance, bearing = measured[odd[0]].tolist()
+        raise ValueError(
+            f"{find(folder, f'Robot{robot}_Measurement.dat')}, time {at:.10g}: a range of {distance:g} m at a "
+            f"bearing of {bearing:g} rad is none; ranges are at least 0, bearings radians"
+        )
     truth = read_timed(find(folder, f"Robot{robot}_Groundtruth.dat"), 4, "time, x, y, orientation", most=1e7)
     landmark_ids, landmarks = _landmarks(find(folder, "Landmark_Groundtruth.dat"))
     subject_of_code = _codes(find(folder, "Barcodes.dat"))

@@ -112,6 +112,10 @@ def prepare(
             config_type(slam)  # before a log is read in vain
         check_writable(out, (*MAP_FILES, *FILES))
         values, past = read_config(config, _RUN_KINDS) if config is not None else ({}, {})
+        if reference is not None or reference_topic is not None:
+            require(reference is None or reference_topic is None,
+                    "--reference and --reference-topic are two references; give one of them")  # fmt: skip
+            past = {name: v for name, v in past.items() if name not in ("reference", "reference_topic")}
         given = {"association": association, "seed": seed, "limit_s": limit_s, "reference": reference}
         given |= {"scan_topic": scan_topic, "odom_topic": odom_topic, "reference_topic": reference_topic}
         given |= {"mount": mount}

@@ -216,6 +216,21 @@ def test_scans_of_one_stamp_that_differ_are_all_kept(tmp_path: Path) -> None:
     assert len(bag(write_bag(tmp_path / "b", messages)).times) == 20
 
 
+def test_a_reference_at_rare_scans_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture of a replay breaks it at gaps: a scan a second or two is none."""
+    messages = [mounted(0.2, 0.0, 0.0)]
+    for k in range(40):
+        at, pose = 1e9 + 0.25 * k, np.array([0.1 * k, 0.0, 0.0])
+        messages += [(t, ODOMETRY, at, odometry_message(at, "odom", "base_link", pose, np.zeros(3)))
+                     for t in ("/odom", "/truth")]  # fmt: skip
+        if k % 8 == 4:
+            messages.append(("/scan", SCAN, at, scan_message(at, "laser", scan(np.full(8, 2.0)))))
+    monkeypatch.chdir(write_bag(tmp_path / "rare", messages))
+    log = bag(Path("."), reference="/truth")
+    assert len(log.reference_times) == 5 and np.diff(log.reference_times).max() < log.reference_gap_s < 10.0
+    assert log.name == "rare", "the folder that it is in"
+
+
 def test_two_lidars_on_one_topic_are_refused(tmp_path: Path) -> None:
     messages = list(drive(mount=mounted(0.2, 0.0, 0.0)))
     rear = ("/scan", SCAN, 1e9 + 0.3, scan_message(1e9 + 0.3, "rear", scan(np.ones(8))))

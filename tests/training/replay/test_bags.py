@@ -59,6 +59,12 @@ def test_a_bag_gives_the_numbers_of_its_log(
         [str(bag), "--config", str(tmp_path / "b" / "config.toml"), "--out", str(tmp_path / "c")], capsys
     )
     assert again["ate_rmse_m"] == found["ate_rmse_m"]
+    # One reference is meant; an option goes before what the configuration says.
+    both = [str(bag), "--reference-topic", "/truth", "--reference", str(true), "--out", str(tmp_path / "e")]
+    assert "are two references; give one of them" in refused(both, capsys)
+    (tmp_path / "e.toml").write_text(f'[run]\nreference = "{tmp_path / "gone.log"}"\n')
+    again = replayed([*both[:3], "--config", str(tmp_path / "e.toml"), *both[5:], "--slam", backend], capsys)
+    assert again["note"] == found["note"]
     # As a reference for scans of the same stamps a CARMEN log is good, too.
     more = replayed([str(bag), "--reference", str(true), "--slam", backend, "--out", str(tmp_path / "d")], capsys)
     assert more["ate_rmse_m"] == pytest.approx(direct["ate_rmse_m"], rel=1e-5)
