@@ -45,7 +45,7 @@ def is_bag(path: Path) -> bool:
     """Tell whether a path is a ROS 2 bag by its name: a file of one, or a folder with such files."""
     if path.is_dir():
         return bool(_files(path) or list(path.glob("*.zstd")))
-    return path.suffix in _SUFFIXES
+    return path.suffix in _SUFFIXES or _packed_whole(path)
 
 
 def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str]) -> Iterator[BagMessage]:
@@ -72,6 +72,8 @@ def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str])
                          "take the packed files away")  # fmt: skip
     for file in files:
         check_file(file, what="bag")
+        if _packed_whole(file):
+            raise ValueError(f"bag {shown_path(file)} is packed; unpack it by zstd -d {shown_path(file)}")
         read = _of_mcap if file.suffix == ".mcap" else _of_sqlite
         try:
             yield from read(file, datatypes, topics)
@@ -96,6 +98,10 @@ def _files(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if path.suffix in _SUFFIXES]
     # Words and numbers by turns, so that like is compared with like.
     return sorted(found, key=lambda path: [int(w) if k % 2 else w for k, w in enumerate(_NUMBER.split(path.name))])
+
+
+def _packed_whole(path: Path) -> bool:
+    return path.suffix in (".zstd", ".zst") and Path(path.stem).suffix in _SUFFIXES
 
 
 def _words(error: Exception) -> str:

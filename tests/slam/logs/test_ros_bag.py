@@ -353,6 +353,8 @@ def test_damaged_and_hostile_bags(log: ScanLog, tmp_path: Path) -> None:
         open_log(tmp_path / "gone.mcap")
     packed = write_bag(tmp_path / "files", recorded(log), storage="sqlite3", mode="file")
     assert "unpack it by zstd -d" in refused(packed)
+    (one,) = packed.glob("*.zstd")
+    assert "is packed; unpack it by zstd -d" in refused(one)
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", "brotli"])
