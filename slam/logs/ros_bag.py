@@ -30,7 +30,7 @@ _TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
 
 _MOST_RANGES = 2**28  # of all scans together: a gibibyte
 _REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
-_GAP_SCANS = 3.0  # intervals of scans, across which it is one line: scans may be rarer than that
+_GAP_SCANS = 2.0  # intervals of scans, across which it is one line: scans may be rarer than that
 _LONGEST_JUMP_M = 1e3  # from one odometry to the next
 _FASTEST_M_S, _FASTEST_RAD_S = 25.0, 20.0  # beyond is no motion, but odometry that began anew …
 _LEAST_S = 0.04  # … where not just two stamps lie too close together
