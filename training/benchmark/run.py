@@ -171,16 +171,14 @@ class BenchmarkPlan:
     def config_text(self) -> str:
         """Return the effective configuration of the first suite and backend as TOML; [run] has what varies."""
         run: dict[str, Any] = {
-            "suites": {
-                s.name: {"noise": s.noise, "places": [p.name for p in s.places]} for s in self.suites
-            },
+            "suites": {s.name: {"noise": s.noise, "places": [p.name for p in s.places]} for s in self.suites},
             "agents": list(self.agents),
             "backends": list(self.backends),
             "split": self.split if self.seeds is None else "given seeds",
             "seeds": {s.name: self._seeds_of(s) for s in self.suites},
             "step_limit": self.settings()["max_steps"],
             "versions": versions(),
-        }  # fmt: skip
+        }
         if self.baseline is not None:
             run["baseline"] = self.baseline
         run |= self._told_teams()

@@ -148,9 +148,7 @@ def _excluded(
             if solved.fun > spare * (1.0 + 1e-9) + 1e-6:
                 return True
             unseen = solved.x
-        fresh = {
-            found for _ in range(_SETS) if (found := _too_far(apart, unseen, length, rng)) is not None
-        }  # fmt: skip
+        fresh = {found for _ in range(_SETS) if (found := _too_far(apart, unseen, length, rng)) is not None}
         if not fresh:
             return False
         sets += sorted(fresh)

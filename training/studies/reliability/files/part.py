@@ -18,9 +18,8 @@ _GOOD = ("read", "refused")
 
 def _jobs(size: int, seed: int) -> list[Job]:
     return [
-        (name, seed, first, min(_AT_ONCE, size - first))
-        for name in READERS for first in range(0, size, _AT_ONCE)
-    ]  # fmt: skip
+        (name, seed, first, min(_AT_ONCE, size - first)) for name in READERS for first in range(0, size, _AT_ONCE)
+    ]
 
 
 def _work(job: Job) -> Row:

@@ -27,9 +27,7 @@ _SIGNALS = (signal.SIGKILL, signal.SIGTERM)
 
 def _jobs(size: int, seed: int) -> list[Job]:
     names = installed()
-    return [
-        (names[k % len(names)], seed, k, min(_KILLS, size - k * _KILLS)) for k in range(-(-size // _KILLS))
-    ]  # fmt: skip
+    return [(names[k % len(names)], seed, k, min(_KILLS, size - k * _KILLS)) for k in range(-(-size // _KILLS))]
 
 
 def _work(job: Job) -> Row:

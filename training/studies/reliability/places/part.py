@@ -46,7 +46,7 @@ def _table(found: Summary) -> Table:
     rows = [
         [name, str(one["rounds"]), str(one["wrong"]), "; ".join(dict.fromkeys(one["skipped"])), one["about"]]
         for name, one in found["places"].items()
-    ]  # fmt: skip
+    ]
     return ["place", "rounds", "wrong", "skipped", "what is done there"], rows
 
 
