@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from training.runs.running import plain
 
 __all__ = [
     "CURVE_POINTS", "THUMBNAIL_PX", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "resampled",
-    "row_metrics", "run_job", "run_single", "small_png", "way",
+    "row_metrics", "run_job", "small_png", "way",
 ]  # fmt: skip
 
 Curve = NDArray[np.float32]
@@ -72,6 +71,10 @@ class EpisodeJob:
             "floor_plan": self.floor_plan, "max_steps": self.max_steps,
         }  # fmt: skip
 
+    def run(self) -> EpisodeRow:
+        """Run the episode; return its row."""
+        return _row(run_whole(**self.options))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRow:
@@ -91,13 +94,8 @@ class EpisodeFailure:
     message: str
 
 
-def run_single(job: EpisodeJob) -> EpisodeRow:
-    """Run an episode of one robot; return its row."""
-    return _row(run_whole(**job.options))
-
-
-def run_job(job: EpisodeJob, run_one: Callable[[Any], EpisodeRow] = run_single) -> EpisodeRow | EpisodeFailure:
-    """Run one episode; an error in it is returned, so that the other episodes go on.
+def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
+    """Run one episode, of one robot or of a team; an error in it is returned, so that the others go on.
 
     Raises
     ------
@@ -105,7 +103,7 @@ def run_job(job: EpisodeJob, run_one: Callable[[Any], EpisodeRow] = run_single) 
         On Ctrl-C: half an episode is no row.
     """
     try:
-        return run_one(job)
+        return job.run()
     except Exception as error:
         return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
 

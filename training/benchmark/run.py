@@ -19,11 +19,11 @@ from slam.formats import atomic_write
 from slam.settings import check_name, to_mapping
 from training.benchmark import store as benchmark_store
 from training.benchmark import suites
-from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key, run_job
 from training.benchmark.figures import Group, group_rows, with_regrets
 from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import NOMINAL, SPLITS, Place, Suite
-from training.benchmark.team_episode import TeamJob, run_job
+from training.benchmark.team_episode import TeamJob
 from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
 from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import refuse_bounds

@@ -13,10 +13,10 @@ from mecanum_env.team.picture import draw_maps
 from slam.metrics.measures import ate_aligned
 from slam.types import Array
 from training.benchmark import episode as single
-from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, Key
+from training.benchmark.episode import EpisodeJob, EpisodeRow, Key
 from training.episodes.team import TeamEpisode, prepare, run
 
-__all__ = ["TeamJob", "run_job"]
+__all__ = ["TeamJob"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +33,13 @@ class TeamJob(EpisodeJob):
             self.team.communication.model,
         )  # fmt: skip
 
-
-def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
-    """Run one episode, of one robot or of a team; as :func:`training.benchmark.episode.run_job`."""
-    return single.run_job(job, _run_team if isinstance(job, TeamJob) else single.run_single)
-
-
-def _run_team(job: TeamJob) -> EpisodeRow:
-    episode = prepare(job.team, **job.options)
-    run(episode, lambda **_: None)
-    if episode.interrupted:
-        raise KeyboardInterrupt
-    return _row(episode)
+    def run(self) -> EpisodeRow:
+        """Run the episode; return its row."""
+        episode = prepare(self.team, **self.options)
+        run(episode, lambda **_: None)
+        if episode.interrupted:
+            raise KeyboardInterrupt
+        return _row(episode)
 
 
 def _row(episode: TeamEpisode) -> EpisodeRow:

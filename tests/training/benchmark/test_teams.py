@@ -17,14 +17,14 @@ import pytest
 from mecanum_env.team.config import TeamConfig
 from tests.training.benchmark.small import episode, made_up_group, without_clock
 from tests.training.cli.test_bad_input import refused
-from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob
+from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob, run_job
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import Report, as_json, markdown, table
 from training.benchmark.report import page
 from training.benchmark.report_charts import COLOURS, scaling_charts, team_chart
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import teams_of
-from training.benchmark.team_episode import TeamJob, run_job
+from training.benchmark.team_episode import TeamJob
 from training.benchmark.team_figures import scaling_of
 from training.cli import main
 
