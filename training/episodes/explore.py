@@ -128,15 +128,10 @@ class Episode(Course):
 # ---- before --------------------------------------------------------------------------------------------------
 
 
-def prepare(
-    *, out: Path, agent: str | None = None, rooms: str | None = None, slam: str | None = None,
-    robot: str | None = None, noise: str | None = None, seed: int | None = None, floor_plan: Path | None = None,
-    start: tuple[float, float, float] | None = None, config: Path | None = None, max_steps: int | None = None,
-    coverage_target: float | None = None,
-) -> Episode:  # fmt: skip
+def prepare(*, out: Path, **asked: Any) -> Episode:
     """Check everything that can be checked, and place the robot; nothing is written.
 
-    Of what is ``None`` the config file or the default decides.
+    What else is asked are options of :func:`asked_for`.
 
     Raises
     ------
@@ -144,11 +139,7 @@ def prepare(
         In one line: which option, file or name is wrong, and what to do.
     """
     with bad_input():
-        world, run, plan = asked_for(
-            out=out, files=[*FILES, *EXTRAS.values()], agent=agent, rooms=rooms, slam=slam, robot=robot,
-            noise=noise, seed=seed, floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,
-            coverage_target=coverage_target,
-        )  # fmt: skip
+        world, run, plan = asked_for(out=out, files=[*FILES, *EXTRAS.values()], **asked)
         wrapped = gymnasium.make(
             "mecanum_env:mecanum_env/Explore-v0", config=replace(world, coverage_target=1.0),
             max_episode_steps=run["max_steps"], disable_env_checker=True,
@@ -166,10 +157,14 @@ def prepare(
 
 
 def asked_for(
-    *, out: Path, files: Sequence[str], rooms: str | None, slam: str | None, robot: str | None, noise: str | None,
-    floor_plan: Path | None, config: Path | None, coverage_target: float | None, seed: int | None, **given: Any,
+    *, out: Path, files: Sequence[str], agent: str | None = None, rooms: str | None = None,
+    slam: str | None = None, robot: str | None = None, noise: str | None = None, seed: int | None = None,
+    floor_plan: Path | None = None, start: tuple[float, float, float] | None = None, config: Path | None = None,
+    max_steps: int | None = None, coverage_target: float | None = None,
 ) -> tuple[EnvConfig, dict[str, Any], FloorPlan]:  # fmt: skip
-    """Return the world that the options of :func:`prepare` ask for, ``config.toml``'s [run], and the plan.
+    """Return the world that is asked for, ``config.toml``'s [run], and the plan.
+
+    Of what is ``None`` the config file or the default decides.
 
     An agent maps all that it can reach; what counts as success, the world's ``coverage_target``, is judged at
     the end.
@@ -178,7 +173,7 @@ def asked_for(
     if any(v is not None for v in (rooms, floor_plan, seed)):
         # Other rooms: neither the start nor the step limit is meant for them.
         past = {name: value for name, value in past.items() if name in _DEFAULTS}
-    given |= {"seed": seed}
+    given = {"agent": agent, "seed": seed, "start": start, "max_steps": max_steps}
     run = _DEFAULTS | past | {name: value for name, value in given.items() if value is not None}
     agents.check(run["agent"], *KNOWN_MAPS)
     if run["agent"].endswith(".safetensors"):
@@ -201,13 +196,12 @@ def done(agent: Agent) -> bool:
     return agent.goal is None and agent.status != "lost"
 
 
-def make_agent(name: str, env: ExploreEnv) -> Agent:
+def make_agent(name: str, env: ExploreEnv, *, config: Mapping[str, Any] | None = None) -> Agent:
     """Return an agent for an environment's robot, the bounds that know the map among them."""
     if name in KNOWN_MAPS:
         return KnownMap(env, KNOWN_MAPS[name])
-    config = env.config
-    body: dict[str, Any] = {"robot": config.robot, "lidar": config.lidar, "step_s": config.step_s}
-    return agents.make(name, **body)
+    told = env.config
+    return agents.make(name, robot=told.robot, lidar=told.lidar, step_s=told.step_s, config=config)
 
 
 def _read_run_table(path: Path) -> dict[str, Any]:

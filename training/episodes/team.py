@@ -140,12 +140,7 @@ def refuse_bounds(names: Iterable[str]) -> None:
             raise ValueError(f"{name} is the fastest way of one robot, and no bound of a team's; leave it out")
 
 
-def prepare(
-    team: TeamConfig, *, out: Path, agent: str | None = None, rooms: str | None = None, slam: str | None = None,
-    robot: str | None = None, noise: str | None = None, seed: int | None = None, floor_plan: Path | None = None,
-    start: tuple[float, float, float] | None = None, config: Path | None = None, max_steps: int | None = None,
-    coverage_target: float | None = None,
-) -> TeamEpisode:  # fmt: skip
+def prepare(team: TeamConfig, *, out: Path, **asked: Any) -> TeamEpisode:
     """Check everything that can be checked, and place the robots; nothing is written.
 
     As :func:`training.episodes.explore.prepare`; ``start`` is the first robot's, ``agent`` drives each of them.
@@ -157,11 +152,7 @@ def prepare(
     """
     with bad_input():
         files = [*FILES, LANDMARKS, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
-        world, run, plan = asked_for(
-            out=out, files=files, agent=agent, rooms=rooms, slam=slam, robot=robot, noise=noise, seed=seed,
-            floor_plan=floor_plan, start=start, config=config, max_steps=max_steps,
-            coverage_target=coverage_target,
-        )  # fmt: skip
+        world, run, plan = asked_for(out=out, files=files, **asked)
         refuse_bounds([run["agent"]])
         if run.get("start") is not None:
             plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)

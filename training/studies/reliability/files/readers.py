@@ -150,10 +150,7 @@ def _log(path: Path) -> None:
 
 def _config(path: Path) -> None:
     """Read a configuration, check it whole, and draw its rooms."""
-    nothing: dict[str, Any] = dict.fromkeys(
-        ("rooms", "slam", "robot", "noise", "floor_plan", "start", "max_steps", "coverage_target", "agent", "seed")
-    )
-    explore.asked_for(out=_NOWHERE, files=[], config=path, **nothing)
+    explore.asked_for(out=_NOWHERE, files=[], config=path)
 
 
 @cache
