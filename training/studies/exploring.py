@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import agents
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 
 __all__ = ["AGENT", "exploring"]
 
@@ -23,8 +23,7 @@ def exploring(
     tuple
         After each step its ``info``, and for how many steps the agent has had no goal; more than 20 end it.
     """
-    told = env.config
-    agent = agents.make(AGENT, config=config, robot=told.robot, lidar=told.lidar, step_s=told.step_s)
+    agent = make_agent(AGENT, env, config=config)
     observation, _ = env.reset(seed=seed)
     agent.reset(env.belief, seed=seed)
     idle = 0

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import agents
 from agents.learned.drive_network import DriveNetwork
 from mecanum_env.env import ExploreEnv
+from training.episodes.explore import make_agent
 from training.learning.end_to_end.config import DriveConfig
 from training.learning.end_to_end.lessons import FollowingTeacher, map_lessons
 
@@ -118,9 +118,8 @@ class _Scene(_Drive):
     def __init__(self, episode: Episode) -> None:
         super().__init__(episode)
         self.rng = np.random.default_rng(episode.seed)
-        body, self._lessons = self.env.config, episode.config.lessons
-        teacher = self._lessons.teacher
-        self.guide = agents.make(teacher, robot=body.robot, lidar=body.lidar, step_s=body.step_s)
+        self._lessons = episode.config.lessons
+        self.guide = make_agent(self._lessons.teacher, self.env)
         self.guide.reset(self.env.belief, episode.seed)
         self.action: NDArray[np.float32] = np.zeros(3, np.float32)
         self.maps: list[dict[str, Any]] = []

@@ -13,14 +13,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import agents
 import mecanum_env
 from mecanum_env.env import ExploreEnv
 from mecanum_env.observation import Observation
 from slam.settings import to_mapping
+from training.episodes.explore import make_agent
 from training.figures.tables import text_table
 from training.runs.processes import memory_mb
 from training.studies.costs import peers
+from training.studies.exploring import AGENT
 
 __all__ = ["ID", "REPEATS", "make_env", "measure", "run", "settings_of", "unwrapped"]
 
@@ -95,7 +96,7 @@ class _Stopwatch:
 def _record(env: gymnasium.Env[Observation, Any], steps: int, seed: int) -> list[tuple[int, list[Any]]]:
     """Explore until there are ``steps`` actions; return them by episode, with its seed."""
     inner = unwrapped(env)
-    agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
+    agent = make_agent(AGENT, inner)
     episodes: list[tuple[int, list[Any]]] = []
     total = 0
     while total < steps:

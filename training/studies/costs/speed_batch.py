@@ -15,11 +15,12 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-import agents
 from mecanum_env.rooms import FloorPlan
+from training.episodes.explore import make_agent
 from training.figures.tables import text_table
 from training.studies.costs import peers
 from training.studies.costs.speed import ID, make_env, settings_of, unwrapped
+from training.studies.exploring import AGENT
 
 __all__ = ["WAYS", "measure", "run"]
 
@@ -41,7 +42,7 @@ def _record(settings: dict[str, Any], seeds: Sequence[int], steps: int) -> tuple
     inner = unwrapped(env)
     ways, plans = [], []
     for seed in seeds:
-        agent = agents.make("nearest-frontier", robot=inner.config.robot, lidar=inner.config.lidar)
+        agent = make_agent(AGENT, inner)
         observation, _ = env.reset(seed=seed)
         agent.reset(inner.belief, seed=seed)
         way: list[Actions] = []

@@ -16,6 +16,7 @@ import gymnasium
 import numpy as np
 
 import agents
+from training.episodes.explore import make_agent
 from training.runs.errors import one_line
 from training.runs.processes import memory_mb
 from training.studies.reliability.parts import Row
@@ -37,13 +38,12 @@ def work(item: Item) -> Row:
         if plain.digest != found.digest:
             found.note("what was refused has left a trace", f"{found.digest} is {plain.digest} without")
     gc.collect()
-    row = {
+    return {
         "steps": found.steps, "episodes": found.episodes, "collisions": found.collisions,
         "refused": found.refused, "deepest_mm": round(1e3 * found.deepest_m, 3), "digest": found.digest,
         "mb": round(memory_mb(), 1), "pid": os.getpid(), "handles": handles(),
         "seconds": round(time.perf_counter() - began, 3), "wrong": found.wrong,
     }  # fmt: skip
-    return row
 
 
 def run(item: Item, *, nonsense: bool = True) -> Findings:
@@ -66,10 +66,7 @@ def _single(item: Item, given: dict[str, Any], found: Findings, nonsense: bool) 
     inner: Any = env.unwrapped
     size = env.action_space.shape[0]  # type: ignore[index]
     rng = np.random.default_rng([item.seed, 2])
-    agent = None
-    if item.driver in agents.names():
-        config = inner.config
-        agent = agents.make(item.driver, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
+    agent = make_agent(item.driver, inner) if item.driver in agents.names() else None
     act = None if agent else policy(item.driver, size, rng, inner)
     left = item.steps
     while left:

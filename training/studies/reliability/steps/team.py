@@ -12,6 +12,7 @@ from gymnasium import spaces
 import agents
 from mecanum_env.team.team import Team
 from slam.types import Array
+from training.episodes.explore import make_agent
 from training.episodes.team import tell_goal
 from training.studies.reliability.steps.actions import Policy, policy
 from training.studies.reliability.steps.items import TEAMS, Item
@@ -27,11 +28,8 @@ def run(item: Item, given: dict[str, Any], found: Findings, nonsense: bool) -> N
     robots = len(team.members)
     explorers, policies = [], []
     for k, member in enumerate(team.members):
-        config = member.config
         if item.driver in agents.names():
-            explorers.append(
-                agents.make(item.driver, robot=config.robot, lidar=config.lidar, step_s=config.step_s)
-            )
+            explorers.append(make_agent(item.driver, member))
         else:
             policies.append(policy(item.driver, 3, np.random.default_rng([item.seed, 2, k]), member))
     while found.steps < item.steps:
