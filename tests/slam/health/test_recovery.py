@@ -17,7 +17,7 @@ from slam.health.recovery import Recovery
 from slam.health.relocalisation import RelocalisationConfig, Relocaliser
 from slam.landmarks.book import LAST_SEEN
 from slam.types import Scan
-from training.studies.recovery.faults import make_fault
+from training.studies.recovery.faults import FAULTS
 
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
 
@@ -36,7 +36,7 @@ def test_carried_off_and_found(name: str) -> None:
     walls = env.episode_metrics()["map_precision"]
     backend, still = env.backend, np.zeros(3, np.float32)
     assert backend.recovery.monitor.fine > 0.99
-    assert make_fault("teleport").begin(env, np.random.default_rng(0))
+    assert FAULTS["teleport"]().begin(env, np.random.default_rng(0))
     lowest = 1.0
     for _ in range(60):
         observation, *_ = env.step(still)
@@ -208,7 +208,7 @@ def test_so_few_beams_as_cannot_find_it_again_do_not_give_it_up() -> None:
 
 def test_dead_reckoning_is_never_found_anew() -> None:
     env = driven("odometry", 40)
-    assert make_fault("teleport").begin(env, np.random.default_rng(0))
+    assert FAULTS["teleport"]().begin(env, np.random.default_rng(0))
     for _ in range(30):
         env.step(np.zeros(3, np.float32))
     assert env.backend.recovery.times_lost == 0
@@ -217,7 +217,7 @@ def test_dead_reckoning_is_never_found_anew() -> None:
 
 def test_a_blind_lidar_is_no_loss() -> None:
     env = driven("invariant-ekf", 40)
-    fault = make_fault("blind")
+    fault = FAULTS["blind"]()
     fault.begin(env, np.random.default_rng(0))
     for _ in range(20):
         env.step(np.array([0.1, 0.0, 0.1], np.float32))

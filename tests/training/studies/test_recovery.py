@@ -16,7 +16,7 @@ from mecanum_env.env import ExploreEnv
 from slam.geometry import wrap
 from training.cli import main
 from training.studies.recovery import command
-from training.studies.recovery.faults import FAULTS, make_fault
+from training.studies.recovery.faults import FAULTS
 from training.studies.recovery.figures import false_alarms, recovered, reliability, sum_up
 from training.studies.recovery.runs import BINS, Row
 
@@ -26,25 +26,25 @@ def test_faults_are_what_they_say() -> None:
     env.reset(seed=1)
     rng = np.random.default_rng(2)
     before = env.truth.world.pose
-    assert make_fault("teleport").begin(env, rng)
+    assert FAULTS["teleport"]().begin(env, rng)
     moved = env.truth.world.pose - before
     assert np.hypot(moved[0], moved[1]) == pytest.approx(1.0)
     assert abs(float(wrap(moved[2]))) == pytest.approx(math.radians(20.0))
 
-    wheel = make_fault("wheel")
+    wheel = FAULTS["wheel"]()
     wheel.begin(env, rng)
     assert sorted(env.truth.world.grip) == [0.0, 1.0, 1.0, 1.0]
     wheel.end(env)
     assert (env.truth.world.grip == 1.0).all()
 
-    blind = make_fault("blind")
+    blind = FAULTS["blind"]()
     blind.begin(env, rng)
     env.step(np.zeros(3, np.float32))
     assert np.isnan(env.scan.ranges).all()
     blind.end(env)
     env.step(np.zeros(3, np.float32))
     assert np.isfinite(env.scan.ranges).any()
-    assert make_fault("none").begin(env, rng)
+    assert FAULTS["none"]().begin(env, rng)
 
 
 def test_a_wheel_without_grip_turns_the_robot() -> None:

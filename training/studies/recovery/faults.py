@@ -13,7 +13,7 @@ import numpy as np
 from mecanum_env.env import ExploreEnv
 from slam.types import Array, Scan
 
-__all__ = ["FAULTS", "Fault", "make_fault"]
+__all__ = ["FAULTS", "Fault"]
 
 _AWAY_M, _TURN_RAD = 1.0, math.radians(20.0)
 _TRIES = 400  # at a place that the robot fits in, with a clear line to it
@@ -92,11 +92,6 @@ class _Blind(Fault):
 
 
 FAULTS: dict[str, type[Fault]] = {"none": Fault, "teleport": _Teleport, "wheel": _Wheel, "blind": _Blind}
-
-
-def make_fault(name: str) -> Fault:
-    """Return a fault of :data:`FAULTS`."""
-    return FAULTS[name]()
 
 
 def _crosses(a: Array, b: Array, segments: Array) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mecanum_env.env import ExploreEnv
 from training.episodes.explore import make_agent
-from training.studies.recovery.faults import make_fault
+from training.studies.recovery.faults import FAULTS
 
 __all__ = ["BINS", "REGION", "Job", "Row", "run_job", "within"]
 
@@ -53,7 +53,7 @@ def run_job(job: Job) -> Row:
     if fault_name == "none":
         episode.drive(steps, until_done=True)
         return episode.row()
-    rng, fault, step_s = np.random.default_rng(seed), make_fault(fault_name), env.config.step_s
+    rng, fault, step_s = np.random.default_rng(seed), FAULTS[fault_name](), env.config.step_s
     episode.drive(round(rng.uniform(_FIRST_S, _LAST_S) / step_s))
     before = env.episode_metrics()
     row: Row = {"begun_s": before["time_s"], "possible": fault.begin(env, rng)}
