@@ -87,27 +87,19 @@ def median(values: ArrayLike) -> Array:
 # ---- resampling ------------------------------------------------------------------------------------------------
 
 
-def resampled_indices(strata: Sequence[Hashable], *, resamples: int = RESAMPLES, seed: int = _SEED) -> Indices:
-    """Return bootstrap resamples of n episodes as indices ``(resamples, n)``, drawn within each stratum.
-
-    Parameters
-    ----------
-    strata
-        Each episode's stratum ``(n,)``: each keeps its share in every resample.
-    resamples, seed
-        How many, and what they are drawn from.
-    """
+def resampled_indices(strata: Sequence[Hashable]) -> Indices:
+    """Return bootstrap resamples of n episodes as indices ``(RESAMPLES, n)``; each stratum keeps its share."""
     codes = {name: code for code, name in enumerate(dict.fromkeys(strata))}
-    return _indices(tuple(codes[name] for name in strata), resamples, seed)
+    return _indices(tuple(codes[name] for name in strata))
 
 
 @lru_cache(maxsize=32)
-def _indices(codes: tuple[int, ...], resamples: int, seed: int) -> Indices:
-    rng = np.random.default_rng(seed)
-    stratum, out = np.array(codes, np.intp), np.empty((resamples, len(codes)), np.intp)
+def _indices(codes: tuple[int, ...]) -> Indices:
+    rng = np.random.default_rng(_SEED)
+    stratum, out = np.array(codes, np.intp), np.empty((RESAMPLES, len(codes)), np.intp)
     for code in range(stratum.max(initial=-1) + 1):
         members = np.flatnonzero(stratum == code)
-        out[:, members] = members[rng.integers(len(members), size=(resamples, len(members)))]
+        out[:, members] = members[rng.integers(len(members), size=(RESAMPLES, len(members)))]
     out.setflags(write=False)
     return out
 

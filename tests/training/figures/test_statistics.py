@@ -11,6 +11,7 @@ from scipy import stats
 
 from training.figures.statistics import (
     CONFIDENCE,
+    RESAMPLES,
     compare,
     estimate,
     interval,
@@ -40,14 +41,14 @@ def test_an_iqm_is_not_moved_by_a_few_outliers() -> None:
 
 def test_resamples_keep_each_stratum_s_share() -> None:
     strata = ["a", "b", "a", "c", "b", "a"]
-    at = resampled_indices(strata, resamples=500)
-    assert at.shape == (500, 6)
+    at = resampled_indices(strata)
+    assert at.shape == (RESAMPLES, 6)
     for k, name in enumerate(strata):
         assert {strata[j] for j in at[:, k].tolist()} == {name}
     # Each member of a stratum is drawn as often as the others.
     counts = np.bincount(at[:, [0, 2, 5]].ravel(), minlength=6)[[0, 2, 5]]
     assert stats.chisquare(counts).pvalue > 0.01
-    np.testing.assert_array_equal(at, resampled_indices(["x", "y", "x", "z", "y", "x"], resamples=500))
+    np.testing.assert_array_equal(at, resampled_indices(["x", "y", "x", "z", "y", "x"]))
 
 
 def test_the_interval_is_the_bootstrap_s_of_every_resample() -> None:
