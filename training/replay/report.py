@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +21,7 @@ from slam.metrics.measures import anees, ate, ate_aligned, heading_errors
 from slam.settings import to_mapping
 from slam.types import Array
 from training.figures.charts import png
+from training.figures.tables import csv_table
 from training.replay.picture import draw_belief, draw_replay
 from training.replay.run import Replay
 from training.replay.scans import scan_metrics
@@ -115,28 +114,23 @@ def _write_into(folder: Path, replay: Replay) -> dict[str, Any]:
         title = f"{log.name}   {replay.config.slam}"
         atomic_write(folder / "map.png", cv2.imencode(".png", draw_belief(belief, estimates, title))[1].tobytes())
     atomic_write(folder / "trajectory.png", png(figure))
-    atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": _run_values(replay)}))
+    told = {key: v for key, v in replay.run.items() if v is not None} | {"versions": versions()}
+    atomic_write(folder / "config.toml", tomli_w.dumps(to_mapping(replay.config) | {"run": told}))
     found = metrics(replay)
     write_json(folder / "metrics.json", found)
     return found
 
 
-def _run_values(replay: Replay) -> dict[str, Any]:
-    return {key: v for key, v in replay.run.items() if v is not None} | {"versions": versions()}
-
-
 def _landmarks_csv(backend: Backend, surveyed: Array) -> str:
     """Return a line a landmark: estimate, covariance, sightings and, where it was surveyed, its true place."""
     found, ids, (seen, _) = handed_out(backend), backend.belief.landmark_ids, backend.landmark_details()
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(("id", "x_m", "y_m", "var_x", "var_y", "cov_xy", "times_seen", "true_x_m", "true_y_m"))
+    columns = ("id", "x_m", "y_m", "var_x", "var_y", "cov_xy", "times_seen", "true_x_m", "true_y_m")
+    rows = []
     for i in np.argsort(ids, kind="stable"):
-        (x, y), cov = found.points[i], found.covs[i]
-        numbers = [f"{v:.9g}" for v in (x, y, cov[0, 0], cov[1, 1], cov[0, 1])]
-        true = [f"{v:.9g}" if math.isfinite(v) else "" for v in surveyed[i]]
-        table.writerow((int(ids[i]), *numbers, int(seen[i]), *true))
-    return text.getvalue()
+        cov, true = found.covs[i], map(plain, surveyed[i])  # null where it was not surveyed
+        values = ids[i], *found.points[i], cov[0, 0], cov[1, 1], cov[0, 1], seen[i], *true
+        rows.append(dict(zip(columns, values, strict=True)))
+    return csv_table(rows, columns, digits=9)
 
 
 def _broken_at_gaps(times: Array, poses: Array, longest_s: float) -> Array:
