@@ -187,12 +187,8 @@ def _deflated(listed: list[list[Any]], arrays: Arrays) -> str:
     parts = []
     for name, kind, _ in listed:
         data = np.ascontiguousarray(arrays[name]).astype(np.dtype(kind).newbyteorder("<")).tobytes()
-        parts.append(data.ljust(_padded(len(data)), b"\0"))
+        parts.append(data + bytes(-len(data) % 4))
     return base64.b64encode(zlib.compress(b"".join(parts), 7)).decode()
-
-
-def _padded(size: int) -> int:
-    return -(-size // 4) * 4
 
 
 def _thinned(recorded: Recorded, most: int) -> Recorded:
