@@ -74,17 +74,7 @@ def extent(groups: Sequence[Group], along: Along) -> float:
 
 
 def coverage_chart(bands: Sequence[Band], *, along: Along, colours: Sequence[int]) -> str:
-    """Return the chart as an ``<svg>`` element.
-
-    Parameters
-    ----------
-    bands
-        All over the same x.
-    along
-        What x is.
-    colours
-        Index of each band's colour, 0 … ; see :data:`COLOURS`.
-    """
+    """Return the chart of bands over the same x as an ``<svg>`` element; ``colours`` are their indices, 0 … ."""
     last = float(bands[0].x[-1])
     right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
     names = ", ".join(b.name for b in bands)

@@ -53,12 +53,7 @@ _CURVES = ("coverage_by_time", "coverage_by_path", "nees")
 
 
 class Store:
-    """Rows by their key. Whatever kills the process leaves whole rows behind.
-
-    Parameters
-    ----------
-    path : Path
-        Made where it is not there.
+    """Rows by their key, in a file that is made where there is none. Whatever kills the process leaves whole rows.
 
     Raises
     ------

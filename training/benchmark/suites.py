@@ -80,14 +80,7 @@ def names(*, floor_plans: bool = False) -> tuple[str, ...]:
 
 
 def choose(text: str, *, floor_plans: Path | None = None) -> tuple[Suite, ...]:
-    """Return the suites of ``a,b`` or ``all``, each once, in that order.
-
-    Parameters
-    ----------
-    text
-        As typed: names of :func:`names`, separated by commas.
-    floor_plans
-        Folder of the plans that the suites of real plans are made of.
+    """Return the suites of ``a,b`` or ``all``, each once, in that order; of real plans with their folder.
 
     Raises
     ------

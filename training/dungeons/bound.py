@@ -28,14 +28,7 @@ _SQUARE = 4  # cells: all of a square is taken for seen where its middle is
 def known_map_path(dungeon: Dungeon, sensor: str = SENSORS[0], *, tries: int = 5) -> float:
     """Return the length [m] of a tour that sees the whole map from its start, 0 where one look is enough.
 
-    Parameters
-    ----------
-    dungeon
-        The map.
-    sensor
-        Of :data:`SENSORS`.
-    tries
-        Choices of way-points that the shortest tour is taken from.
+    It is the shortest over so many choices of way-points (``tries``).
     """
     return _shortest(dungeon, lambda lattice, reached: _sight(dungeon, lattice.cells[reached], sensor), tries)
 

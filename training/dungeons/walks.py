@@ -178,13 +178,7 @@ class TourDriver:
 
 
 class LearnedDriver(TourDriver):
-    """Goes on as ``learned-tour`` does, with the network in PyTorch and half precision.
-
-    Parameters
-    ----------
-    network
-        What foresees the openings' costs; it knows how far the plan extends.
-    """
+    """Goes on as ``learned-tour`` does that knows how far the plan extends; in PyTorch and half precision."""
 
     stream, asked = 9, 0.5
     most_hops = MOST_HOPS

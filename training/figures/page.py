@@ -25,11 +25,7 @@ def security_policy(*, styles: Sequence[str], scripts: Sequence[str] = ()) -> st
 
     It runs these scripts and none else, takes these styles and none else, shows images that are in it, and loads
     nothing: whatever a name, a title or a configuration in it says (Content Security Policy Level 3, W3C).
-
-    Parameters
-    ----------
-    styles, scripts
-        What stands between the tags, to the letter.
+    Styles and scripts are what stands between the tags, to the letter.
     """
     allowed = {"script-src": scripts, "style-src": styles}
     parts = [

@@ -23,13 +23,7 @@ _HERE_M = 0.43  # the robot is at a place: no cell of the lattice is farther fro
 
 
 class Hindsight:
-    """Prices what is left to explore in one episode.
-
-    Parameters
-    ----------
-    true : TruePlaces
-        Of the episode's room; it is not changed, and may be used again.
-    """
+    """Prices what is left to explore in one episode; its room's places are not changed, and may be used again."""
 
     def __init__(self, true: TruePlaces) -> None:
         self._true = true

@@ -55,12 +55,7 @@ class Layer(nn.Module):
 class ChoiceNetwork(nn.Module):
     """Scores candidates, whatever their order and number, and says what the whole choice is worth.
 
-    Parameters
-    ----------
-    features, patch, state : int
-        Numbers in a candidate's row, in its patch, and of the choice as a whole.
-    width, heads, layers : int
-        Of the attention.
+    ``features``, ``patch`` and ``state`` count numbers: a candidate's row, its patch, the choice as a whole.
     """
 
     def __init__(

@@ -34,14 +34,7 @@ __all__ = ["export_policy", "export_run", "join_policies", "write_zip"]
 def export_policy(weights: Mapping[str, NDArray[np.float32]], target: Path, training: Mapping[str, Any]) -> None:
     """Write a policy of ``ppo-frontier`` as ``target`` (.safetensors, half precision) and the JSON file beside it.
 
-    Parameters
-    ----------
-    weights
-        Of the network, by name.
-    target
-        Where to.
-    training
-        What else the JSON file says; ``config``, the training's, among it: it says how the policy drives.
+    The latter says what ``training`` does; its ``config``, the training's, has how the policy drives.
 
     Raises
     ------
@@ -113,15 +106,10 @@ def join_policies(sources: Sequence[Path], target: Path) -> None:
     export_policy(joined(members), target, training)
 
 
-def write_zip(source: Path, target: Path, member: int | None = None) -> None:
+def write_zip(source: Path, target: Path, member: int | None) -> None:
     """Write a policy of the package's format as a zip that ``MaskablePPO.load`` reads, to train on from.
 
-    Parameters
-    ----------
-    source, target
-        From and to.
-    member
-        Which of several networks that choose together, from 1: a zip holds one.
+    A zip holds one network: ``member`` says which of several that choose together, from 1.
 
     Raises
     ------

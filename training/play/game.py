@@ -42,19 +42,9 @@ def open_window() -> Window:
 
 
 class Game:
-    """A session in a window.
+    """A session in a window, from which the keys come, too; ``speed`` is times true speed."""
 
-    Parameters
-    ----------
-    session : Session
-        What is played.
-    window : Window
-        Where it is shown, and where the keys come from.
-    speed : float
-        Times true speed.
-    """
-
-    def __init__(self, session: Session, window: Window, *, speed: float = 1.0) -> None:
+    def __init__(self, session: Session, window: Window, *, speed: float) -> None:
         self._pygame = load_pygame()
         self._session, self._window = session, window
         self._controls, self._gamepad = Controls(), _Gamepad()

@@ -29,16 +29,7 @@ def play_picture(
 ) -> Image:
     """Return the picture ``(760, 1280, 3)``, RGB: the strip, and below it the frame.
 
-    Parameters
-    ----------
-    session : Session
-        What is played.
-    steps_per_s : float or None
-        As measured; None where nothing was yet.
-    show_help : bool
-        Whether the keys are listed over the frame.
-    notice : str
-        One line over the frame: what the next picture takes some time for.
+    Over the frame the keys may be listed, and a notice tells what the next picture takes some time for.
     """
     # Drawn as OpenCV draws, blue first; the frame comes red first.
     picture = np.empty((*PICTURE_SHAPE, 3), np.uint8)

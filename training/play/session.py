@@ -45,16 +45,8 @@ def checked_config(agent: str, **where: Any) -> EnvConfig:
 class Session:
     """Episodes one after the other, each with its rooms and its backend, and whoever drives.
 
-    An episode goes on for as long as somebody drives: all may be mapped, and no limit of time ends it.
-
-    Parameters
-    ----------
-    agent : str
-        Who drives when asked to.
-    seed : int
-        Of the first episode.
-    **where
-        Rooms, robot and backend, as :func:`mecanum_env.arguments.make_config` takes them.
+    An episode goes on for as long as somebody drives: all may be mapped, and no limit of time ends it. Where the
+    first one is, is said as to :func:`mecanum_env.arguments.make_config`; the agent drives when asked to.
 
     Raises
     ------

@@ -23,15 +23,7 @@ _NO_END = 10**9  # steps
 
 
 class TeamSession(Session):
-    """A :class:`Session` in which others explore, too.
-
-    Parameters
-    ----------
-    team : TeamConfig
-        How many robots, who hears whom.
-    **options
-        As of :class:`Session`.
-    """
+    """A :class:`Session`, with its options, in which others explore, too."""
 
     team: Team
 

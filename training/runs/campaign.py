@@ -40,19 +40,9 @@ SETTINGS = "settings.json"
 
 
 def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> list[str]:
-    """Return the backends of ``a,b``, each once, in that order.
+    """Return the backends of ``a,b``, each once, in that order; ``ValueError`` lists the valid names.
 
-    Parameters
-    ----------
-    text
-        As typed: registered names, separated by commas.
-    without
-        Registered names that cannot be used here → why.
-
-    Raises
-    ------
-    ValueError
-        That lists the valid names.
+    ``without`` has names of backends that cannot be used here, and why.
     """
     without = without or {}
     valid = [name for name in slam.names() if name not in without]

@@ -52,7 +52,7 @@ class Cluster:
     most: int | None = None  # items at a time; None: as many as the cluster has cores for, or gets to have
 
 
-def find_cluster(address: str, most: int | None = None) -> Cluster:
+def find_cluster(address: str, most: int | None) -> Cluster:
     """Return the cluster at an address, before any work is begun.
 
     Raises
@@ -133,15 +133,9 @@ def _work(origin: _Origin, call: bytes) -> bytes:
 
 
 class RayPool(Executor):
-    """Processes of a Ray cluster, as an executor.
+    """Processes of a Ray cluster, as an executor: for so many items at a time; None: all are Ray's to schedule."""
 
-    Parameters
-    ----------
-    most : int, optional
-        Items at a time; None: all are Ray's to schedule.
-    """
-
-    def __init__(self, most: int | None = None) -> None:
+    def __init__(self, most: int | None) -> None:
         import ray
 
         self._ray, self._most = ray, most or sys.maxsize

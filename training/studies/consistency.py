@@ -104,20 +104,8 @@ def consistency(
 ) -> dict[str, Any]:  # fmt: skip
     """Do the runs that ``out`` does not hold yet, write ``consistency.json`` and ``.png``, return the former.
 
-    Parameters
-    ----------
-    backends
-        As typed.
-    rooms
-        A name in :data:`WORLDS`, or a generator of rooms.
-    runs, seed0
-        How many for each backend, and the seed of the first.
-    steps
-        Of each run, at most; None: the world's, or those of an episode.
-    noise
-        Times the noise of the world, or of the nominal robot.
-    out, workers
-        Folder of the results, and processes.
+    Backends are given as typed. ``rooms`` is a name in :data:`WORLDS`, or a generator; ``steps`` are at most those
+    of a run (None: the world's, or an episode's); ``noise`` is times that of the world, or of the nominal robot.
 
     Raises
     ------

@@ -44,20 +44,7 @@ _WIDER = (0.02, 0.03, 0.045)  # where none of these is enough
 
 
 class KnownMap(Agent):
-    """Drives the fastest way found, and stops.
-
-    Parameters
-    ----------
-    env : ExploreEnv
-        The episode's, after its reset.
-    coverage : float
-        That it is to reach soonest.
-
-    Attributes
-    ----------
-    lower_bound_s : float
-        Nobody can have reached it before.
-    """
+    """Drives the fastest way found to a coverage, and stops; the environment is the episode's, after its reset."""
 
     def __init__(self, env: ExploreEnv, coverage: float) -> None:
         config = env.config
@@ -66,7 +53,7 @@ class KnownMap(Agent):
         self._ground = env.truth.ground
         self._coverage = coverage
         self._steps_left = 0
-        self.lower_bound_s = 0.0
+        self.lower_bound_s = 0.0  # nobody can have reached the coverage before
 
     def reset(self, belief: Belief, seed: int = 0) -> None:
         """Search, and drive what was found in an episode of the same seed; the belief must be at its start."""

@@ -28,15 +28,7 @@ _HOT_S, _COLD_S = 1.0, 0.05  # longer that a drive may well be to be taken, at f
 
 
 class Rehearsal(PathFollower):
-    """Follows paths as :class:`PathFollower` does, where the map is true and wheels do as they are told.
-
-    Parameters
-    ----------
-    control, robot, lidar, step_s
-        As the driver has them.
-    sights : Sights
-        Of the true map.
-    """
+    """Follows paths as :class:`PathFollower` does, where the map is true and wheels do as they are told."""
 
     def __init__(
         self, control: ControlConfig, sights: Sights, *, robot: RobotConfig, lidar: LidarConfig, step_s: float

@@ -94,16 +94,7 @@ def write_mcap(
 ) -> None:
     """Write an episode as ROS 2 messages; docs/how-to/exports.md lists the topics.
 
-    Parameters
-    ----------
-    recording : Recording
-        The episode.
-    path : path
-        The file; written beside it and then renamed.
-    robot, lidar : config
-        Size of the body, and where the lidar is on it.
-    about : mapping, optional
-        What the file says of itself (agent, backend, seed, …), as the metadata record ``mecanum-slam``.
+    What the file says of itself, ``about`` (agent, backend, seed, …), is the metadata record ``mecanum-slam``.
 
     Raises
     ------

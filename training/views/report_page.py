@@ -60,20 +60,9 @@ def episode_page(
 ) -> str:  # fmt: skip
     """Return the page.
 
-    Parameters
-    ----------
-    env : ExploreEnv
-        At the end of the episode: for the true plan, and what the robot is like.
-    recording : Recording
-        What happened.
-    title, ending : str
-        What was explored by whom, and why it ended.
-    metrics : mapping
-        As in ``metrics.json``.
-    target : float
-        Coverage that counts as success.
-    config : str
-        The effective configuration as TOML.
+    The environment, at the episode's end, is for the true plan and what the robot is like. The title says what was
+    explored by whom, ``ending`` why it ended, ``target`` which coverage counts as success; metrics are those of
+    ``metrics.json``, ``config`` is TOML.
     """
     header, arrays = pack(recording)
     view = episode_view(env.truth.ground, env.belief, longest_px=TRUTH_PX)

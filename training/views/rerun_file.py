@@ -43,18 +43,9 @@ def check_rerun() -> None:
 def write_rerun(
     recording: Recording, path: str | Path, *, robot: RobotConfig, lidar: LidarConfig, name: str = "episode"
 ) -> None:
-    """Write an episode as a Rerun recording with its blueprint; docs/how-to/exports.md lists the entities.
+    """Write an episode as a Rerun recording (.rrd) with its blueprint; docs/how-to/exports.md lists the entities.
 
-    Parameters
-    ----------
-    recording : Recording
-        The episode.
-    path : path
-        The file, ``.rrd``; written beside it and then renamed.
-    robot, lidar : config
-        Size of the body, and where the lidar is on it.
-    name : str
-        What the viewer calls the recording.
+    ``name`` is what the viewer calls it.
 
     Raises
     ------

@@ -97,16 +97,7 @@ def peer_setup(config: EnvConfig) -> dict[str, Any]:
 def compare(peer: str, config: EnvConfig, *, drives: Sequence[Drive], ours: Callable[[], float]) -> dict[str, Any]:
     """Measure ours and the peer in turn, :data:`ROUNDS` times; every round drives all of ``drives``, ours first.
 
-    Parameters
-    ----------
-    peer : str
-        A name in :data:`PEERS`.
-    config : EnvConfig
-        Our environment's; see :func:`peer_setup`.
-    drives : sequence of Drive
-        The rooms, and the steps in each.
-    ours : callable
-        Drives them once in our environment and returns its complete steps per second.
+    ``ours`` drives them once in our environment and returns its complete steps per second.
 
     Returns
     -------
@@ -177,11 +168,17 @@ def _own_process() -> Iterator[Callable[..., Any]]:
             raise RuntimeError(f"the peer broke down: {type(error).__name__}: {one_line(error)}") from error
 
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, mp_context=context, initializer=start_worker) as pool:
+    with ProcessPoolExecutor(1, mp_context=context, initializer=_become_peer) as pool:
         yield ask
 
 
 # ---- in the peer's process ---------------------------------------------------------------------------------
+
+
+def _become_peer() -> None:
+    start_worker()
+    os.dup2(2, 1)  # what libraries print goes to standard error
+    atexit.register(os._exit, 0)  # navground's library may crash while the interpreter takes itself down
 
 
 def _navground_env(setup: dict[str, Any], drives: Sequence[Drive]) -> Any:
@@ -276,8 +273,6 @@ _load: list[Any] = []  # of this process: the environment, and what every round 
 
 def _get_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> dict[str, Any]:
     """Make the environment and warm it up; return what stands in the first room."""
-    os.dup2(2, 1)  # what libraries print goes to standard error
-    atexit.register(os._exit, 0)  # navground's library may crash while the interpreter takes itself down
     env, first = _navground_env(setup, drives), drives[0]
     observation, _ = env.reset(seed=first.seed)
     world = env.unwrapped._world  # no public way to look at what stands in it
@@ -298,8 +293,6 @@ _batch: dict[str, Any] = {}  # of this process: vector environments, and what th
 def _get_batch_ready(setup: dict[str, Any], drives: Sequence[Drive]) -> None:
     from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 
-    os.dup2(2, 1)  # what libraries print goes to standard error
-    atexit.register(os._exit, 0)  # as above
     make = partial(_navground_env, setup, drives)
     _batch.update(sync=SyncVectorEnv([make] * len(drives)), drives=drives)
     _batch["async"] = AsyncVectorEnv([make] * len(drives))

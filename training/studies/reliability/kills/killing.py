@@ -83,12 +83,10 @@ def run(argv: Sequence[str], folder: Path, moment: Moment | None = None) -> Run:
 def _look(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Return names, sizes and times of what is in a folder."""
     found = []
-    try:
+    with contextlib.suppress(OSError):  # not there yet, or one has gone meanwhile
         for entry in os.scandir(folder):
             stat = entry.stat()
             found.append((entry.name, stat.st_size, stat.st_mtime_ns))
-    except OSError:  # not there yet, or one has gone meanwhile
-        pass
     return tuple(sorted(found))
 
 
@@ -109,9 +107,7 @@ def _marked(mark: str) -> list[int]:
     wanted, found = f"{_MARK}={mark}".encode(), []
     for entry in Path("/proc").iterdir() if Path("/proc/self/environ").exists() else ():
         if entry.name.isdigit():
-            try:
+            with contextlib.suppress(OSError):
                 if wanted in (entry / "environ").read_bytes():
                     found.append(int(entry.name))
-            except OSError:
-                continue
     return found

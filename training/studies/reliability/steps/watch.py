@@ -54,19 +54,7 @@ class Findings:
 
 
 class Watch:
-    """Judges one robot's environment.
-
-    Parameters
-    ----------
-    env
-        The environment, after its reset.
-    found
-        Where it is noted.
-    space
-        Of its observations.
-    others
-        Returns the sides ``(n, 4)`` [m] of other bodies.
-    """
+    """Judges an environment after its reset; ``others`` gives the sides ``(n, 4)`` [m] of other bodies."""
 
     def __init__(
         self, env: ExploreEnv, found: Findings, space: spaces.Dict, others: Callable[[], Array] = lambda: _NO_SIDES
