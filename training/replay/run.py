@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.logs import AnyLog, BagTopics, ObservationNoise, ScanLog, open_log, parse_mount, with_reference
-from slam.metrics.measures import nees_pose
 from slam.motion import move
 from slam.registry import config_type, make
 from slam.settings import Config, check_name, from_mapping, require, to_mapping
@@ -246,11 +245,4 @@ def _sample(replay: Replay, before: float, twist: Any) -> None:
         replay.covs.append(backend.pose_cov)
         replay.health.append(backend.health)
         true_pose = log.reference_at(now) if log.has_heading and replay.sample_rows[k] >= 0 else None
-        replay.nees.append(math.nan if true_pose is None else _pose_nees(backend, true_pose))
-
-
-def _pose_nees(backend: Backend, true_pose: Array) -> float:
-    own: Callable[[Array], float] | None = getattr(backend, "pose_nees", None)
-    if own is not None:  # a filter whose error is not the plain difference
-        return float(own(true_pose))
-    return float(nees_pose(backend.pose, backend.pose_cov, true_pose))
+        replay.nees.append(math.nan if true_pose is None else backend.pose_nees(true_pose))
