@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 import slam
 from slam.backend import Backend
@@ -21,7 +22,7 @@ from slam.geometry import wrap
 from slam.motion import move, twist_between
 from slam.types import Array, Observations, Odometry
 
-__all__ = ["WORLDS", "LandmarkWorld", "Step", "drive", "not_observing", "simulate"]
+__all__ = ["WORLDS", "LandmarkWorld", "Step", "drive", "not_observing", "observed", "simulate"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,19 +106,25 @@ def simulate(world: LandmarkWorld, seed: int, steps: int) -> Iterator[Step]:
     path = world.path(steps)
     pose = path[0] + np.sqrt(np.diag(world.start_cov)) * rng.standard_normal(3)
     sigmas = np.array([world.speed_sigma_m_s, world.speed_sigma_m_s, world.turn_sigma_rad_s])
-    cov, dt = world.observation_cov, world.dt
-    root = np.sqrt(np.diag(cov))
+    dt = world.dt
     for k in range(steps):
         twist = twist_between(path[k], path[k + 1], dt)
         pose = move(pose, twist, dt)
         odometry = Odometry(twist + sigmas * rng.standard_normal(3), dt)
         away = world.landmarks - pose[:2]
-        ranges = np.hypot(away[:, 0], away[:, 1])
-        ids = np.flatnonzero(ranges < world.reach_m)
-        bearings = np.arctan2(away[ids, 1], away[ids, 0]) - pose[2]
-        seen = np.column_stack([ranges[ids], bearings]) + root * rng.standard_normal((len(ids), 2))
-        seen[:, 1] = wrap(seen[:, 1])
-        yield Step(odometry, Observations(seen, np.repeat(cov[None], len(ids), axis=0), ids), pose)
+        ids = np.flatnonzero(np.hypot(away[:, 0], away[:, 1]) < world.reach_m)
+        yield Step(odometry, observed(world.landmarks, ids, pose, world.observation_cov, rng), pose)
+
+
+def observed(
+    landmarks: Array, ids: NDArray[np.int64], pose: Array, cov: Array, rng: np.random.Generator
+) -> Observations:
+    """Return what is seen of some landmarks ``(n, 2)`` from a pose, with noise of a covariance ``(2, 2)``."""
+    dx, dy = (landmarks[ids] - pose[:2]).T
+    seen = np.column_stack([np.hypot(dx, dy), np.arctan2(dy, dx) - pose[2]])
+    seen += np.sqrt(np.diag(cov)) * rng.standard_normal(seen.shape)
+    seen[:, 1] = wrap(seen[:, 1])
+    return Observations(seen, np.repeat(cov[None], len(ids), axis=0), ids)
 
 
 def drive(world: LandmarkWorld, backend: Backend, seed: int, steps: int) -> Iterator[Step]:

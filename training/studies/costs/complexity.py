@@ -13,13 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg.blas import dsyrk
 
 import slam
 from slam.backend import Backend
 from slam.formats import atomic_write
-from slam.geometry import wrap
 from slam.motion import move
 from slam.types import Array, Observations, Odometry
 from training.figures.charts import chart, label, png
@@ -29,7 +27,7 @@ from training.runs.errors import bad_input
 from training.runs.rows import resume
 from training.runs.running import write_json
 from training.runs.typed import whole_numbers
-from training.studies.circle_world import not_observing
+from training.studies.circle_world import not_observing, observed
 
 __all__ = ["REFERENCE", "SEEN", "complexity", "exponent", "run_job", "table"]
 
@@ -45,7 +43,7 @@ REPEATS = 10
 STORE = "points.jsonl"  # what was measured
 _MOST_LANDMARKS = 2000  # the joint covariance of so many takes 130 MB
 _DT, _SPEED, _TURN = 0.1, 0.3, 0.2
-_SIGMAS = np.array([0.02, math.radians(1.0)])
+_COV = np.diag([0.02, math.radians(1.0)]) ** 2  # of an observation
 
 
 # ---- one point -------------------------------------------------------------------------------------------------
@@ -91,16 +89,9 @@ def _record(world: Array, steps: int) -> list[tuple[Odometry, Observations, Arra
         before, pose = pose, move(pose, twist, _DT)
         odometry = Odometry(twist * (1.0 + 0.01 * rng.standard_normal(3)), _DT)
         distance = np.hypot(*(world - pose[:2]).T)
-        out.append((odometry, _observe(world, np.argsort(distance, kind="stable")[:SEEN], pose, rng), before))
+        nearest = np.argsort(distance, kind="stable")[:SEEN]
+        out.append((odometry, observed(world, nearest, pose, _COV, rng), before))
     return out
-
-
-def _observe(world: Array, ids: NDArray[np.int64], pose: Array, rng: np.random.Generator) -> Observations:
-    dx, dy = (world[ids] - pose[:2]).T
-    seen = np.column_stack([np.hypot(dx, dy), np.arctan2(dy, dx) - pose[2]])
-    seen += _SIGMAS * rng.standard_normal(seen.shape)
-    seen[:, 1] = wrap(seen[:, 1])
-    return Observations(seen, np.repeat(np.diag(_SIGMAS**2)[None], len(ids), axis=0), ids)
 
 
 def _map_everything(backend: Backend, world: Array, pose: Array) -> None:
@@ -108,7 +99,8 @@ def _map_everything(backend: Backend, world: Array, pose: Array) -> None:
     backend.reset(pose)
     rng = np.random.default_rng(1)
     for begin in range(0, len(world), SEEN):
-        backend.observe(_observe(world, np.arange(begin, min(begin + SEEN, len(world))), pose, rng))
+        ids = np.arange(begin, min(begin + SEEN, len(world)))
+        backend.observe(observed(world, ids, pose, _COV, rng))
 
 
 def _watch_correction(backend: Backend) -> Callable[[], float]:
