@@ -22,7 +22,7 @@ from agents.base import Goal
 from mecanum_env.env import ExploreEnv
 from slam.ekf import EkfSlam
 from slam.formats import atomic_write
-from slam.geometry import transform_points, wrap_scalar
+from slam.geometry import about_z, compose, inverse, transform_points, wrap_scalar
 from slam.landmarks.innovations import Innovation
 from slam.metrics.chi_square import chi2_quantile
 from slam.types import Array, Scan
@@ -77,18 +77,17 @@ class BeliefWitness:
         """Take down the environment as it is now."""
         del goal
         true, pose, cov = env.truth.pose, env.backend.pose, env.backend.pose_cov
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        turn = about_z(-pose[2])
         error = turn @ (true - pose)
         error[2] = wrap_scalar(float(true[2] - pose[2]))
         self.errors.append(error)
         self.sigmas.append(np.sqrt(np.diag(turn @ cov @ turn.T)))
         self.nees.append(env.backend.pose_nees(true))
         step = len(self.nees) - 1
-        offset = env.config.lidar.offset_m
+        mount = np.array([env.config.lidar.offset_m, 0.0, 0.0])
         for innovation in self._seen:
             self.nis.setdefault(innovation.kind, []).append(innovation.nis)
-            self._keep(Moment(step, innovation, env.scan, _sensor(pose, offset), _sensor(true, offset)))
+            self._keep(Moment(step, innovation, env.scan, compose(pose, mount), compose(true, mount)))
         self._seen.clear()
 
     def _keep(self, moment: Moment) -> None:
@@ -108,10 +107,6 @@ class BeliefWitness:
 
 def _size(moment: Moment) -> float:
     return moment.innovation.nis
-
-
-def _sensor(pose: Array, offset: float) -> Array:
-    return np.array([pose[0] + offset * math.cos(pose[2]), pose[1] + offset * math.sin(pose[2]), pose[2]])
 
 
 def rises(nees: Sequence[float]) -> list[int]:
@@ -174,11 +169,8 @@ def _draw_course(witness: BeliefWitness, step_s: float) -> bytes:
 
 def _draw_innovations(moments: Sequence[Moment], env: ExploreEnv, step_s: float) -> bytes:
     figure, panels = chart(2, 3, size=(1800, 1200))
-    to_start = env.truth.ground.in_start_frame
-    walls = np.array([
-        [*to_start(np.array([x0, y0, 0.0]))[:2], *to_start(np.array([x1, y1, 0.0]))[:2]]
-        for x0, y0, x1, y1 in env.truth.ground.plan.segments.tolist()
-    ])  # fmt: skip
+    ground = env.truth.ground
+    walls = transform_points(inverse(ground.start), ground.plan.segments.reshape(-1, 2)).reshape(-1, 4)
     for axes in panels:
         axes.set_visible(False)
     for axes, moment in zip(panels, moments, strict=False):

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from mecanum_env.env import ExploreEnv
-from slam.types import Array, Scan
+from mecanum_env.team.communication import walls_between
+from slam.types import Scan
 
 __all__ = ["FAULTS", "Fault"]
 
@@ -43,7 +44,7 @@ class _Teleport(Fault):
             way = rng.uniform(-math.pi, math.pi)
             to = np.array([x + _AWAY_M * math.cos(way), y + _AWAY_M * math.sin(way)])
             turned = theta + _TURN_RAD * (1.0 if rng.random() < 0.5 else -1.0)
-            if not _crosses(np.array([x, y]), to, plan.segments) and world.put([to[0], to[1], turned]):
+            if not walls_between(np.array([x, y]), to, plan.segments) and world.put([to[0], to[1], turned]):
                 return True
         return False
 
@@ -92,13 +93,3 @@ class _Blind(Fault):
 
 
 FAULTS: dict[str, type[Fault]] = {"none": Fault, "teleport": _Teleport, "wheel": _Wheel, "blind": _Blind}
-
-
-def _crosses(a: Array, b: Array, segments: Array) -> bool:
-    """Tell whether the way from one point ``(2,)`` to another meets a wall ``(n, 4)``."""
-    d, e, f = b - a, segments[:, 2:] - segments[:, :2], segments[:, :2] - a
-    with np.errstate(divide="ignore", invalid="ignore"):
-        area = d[0] * e[:, 1] - d[1] * e[:, 0]
-        along = (f[:, 0] * e[:, 1] - f[:, 1] * e[:, 0]) / area
-        across = (f[:, 0] * d[1] - f[:, 1] * d[0]) / area
-    return bool(np.any((along > 0.0) & (along < 1.0) & (across > 0.0) & (across < 1.0)))

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-import cv2
 import numpy as np
 import typer
 
@@ -76,13 +75,8 @@ class _Robot:
 
 def _another_start(plan: FloorPlan, rng: np.random.Generator) -> Array:
     """Return a pose in the world frame that can be reached from the plan's start, any of them alike."""
-    start = (np.array(plan.start[:2]) - plan.origin) / plan.resolution
-    wide = plan.clearance() >= _CLEARANCE_M
-    _, labels = cv2.connectedComponents(wide.astype(np.uint8), connectivity=4)
-    cells = np.argwhere(wide)
-    nearest = cells[np.argmin(np.hypot(*(cells - start[::-1]).T))]
-    within = np.argwhere(labels == labels[tuple(nearest)])
-    row, col = within[rng.integers(len(within))]
+    cells = np.argwhere(plan.reachable(_CLEARANCE_M, np.array(plan.start)))
+    row, col = cells[rng.integers(len(cells))]
     x, y = (np.array([col, row]) + 0.5) * plan.resolution + plan.origin
     return np.array([x, y, rng.uniform(-math.pi, math.pi)])
 

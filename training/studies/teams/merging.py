@@ -14,7 +14,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-import cv2
 import numpy as np
 import typer
 
@@ -91,10 +90,8 @@ def run_job(job: Job) -> Row:
 
 def _free_place(plan: FloorPlan, radius_m: float, rng: np.random.Generator) -> tuple[float, float, float]:
     """Draw a pose that the robot can reach from the plan's start."""
-    clearance = plan.clearance()
-    _, labels = cv2.connectedComponents((clearance >= radius_m).astype(np.uint8), connectivity=4)
-    col, row = ((np.array(plan.start[:2]) - plan.origin) / plan.resolution).astype(int)
-    cells = np.argwhere((labels == labels[row, col]) & (clearance >= _CLEARANCE_M))
+    reachable = plan.reachable(radius_m, np.array(plan.start))
+    cells = np.argwhere(reachable & (plan.clearance() >= _CLEARANCE_M))
     x, y = (rng.choice(cells)[::-1] + 0.5) * plan.resolution + np.array(plan.origin)
     return float(x), float(y), float(rng.uniform(-math.pi, math.pi))
 
