@@ -13,9 +13,9 @@ from slam.files import plain_name
 __all__ = ["csv_table", "markdown_name", "markdown_table", "number", "text_table"]
 
 
-def number(value: float | None, digits: int, missing: str = "–") -> str:
-    """Return a number with so many digits after the point, or what stands for none."""
-    return missing if value is None else f"{value:.{digits}f}"
+def number(value: float | None, digits: int, missing: str = "–", *, factor: float = 1.0) -> str:
+    """Return a number, times a factor, with so many digits after the point, or what stands for none."""
+    return missing if value is None else f"{factor * value:.{digits}f}"
 
 
 def markdown_name(name: str) -> str:

@@ -30,6 +30,7 @@ from training.episodes.playback import ellipses
 from training.episodes.recording import Recorded, Recording
 from training.figures.page import HEAD, name_html, security_policy, text_html
 from training.figures.page_style import STYLE
+from training.figures.tables import number
 
 if TYPE_CHECKING:
     from mecanum_env.config import EnvConfig
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "LOST", "NO_RETURN", "TRUTH_PX", "about_plan", "assets", "episode_page", "filled", "first_asked",
-    "metrics_table", "number", "pack", "tiles",
+    "metrics_table", "pack", "tiles",
 ]  # fmt: skip
 
 _ASSETS = Path(__file__).parent / "assets"
@@ -248,14 +249,14 @@ Tile = tuple[str, str, str]  # what it is, its figure, its unit
 def first_asked(metrics: Mapping[str, Any]) -> list[Tile]:
     """Return the tiles of what one asks first."""
     return [
-        ("coverage", number(metrics["coverage"], 100.0, 1), "%"),
-        ("time", number(metrics["time_s"], 1.0, 1), "s"),
-        ("to 95 %", number(metrics["time_to_95_s"], 1.0, 1), "s"),
-        ("path", number(metrics["path_length_m"], 1.0, 1), "m"),
+        ("coverage", number(metrics["coverage"], 1, factor=100.0), "%"),
+        ("time", number(metrics["time_s"], 1), "s"),
+        ("to 95 %", number(metrics["time_to_95_s"], 1), "s"),
+        ("path", number(metrics["path_length_m"], 1), "m"),
         ("collisions", str(metrics["collisions"]), ""),
-        ("ATE", number(metrics["ate_rmse_m"], 100.0, 1), "cm"),
-        ("NEES / 3", number(metrics["anees"], 1.0, 2), ""),
-        ("walls, IoU", number(metrics["map_iou"], 1.0, 3), ""),
+        ("ATE", number(metrics["ate_rmse_m"], 1, factor=100.0), "cm"),
+        ("NEES / 3", number(metrics["anees"], 2), ""),
+        ("walls, IoU", number(metrics["map_iou"], 3), ""),
     ]
 
 
@@ -265,11 +266,6 @@ def tiles(shown: Sequence[Tile]) -> str:
         f"<div><dt>{name}</dt><dd>{value}<small>{'' if value == '–' else unit}</small></dd></div>"
         for name, value, unit in shown
     )
-
-
-def number(value: float | None, factor: float, digits: int) -> str:
-    """Return a figure in the unit shown; a dash where there is none."""
-    return "–" if value is None else f"{factor * value:.{digits}f}"
 
 
 def metrics_table(metrics: Mapping[str, Any]) -> str:

@@ -15,6 +15,7 @@ from mecanum_env.views.paint import extent_of_truth, with_margin
 from training.episodes.recording import Recording
 from training.episodes.team import TeamEpisode
 from training.figures.page import text_html
+from training.figures.tables import number
 from training.views.report_page import (
     TRUTH_PX,
     about_plan,
@@ -22,7 +23,6 @@ from training.views.report_page import (
     filled,
     first_asked,
     metrics_table,
-    number,
     pack,
     tiles,
 )
@@ -88,7 +88,7 @@ def _robots_table(robots: Sequence[Mapping[str, Any]]) -> str:
     head = "".join(f"<th>{escape(heading)}</th>" for heading in ("", *(heading for heading, *_ in _COLUMNS)))
     rows = "".join(
         f'<tr><th><span class="key robot-{k}"></span>robot&nbsp;{k}</th>'
-        + "".join(f"<td>{number(robot[name], factor, digits)}</td>" for _, name, factor, digits in _COLUMNS)
+        + "".join(f"<td>{number(robot[name], digits, factor=factor)}</td>" for _, name, factor, digits in _COLUMNS)
         + "</tr>"
         for k, robot in enumerate(robots)
     )

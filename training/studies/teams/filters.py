@@ -177,8 +177,8 @@ def table(rows: list[dict[str, dict[str, Any]]]) -> str:
             lines.append([
                 f"{name}, {which}", number(mean("nees"), 2), number(worst("nees"), 1),
                 number(float(np.mean(together)) if together and which == "first" else None, 2),
-                *(number(v and 1e3 * v, 1) for v in (mean("ate_m"), worst("ate_m"), mean("end_m"))),
-                number((turn := mean("heading_rad")) and math.degrees(turn), 3),
+                *(number(v, 1, factor=1e3) for v in (mean("ate_m"), worst("ate_m"), mean("end_m"))),
+                number(mean("heading_rad"), 3, factor=180.0 / math.pi),
                 number(mean("landmarks"), 0), number(float(np.mean([row[name]["ms"] for row in rows])), 2),
             ])  # fmt: skip
     head = [
