@@ -19,7 +19,7 @@ from training.runs.errors import one_line
 from training.runs.running import plain
 
 __all__ = [
-    "CURVE_POINTS", "THUMBNAIL_PX", "WALL_CLOCK", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "resampled",
+    "CURVE_POINTS", "THUMBNAIL_PX", "EpisodeFailure", "EpisodeJob", "EpisodeRow", "Key", "resampled",
     "row_metrics", "run_job", "small_png", "way",
 ]  # fmt: skip
 
@@ -29,9 +29,6 @@ Key = tuple[str, str, int, str, str] | tuple[str, str, int, str, str, int, str]
 
 CURVE_POINTS = 128
 """Points of a curve: coverage at so many times (or ways), evenly spaced from the episode's start to its end."""
-
-WALL_CLOCK = ("decision_ms_median", "decision_ms_p95", "wall_time_s")
-"""The metrics that the machine decides, too; all the others are the same in every run of a job."""
 
 THUMBNAIL_PX = 220
 """Longer side of a thumbnail."""
