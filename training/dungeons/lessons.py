@@ -144,7 +144,7 @@ def _driver(policy: bytes | None) -> TourDriver:
 
 def _arrays(policy: bytes | None, seed: int) -> dict[str, NDArray[Any]]:
     lessons = lessons_of(seed, _driver(policy))
-    return {} if lessons is None else {f.name: getattr(lessons, f.name) for f in fields(lessons)}
+    return {} if lessons is None else vars(lessons)
 
 
 def _write(folder: Path, seed: int, arrays: dict[str, NDArray[Any]]) -> None:

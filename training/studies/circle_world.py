@@ -74,8 +74,7 @@ class LandmarkWorld:
 
     def settings(self) -> dict[str, Any]:
         """Return everything that defines the world, as JSON has it."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return values | {"landmarks": np.round(self.landmarks, 9).tolist()}
+        return dataclasses.asdict(self) | {"landmarks": np.round(self.landmarks, 9).tolist()}
 
     def path(self, steps: int) -> Array:
         """Return the poses ``(steps + 1, 3)`` at constant speed along the ellipse, heading along it."""

@@ -213,9 +213,7 @@ def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: i
     return peers.compare(peer, inner.config, drives=drives, ours=ours)
 
 
-def run(
-    *, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None = None
-) -> dict[str, Any]:
+def run(*, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None) -> None:
     """Measure, and print a table (or one JSON object) on standard output; ``peer`` adds a comparison."""
     print(f"measuring {rooms}, {slam}, {beams} beams, {steps:,} steps …", file=sys.stderr)
     result = measure(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
@@ -224,7 +222,7 @@ def run(
         result["peer"] = _beside(peer, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
     if as_json:
         print(json.dumps(result))
-        return result
+        return
     print(
         f"{result['steps_per_second']:,.0f} complete steps per second ({result['steps']:,} steps; median "
         f"{result['step_us_median']:.0f} µs, 99th percentile {result['step_us_p99']:.0f} µs; undisturbed, the "
@@ -237,7 +235,6 @@ def run(
     print(text_table(["stage", "median µs", "mean µs"], rows))
     if peer is not None:
         print(_against(result["peer"]))
-    return result
 
 
 def _against(peer: dict[str, Any]) -> str:

@@ -131,8 +131,8 @@ def measure(
 
 
 def run(
-    envs: int, *, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None = None
-) -> dict[str, Any]:
+    envs: int, *, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None
+) -> None:
     """Measure, and print a table (or one JSON object) on standard output."""
 
     def progress(done: int, rounds: int) -> None:
@@ -143,7 +143,7 @@ def run(
     )
     if as_json:
         print(json.dumps(result))
-        return result
+        return
     print(
         f"{envs} environments, {result['steps']} steps, {result['cores']} cores; medians of {peers.ROUNDS} rounds"
     )
@@ -153,4 +153,3 @@ def run(
         undisturbed = [f"{best[way]:,.0f}", f"{best[way] / best['one']:.2f}"] if way in best else ["–", "–"]
         rows.append([way, f"{rate:,.0f}", f"{result['ratio_to_one'][way]:.2f}", *undisturbed])
     print(text_table(["way", "steps/s", "of one", "undisturbed", "of one"], rows))
-    return result
