@@ -6,6 +6,7 @@ import base64
 import json
 import re
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -295,6 +296,16 @@ def test_a_layer_is_switched_by_keys_too(browser: Any, episode: Recorded) -> Non
     browser.find_element("id", "speed").send_keys(Keys.TAB + Keys.SPACE)
     assert not browser.find_element("css selector", "[data-layer=scan]").is_selected()
     assert not browser.execute_script("return replay.playing")
+
+
+def test_a_goal_lies_within_its_curve(browser: Any, tmp_path: Path) -> None:
+    episode, recorder = explore.prepare(out=tmp_path, rooms="rectangular", max_steps=2), Recorder()
+    explore.run(episode, lambda **_: None, [recorder])
+    recording = recorder.recording()
+    write_episode(episode, replace(recording, nees=np.full_like(recording.nees, 0.3)))
+    opened(browser, Recorded(episode.env, recording, tmp_path))
+    curves = browser.execute_script("return replay.curves.map(({ goal, top }) => [goal ?? 0, top])")
+    assert len(curves) == 5 and all(goal <= top for goal, top in curves), "or it is drawn where another value is"
 
 
 def test_the_belief_is_drawn_where_it_is(browser: Any, episode: Recorded) -> None:

@@ -55,6 +55,11 @@ def test_a_browser_replays_all_robots(browser: Any, written: Written) -> None:
     assert browser.execute_script("return replay.k") == 20
     outputs = [e.text for e in browser.find_elements("css selector", "#curves output")]
     assert outputs[0] == f"{100 * written.explored.episode.log.coverage[20]:.1f}" and len(outputs) == 4
+    apart = [r.true_poses[20, :2] - r.estimates[20, :2] for r in written.explored.recordings]
+    errors = [f"{error:.1f}" for error in sorted(100 * np.hypot(*np.transpose(apart)))]
+    assert outputs[1] == " – ".join(dict.fromkeys([errors[0], errors[-1]])), "of all robots, not of the last"
+    nees = sorted(r.nees[20] / 3 for r in written.explored.recordings)
+    assert outputs[2] == f"{nees[0]:.2f} – {nees[-1]:.2f}"
     picture = "return document.getElementById('{}').toDataURL()"
     for layer, canvas in (("scan", "world"), ("links", "world"), ("paths", "belief"), ("landmarks", "belief")):
         before = browser.execute_script(picture.format(canvas))

@@ -1,5 +1,6 @@
 "use strict";
-// What is measured, over time; `pick` is told the row that was pointed at. A curve has `values`, or several `lines`.
+// What is measured, over time; `pick` is told the row that was pointed at. A curve has `values`, or several `lines`: of
+// lines that are `alike` the least and the largest value are told, else the last one's, which lies above the others.
 function openCurves(header, curves, pick) {
   const n = header.rows, step = header.step_s;
   for (const curve of curves) {
@@ -10,7 +11,8 @@ function openCurves(header, curves, pick) {
     curve.canvas.setAttribute("role", "img");
     curve.canvas.setAttribute("aria-label", `${curve.name} over time`);
     curve.output = figure.querySelector("output");
-    let top = curve.least || 0;
+    if (curve.alike) curve.output.title = "least and largest at this time";
+    let top = Math.max(curve.least || 0, curve.goal || 0);
     curve.lines ??= [curve];
     for (const values of [...curve.lines.map((line) => line.values), curve.band || []]) {
       // A rare spike would flatten all else: the top is what all but the highest half per cent stay below.
@@ -96,12 +98,14 @@ function openCurves(header, curves, pick) {
     c.moveTo(x(k), top);
     c.lineTo(x(k), bottom);
     c.stroke();
-    const value = curve.lines.at(-1).values[k]; // drawn last, over the others
+    const told = (curve.alike ? curve.lines : curve.lines.slice(-1)).map((line) => line.values[k]).filter(Number.isFinite);
+    const ends = new Set([Math.min(...told), Math.max(...told)].map((value) => value.toFixed(curve.digits)));
     const band = curve.band ? ` of ${curve.signed ? "±" : ""}${curve.band[k].toFixed(curve.digits)}` : "";
-    curve.output.textContent = Number.isFinite(value) ? `${value.toFixed(curve.digits)}${band}` : "–";
+    curve.output.textContent = told.length ? [...ends].join(" – ") + band : "–";
   }
 
   return {
+    curves,
     draw(k) {
       for (const curve of curves) drawCurve(curve, k);
     },

@@ -95,5 +95,5 @@
   }
   window.addEventListener("hashchange", () => { pause(); seek(asked()); });
   seek(asked());
-  window.replay = { seek, play, pause, data, header, map, get k() { return k; }, get playing() { return playing; } };
+  window.replay = { seek, play, pause, data, header, map, curves: parts[1].curves, get k() { return k; }, get playing() { return playing; } };
 })();

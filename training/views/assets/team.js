@@ -123,9 +123,9 @@ function curvesOf(header, { data, robots }) {
         { colour: "--ink", width: 2.4, values: series((k) => 100 * data.coverage[k]) },
       ],
     },
-    { name: "position errors", unit: "cm", digits: 1, lines: ofEach((own, k) => 100 * positionError(own, k)) },
+    { name: "position errors", unit: "cm", digits: 1, alike: true, lines: ofEach((own, k) => 100 * positionError(own, k)) },
     {
-      name: "NEES / 3 of each, ideally 1 on average", unit: "", digits: 2, goal: 1,
+      name: "NEES / 3 of each, ideally 1 on average", unit: "", digits: 2, goal: 1, alike: true,
       lines: ofEach((own, k) => (k ? own.nees[k] / 3 : NaN)),
     },
     { name: "robots in the largest group in touch", unit: "", digits: 0, colour: "--link", least: count, values: series(largest) },
