@@ -228,13 +228,24 @@ def _extra(requirement: Requirement) -> list[str]:
 
 
 def _mismatch(requirement: Requirement) -> str:
-    """Return what is wrong about an installed package, or nothing."""
+    """Return what is wrong about an installed package, or about what its extras that are asked for need."""
     try:
         found = version(requirement.name)
     except PackageNotFoundError:
         return f"{requirement.name} is missing"
-    fits = requirement.specifier.contains(found, prereleases=True)
-    return "" if fits else f"{requirement.name} {found}, wanted {requirement.specifier}"
+    if not requirement.specifier.contains(found, prereleases=True):
+        return f"{requirement.name} {found}, wanted {requirement.specifier}"
+    for extra in sorted(requirement.extras):
+        needed = [r for r in map(Requirement, requires(requirement.name) or ()) if _of_extra(r, extra)]
+        if wrong := [text for r in needed if (text := _mismatch(r))]:
+            return f"{requirement.name}[{extra}]: {', '.join(wrong)}"
+    return ""
+
+
+def _of_extra(requirement: Requirement, extra: str) -> bool:
+    """Whether a package needs something for an extra of its own alone, here."""
+    marker = requirement.marker
+    return marker is not None and marker.evaluate({"extra": extra}) and not marker.evaluate({"extra": ""})
 
 
 def _ask(program: str) -> str:

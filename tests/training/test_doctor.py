@@ -53,6 +53,20 @@ def test_a_package_that_is_missing_or_too_old_fails_and_is_named(
     assert any(re.fullmatch(r"ok +extra +x: there", text) for text in lines)
 
 
+def test_an_extra_that_asks_for_anothers_extra_is_there_with_all_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    needed = {
+        "mecanum-slam": ['rich[part]>=1; extra == "x"', 'rich[whole]>=1; extra == "y"'],
+        "rich": [
+            'no-such-package-anywhere>=1; python_version >= "3" and extra == "part"',
+            'numpy>=99; python_version < "3" and extra == "whole"',
+            "numpy>=2.0",
+        ],
+    }
+    monkeypatch.setattr(doctor, "requires", needed.__getitem__)
+    found = {answer["found"]: answer["works"] for answer in doctor._extras()}
+    assert found == {"x: rich[part]: no-such-package-anywhere is missing": False, "y: there": True}
+
+
 def test_what_breaks_is_a_finding_and_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken() -> doctor.Answers:
         raise OSError("no\nway")
