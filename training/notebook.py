@@ -112,7 +112,10 @@ def _path(name: str, given: str | Path | None) -> Path | None:
 def _text(value: Any, factor: float, unit: str) -> str:
     if value is None:
         return "–"
-    return f"{value} {unit}" if isinstance(value, int) else f"{factor * value:.3g} {unit}"
+    if isinstance(value, int):
+        return f"{value} {unit}"
+    shown = factor * value
+    return f"{shown:.0f} {unit}" if abs(shown) >= 999.5 else f"{shown:.3g} {unit}"
 
 
 def _data_uri(picture: Path) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 import training
 from training.cli import main
+from training.notebook import Explored
 
 
 def test_it_is_the_command_s_episode_and_shows_its_figures(tmp_path: Path) -> None:
@@ -24,6 +25,12 @@ def test_it_is_the_command_s_episode_and_shows_its_figures(tmp_path: Path) -> No
     assert "a &lt;b&gt;" in page and "a <b>" not in page
     assert f"{100 * result.metrics['coverage']:.3g} %" in page
     assert "95 % covered at</th><td>–" in page, "not reached"
+
+
+def test_long_episodes_are_shown_in_seconds_and_metres(tmp_path: Path) -> None:
+    metrics = {"time_s": 1234.5, "path_length_m": 999.7, "coverage": 0.5}
+    page = Explored(metrics=metrics, out=tmp_path)._repr_html_()
+    assert "time</th><td>1234 s" in page and "path</th><td>1000 m" in page and "coverage</th><td>50 %" in page
 
 
 def test_several_robots_are_the_command_s_too(tmp_path: Path) -> None:
