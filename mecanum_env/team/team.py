@@ -32,9 +32,11 @@ from slam.settings import argument, checked, from_mapping
 from slam.teams.centralised import JointEkf
 from slam.types import Array
 
-__all__ = ["Outcome", "Team"]
+__all__ = ["JOINT_SLAM", "Outcome", "Team"]
 
-_JOINT = "ekf-lines"
+JOINT_SLAM = "ekf-lines"
+"""The backend that one filter over all robots is."""
+
 _COVER_EVERY_S = 1.0
 _GATE = chi2_quantile(0.999, 3)  # of a sighting
 _OPTIONS = ("floor_plan", "start_poses", "room_seed")
@@ -91,9 +93,11 @@ class Team:
         self.joint: JointEkf | None = None
         """The one filter of a joint belief."""
         if self.team.belief == "joint":
-            if self.config.slam not in (_JOINT, EnvConfig().slam):  # the default stands for none
-                raise ValueError(f"a joint belief is {_JOINT} over all robots; slam must be left out or be that")
-            self.config = replace(self.config, slam=_JOINT)
+            if self.config.slam not in (JOINT_SLAM, EnvConfig().slam):  # the default stands for none
+                raise ValueError(
+                    f"a joint belief is {JOINT_SLAM} over all robots; slam must be left out or be that"
+                )
+            self.config = replace(self.config, slam=JOINT_SLAM)
             settings_of_all = from_mapping(EkfLinesConfig, backend_settings(self.config))
             self.joint = JointEkf(self.team.robots, settings_of_all)
         parts = (None,) * self.team.robots if self.joint is None else self.joint.members

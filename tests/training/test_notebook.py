@@ -50,6 +50,7 @@ def test_several_robots_are_the_command_s_too(tmp_path: Path) -> None:
         ({"rooms": "aprtment"}, "did you mean 'apartment'"),
         ({"floor_plan": "missing.png"}, "missing.png"),
         ({"floor_plan": 3}, "floor_plan must be a path, got 3"),
+        ({"rooms": "cave", "floor_plan": "missing.png"}, "instead of rooms"),
         ({"max_steps": 0}, "max_steps must be a whole number"),
         ({"seed": "one"}, "seed must be a whole number"),
         ({"coverage_target": 2.0}, "coverage_target must be in"),

@@ -98,6 +98,8 @@ def choose(text: str, *, floor_plans: Path | None = None) -> tuple[Suite, ...]:
             if name == "all":
                 raise BadInput("--suite all stands for every suite; give it alone")
             raise unknown_name("suite", name, (*valid, "all"))
+    if floor_plans is not None and not set(wanted) - set(names()):
+        raise BadInput(f"--floor-plans belongs to the suite {FLOOR_PLANS}; add it to --suite, or leave it out")
     plans = read_floor_plans(floor_plans) if floor_plans is not None else ()
     return tuple(_make(name, plans) for name in wanted)
 

@@ -130,6 +130,8 @@ def benchmark(
         )  # fmt: skip
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
+    if split is not None and seeds is not None:
+        raise BadInput("--seeds are others than those of --split; leave out the one or the other")
     from training.benchmark import run as task
     from training.benchmark.output import Report, table
     from training.benchmark.output import as_json as as_mapping

@@ -28,7 +28,7 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "done", "make_agent", "prepare", "run", "run_whole",
+    "done", "make_agent", "prepare", "refuse_two_places", "run", "run_whole",
 ]  # fmt: skip
 
 FILES = (
@@ -169,6 +169,7 @@ def asked_for(
     An agent maps all that it can reach; what counts as success, the world's ``coverage_target``, is judged at
     the end.
     """
+    refuse_two_places(rooms, floor_plan)
     past = _read_run_table(config) if config is not None else {}
     if any(v is not None for v in (rooms, floor_plan, seed)):
         # Other rooms: neither the start nor the step limit is meant for them.
@@ -189,6 +190,12 @@ def asked_for(
     plan = make_plan(world, run["seed"])
     limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
     return world, run | {"max_steps": limit}, plan
+
+
+def refuse_two_places(rooms: str | None, floor_plan: Path | None) -> None:
+    """Raise ``ValueError`` where both rooms and a plan are asked for: the rooms would be passed over."""
+    if rooms is not None and floor_plan is not None:
+        raise ValueError("a floor plan is explored instead of rooms; leave out the one or the other")
 
 
 def done(agent: Agent) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from agents.base import Agent, Goal
 from mecanum_env.team.config import TeamConfig
-from mecanum_env.team.team import Team
+from mecanum_env.team.team import JOINT_SLAM, Team
 from slam.files import quoted
 from slam.settings import from_mapping
 from training.episodes.explore import AGENT_DONE_AFTER_S, EXTRAS, Course, Progress, asked_for, done, make_agent
@@ -154,6 +154,9 @@ def prepare(team: TeamConfig, *, out: Path, **asked: Any) -> TeamEpisode:
         files = [*FILES, LANDMARKS, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
         world, run, plan = asked_for(out=out, files=files, **asked)
         refuse_bounds([run["agent"]])
+        if team.belief == "joint" and slam is not None and slam != JOINT_SLAM:
+            # What a file has may be the default: that stands for none.
+            raise ValueError(f"--joint-belief is one {JOINT_SLAM} over all robots; leave out --slam {slam}")
         if run.get("start") is not None:
             plan = plan.with_start(run["start"], clearance_m=world.robot.inscribed_radius_m)
         robots = Team(team=team, config=replace(world, coverage_target=1.0), max_steps=run["max_steps"])

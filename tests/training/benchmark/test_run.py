@@ -249,6 +249,8 @@ def test_the_documented_agent_is_found_by_its_entry_point(
         (["--sensor", "public"], ["--sensor belongs to", "--protocol dungeons"]),
         (["--protocol", "dungeons", "--maps", "nowhere"], ["--maps nowhere", "no folder"]),
         (["--floor-plans", "nowhere"], ["--floor-plans nowhere", "no folder"]),
+        (["--floor-plans", ".", "--suite", "rooms"], ["--floor-plans belongs to the suite floor-plans"]),
+        (["--split", "validation", "--seeds", "3"], ["--seeds are others than those of --split"]),
     ],
 )
 def test_bad_input(argv: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

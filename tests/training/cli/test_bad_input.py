@@ -116,6 +116,16 @@ def test_bad_floor_plans(kind: str, words: list[str], tmp_path: Path, capsys: py
     assert all(word in line for word in [*words, str(path)]), line
 
 
+def test_rooms_beside_a_floor_plan(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places = ["--rooms", "cave", "--floor-plan", str(write_room(tmp_path / "room.png"))]
+    for line in (
+        explore_refused(places, capsys, tmp_path / "out"),
+        explore_refused([*places, "--robots", "2"], capsys, tmp_path / "out"),
+        refused(["play", *places], capsys),
+    ):
+        assert "instead of rooms; leave out the one or the other" in line
+
+
 def test_a_start_inside_a_wall_or_too_near_to_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plan = write_room(tmp_path / "room.png")
     for start in ("0.1,0.1,0", "0.35,1.5,0", "-5,0,0", "1e300,0,0"):
