@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.views.canvas import FLOOR, WALL, Canvas, View
 from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned, with_margin
-from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_readouts
+from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_backend, write_readouts
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.types import Array
@@ -94,6 +94,7 @@ def _paint_maps(canvas: Canvas, grids: list[OccupancyGrid], frames: list[Array])
 
 
 def _write(frame: Image, team: Team) -> None:
+    write_backend(frame, "Maps", team.config.slam)
     coverage = team.coverage_share
     collisions = sum(member.truth.world.collisions for member in team.members)
     entries = (

@@ -34,6 +34,7 @@ ROBOT: Colour = (42, 92, 222)
 INK: Colour = (110, 100, 92)
 
 _SHIFT = 4  # OpenCV's fixed-point fraction bits: antialiased to 1/16 pixel
+_SPELT = str.maketrans({"·": "-", "–": "-", "…": "...", "σ": "sigma", "²": "2", "×": "x"})
 _TYRE_SHARE = 0.22  # width of a drawn wheel over the robot's width
 
 
@@ -187,8 +188,7 @@ def put_text(
     font = _font()
     if font is None:
         width = 2 if bold else 1
-        plain = text.replace("·", "-").replace("σ", "sigma").replace("²", "2")
-        cv2.putText(image, plain, at, cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), colour, width, cv2.LINE_AA)
+        cv2.putText(image, _ascii(text), at, cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), colour, width, cv2.LINE_AA)
     else:
         cv2.putText(image, text, at, colour, font, round(size), 700 if bold else 400)
 
@@ -197,7 +197,7 @@ def text_width(text: str, *, size: float = 16.0, bold: bool = False) -> int:
     """Return how wide :func:`put_text` writes a text [pixels]."""
     font = _font()
     if font is None:
-        (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), 2 if bold else 1)
+        (width, _), _ = cv2.getTextSize(_ascii(text), cv2.FONT_HERSHEY_SIMPLEX, _hershey(size), 2 if bold else 1)
         return int(width)
     size_px = cv2.getTextSize((4096, 4096), text, (0, 0), font, round(size), 700 if bold else 400)
     return int(size_px[2])
@@ -208,6 +208,11 @@ def _font() -> Any:
     """Return OpenCV 5's sans serif, or None before that: then its plotter font has to do."""
     made = getattr(cv2, "FontFace", None)
     return made("sans") if made is not None else None
+
+
+def _ascii(text: str) -> str:
+    """Return a text in the letters that the plotter font has, one question mark for each other one."""
+    return text.translate(_SPELT).encode("ascii", "replace").decode()
 
 
 def _hershey(size: float) -> float:

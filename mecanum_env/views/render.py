@@ -40,7 +40,7 @@ from slam.types import Array, Scan
 
 __all__ = [
     "FRAME_SHAPE", "Shown", "blank_frame", "frontier_cells", "panels", "render_frame", "view_of_truth",
-    "write_readouts",
+    "write_backend", "write_readouts",
 ]  # fmt: skip
 
 Image = NDArray[np.uint8]
@@ -213,8 +213,7 @@ def _paint_grid(canvas: Canvas, grid: OccupancyGrid) -> None:
 
 
 def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, error: str) -> None:
-    at = _RIGHT + text_width("Belief", size=19, bold=True) + 12
-    put_text(frame, env.config.slam, (at, 30), INK, size=17)
+    write_backend(frame, "Belief", env.config.slam)
     entries = (
         ("time", f"{time_s:.1f} s", 0),
         ("coverage", f"{100.0 * coverage:.1f} %", 163),
@@ -224,6 +223,11 @@ def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, 
         ("landmarks", f"{len(env.belief.landmarks) + len(env.belief.lines)}", 1100),
     )
     write_readouts(frame, entries, coverage=coverage, colour=TRUE_PATH)
+
+
+def write_backend(frame: Image, title: str, name: str) -> None:
+    """Write the backend's name beside the title of a frame's right panel."""
+    put_text(frame, name, (_RIGHT + text_width(title, size=19, bold=True) + 12, 30), INK, size=17)
 
 
 def write_readouts(

@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms.files.importers import from_raster
+from mecanum_env.views import canvas
 from mecanum_env.views.canvas import FLOOR, ROBOT, WALL, Canvas, View, _round_length
 from mecanum_env.views.paint import FRONTIER, LANDMARK, PLANNED_PATH
 from mecanum_env.views.pictures import draw_map, draw_truth, episode_view
@@ -46,6 +48,18 @@ def mask_of(image: np.ndarray, bgr: tuple[int, int, int], *, rgb: bool = False) 
 def centre(mask: np.ndarray) -> np.ndarray:
     rows, cols = np.nonzero(mask)
     return np.array([cols.mean(), rows.mean()])
+
+
+def test_without_a_font_of_its_own_opencv_is_given_letters_that_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canvas, "_font", lambda: None)
+    told: list[str] = []
+    monkeypatch.setattr(cv2, "putText", lambda image, text, *_: told.append(text))
+    monkeypatch.setattr(cv2, "getTextSize", lambda text, *_: (told.append(text) or (0, 0), 0))
+    for text in ("– steps/s", "cave, seed 1 …", "landmark, 3σ", "büro.png"):
+        canvas.put_text(np.zeros((9, 9, 3), np.uint8), text, (0, 0), canvas.INK)
+        canvas.text_width(text)
+    spelt = ("- steps/s", "cave, seed 1 ...", "landmark, 3sigma", "b?ro.png")
+    assert told == [text for text in spelt for _ in range(2)], "written, and measured alike"
 
 
 def test_a_frame_is_rgb_of_one_size_and_changes_nothing(env: ExploreEnv) -> None:

@@ -51,6 +51,9 @@ def test_commands_start_teams() -> None:
     played.obey(Command.NEXT_ROOM)
     assert played.seed == 4 and played.info["time_s"] == 0.0 and len(played.team.members) == 2
     assert played.env is played.team.members[0]
+    above_the_panels = played.frame()[:40]
+    played.obey(Command.NEXT_BACKEND)
+    assert np.any(played.frame()[:40] != above_the_panels), "the backend is named"
 
 
 def test_the_command(pygame: object, capsys: pytest.CaptureFixture[str]) -> None:
