@@ -78,6 +78,9 @@ def test_entities_and_their_rows(path: Path, columns: Columns, episode: Recorded
         "/coverage": n, "/error/position_m": n, "/error/heading_rad": n, "/nees": n, "/health": n,
         "/collisions": n,
     }  # fmt: skip
+    page = (Path(__file__).parents[3] / "docs" / "how-to" / "exports.md").read_text("utf-8")
+    named = {entity for entity in rows if f"`{entity[1:]}`" in page}
+    assert set(rows) - named == {"/world/landmarks/ellipses"}, "the page has it as …/ellipses"
     static = Counter(c.entity_path for c in RrdReader(path).stream().to_chunks() if c.is_static)
     assert {"/world", "/world/true/body", "/world/believed/body", "/world/believed/lidar"} <= set(static)
     timelines = {name for c in RrdReader(path).stream().to_chunks() for name in c.timeline_names}
