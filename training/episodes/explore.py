@@ -46,7 +46,7 @@ LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
 ENDINGS = {
     **AGENT_ENDINGS,
     "time": "the step limit was reached first",
-    "collision": "it touched a wall, and the configuration ends an episode there",
+    "collision": "it touched a wall or another robot, and the configuration ends an episode there",
     "interrupted": "broken off by Ctrl-C",
     "running": "it goes on: written on the way",
 }

@@ -14,6 +14,8 @@ from slam.grids.occupancy import FREE
 from tests.training.pages import assert_strict
 from tests.training.team_episode import STEPS, Explored, explore_together
 from tests.training.views.test_report_page import opened, page_data, settled
+from training.episodes.recording import TeamRecorder
+from training.episodes.team import prepare, read_team, run
 from training.views.film import filmed
 from training.views.team_files import write_team_episode
 from training.views.team_page import colour
@@ -77,6 +79,32 @@ def test_a_browser_replays_all_robots(browser: Any, written: Written) -> None:
     browser.find_element("css selector", "[data-layer=follow]").click()
     settled(browser)
     assert not [entry for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
+def test_who_has_ended_goes_nowhere_any_more(browser: Any, tmp_path: Path) -> None:
+    (tmp_path / "config.toml").write_text("terminate_on_collision = true\n")
+    episode = prepare(
+        read_team(robots=4), out=tmp_path / "out", agent="random", rooms="rectangular", seed=2, max_steps=60,
+        config=tmp_path / "config.toml",
+    )  # fmt: skip
+    recorder = TeamRecorder()
+    run(episode, lambda **_: None, [recorder])
+    recordings = recorder.recording()
+    write_team_episode(episode, recordings)
+    rows = [len(recording.times) for recording in recordings]
+    first, ended = int(np.argmin(rows)), min(rows)
+    assert ended < max(rows) and len(recordings[first].goals.values[-1])
+    opened(browser, Written(Explored(episode, recordings), tmp_path / "out"))  # type: ignore[arg-type]
+    choose = "const s = document.getElementById('map-of'); s.value = {}; s.dispatchEvent(new Event('change'))"
+    browser.execute_script(choose.format(first))
+    picture = "return document.getElementById('belief').toDataURL()"
+    for row, goes in ((ended - 1, True), (ended, False)):
+        browser.execute_script("replay.seek(arguments[0])", row)
+        settled(browser)
+        before = browser.execute_script(picture)
+        browser.find_element("css selector", "[data-layer=goal]").click()
+        settled(browser)
+        assert (browser.execute_script(picture) != before) == goes
 
 
 def test_maps_are_drawn_in_the_mean_of_their_robots_colours(browser: Any, written: Written) -> None:

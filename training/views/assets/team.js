@@ -94,7 +94,8 @@ async function openViews(header, { data, robots }, redraw) {
     maps(c, shown, k);
     if (layers.landmarks) each(c, shown, (robot) => draw.landmarks(c, robot.landmarksAt(k), px, robot.header.colour));
     if (layers.paths) each(c, shown, (robot) => draw.path(c, robot.data.estimate, rowOf(robot, k), robot.header.colour, px));
-    if (layers.goal) each(c, shown, (robot) => draw.goal(c, robot.wayAt(k), px, robot.header.colour));
+    const goingOn = shown.filter((robot) => k < robot.header.rows);
+    if (layers.goal) each(c, goingOn, (robot) => draw.goal(c, robot.wayAt(k), px, robot.header.colour));
     each(c, shown, (robot) => draw.robot(c, robot.data.estimate, rowOf(robot, k), robot.header.colour));
   }
 
