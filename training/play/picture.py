@@ -38,8 +38,9 @@ def play_picture(
     if show_help:
         _write_help(picture)
     if notice:
-        box = _box(picture, text_width(notice, size=18) + 60, 60)
-        put_text(box, notice, (30, 37), WALL, size=18)
+        text = _shortened(notice, picture.shape[1] - 100, size=18)
+        box = _box(picture, text_width(text, size=18) + 60, 60)
+        put_text(box, text, (30, 37), WALL, size=18)
     return np.ascontiguousarray(picture[:, :, ::-1])
 
 
@@ -62,11 +63,11 @@ def _write(strip: Image, text: str, x: int, colour: Colour, *, bold: bool = Fals
     return x + text_width(text, size=17, bold=bold)
 
 
-def _shortened(text: str, width: int) -> str:
+def _shortened(text: str, width: int, *, size: int = 17) -> str:
     """Return a text, or as much of its beginning as is no wider."""
-    if text_width(text, size=17) <= width:
+    if text_width(text, size=size) <= width:
         return text
-    while text and text_width(f"{text}…", size=17) > width:
+    while text and text_width(f"{text}…", size=size) > width:
         text = text[:-1]
     return f"{text}…"
 

@@ -134,6 +134,14 @@ def test_the_frame_stands_below_the_strip() -> None:
     assert not np.array_equal(noticed, helped)
 
 
+def test_a_long_notice_stays_in_the_middle() -> None:
+    played = session()
+    before = play_picture(played, steps_per_s=None)
+    noticed = play_picture(played, steps_per_s=None, notice="a plan of a long name " * 12)
+    columns = np.flatnonzero(np.any(noticed != before, axis=(0, 2)))
+    assert 0 < columns[0] < 100 and abs(columns[0] + columns[-1] - 1279) <= 2
+
+
 def test_what_does_not_fit_is_shortened() -> None:
     assert _shortened("a room", 400) == "a room"
     short = _shortened("a room " * 40, 200)
