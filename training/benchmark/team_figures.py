@@ -103,7 +103,7 @@ def scaling_table(scalings: Sequence[Scaling]) -> Table:
                 *(figure(BY_KEY[key], s.others[k][key]) for key in _SHOWN),
                 figure(_TOUCHING, s.touching[k]),
                 Cell("–" if nees is None else f"{nees:.2f}"),
-                Cell(", ".join(f"{own:.2f}" for own in s.nees_each[k])),
+                Cell(", ".join("–" if np.isnan(own) else f"{own:.2f}" for own in s.nees_each[k])),
             )))  # fmt: skip
     head = (
         "agent × robots", "episodes", "time to 95 % [s]", "against one robot", "reached 95 % [%]", "ATE [cm]",

@@ -25,7 +25,7 @@ from training.benchmark.report_charts import COLOURS, scaling_charts, team_chart
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import teams_of
 from training.benchmark.team_episode import TeamJob
-from training.benchmark.team_figures import scaling_of
+from training.benchmark.team_figures import scaling_of, scaling_table
 from training.cli import main
 
 NOTHING: dict[str, Any] = {"communication": None, "range_m": None, "starts": None, "unknown_starts": False}
@@ -185,6 +185,8 @@ def test_figures_by_the_number_of_robots() -> None:
     assert found.nees_each == (pytest.approx((1.0 / 3.0,)), pytest.approx((1.0 / 3.0, 1.0, 5.0 / 3.0)))
     assert three.consistency()["nees_band_95"][1] < alone.consistency()["nees_band_95"][1]
     assert scaling_of([alone], suite="rooms") == []
+    unknown = replace(found, nees_each=((np.nan,), (1.0, np.nan, 1.25)))  # episodes of less than a second
+    assert [cells[-1].text for _, cells in scaling_table([unknown]).rows] == ["–", "1.00, –, 1.25"]
 
 
 def test_tables_and_page_show_them() -> None:
