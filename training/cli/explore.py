@@ -122,7 +122,11 @@ def explore(
         print(json.dumps(metrics, ensure_ascii=False))
     else:
         made = [single.EXTRAS[name] for name in extras]
-        files = [*single.FILES, *made] if alone else [*several.FILES, *made, *several.files_of(0)]
+        if alone:
+            files = [*single.FILES, *made]
+        else:
+            of_all = [several.LANDMARKS] if (out / several.LANDMARKS).exists() else []  # not of every backend
+            files = [*several.FILES, *of_all, *made, *several.files_of(0)]
         written = f"{out}/: {', '.join(files)}" + ("" if alone else ", … of each robot")
         print(_summary(metrics, written, single.ENDINGS[metrics["end"]]))
     if film is not None and film.failure is not None:

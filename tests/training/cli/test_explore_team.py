@@ -83,7 +83,11 @@ def test_files_of_another_episode_are_taken_away(tmp_path: Path, capsys: pytest.
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == metrics_of(tmp_path)
     assert main([*SHORT, *there]) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*SINGLE_FILES, *mine])
+    capsys.readouterr()
+    assert main([*SHORT, "--robots", "2", *there]) == 0
+    assert " landmarks.db," in capsys.readouterr().out
     assert main([*SHORT, "--robots", "2", "--slam", "odometry", *there]) == 0
+    assert " landmarks.db," not in capsys.readouterr().out
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted({*files(2), *mine} - {LANDMARKS})
 
 
