@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.views.canvas import FLOOR, WALL, Canvas, View
+from mecanum_env.views.canvas import FLOOR, WALL, Canvas, Colour, View
 from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned, with_margin
 from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_backend, write_readouts
 from slam.geometry import compose, inverse, transform_points
@@ -18,7 +18,7 @@ from slam.types import Array
 if TYPE_CHECKING:
     from mecanum_env.team.team import Team
 
-__all__ = ["COLOURS", "draw_maps", "render_team"]
+__all__ = ["COLOURS", "colour_of", "draw_maps", "render_team"]
 
 Image = NDArray[np.uint8]
 
@@ -26,9 +26,18 @@ COLOURS = (
     (180, 119, 31), (14, 127, 255), (44, 160, 44), (40, 39, 214), (189, 103, 148), (75, 86, 140), (194, 119, 227),
     (34, 189, 188),
 )  # fmt: skip
-"""Of the robots in turn, blue, green, red: Matplotlib's."""
+"""Of the first eight robots, blue, green, red: Matplotlib's."""
+
+_SHADES = ((1.0, 0.0), (0.6, 0.0), (0.5, 127.5))  # of further eights: as they are, darker, paler
 
 _TINT = 0.45  # share of the robot's colour in what it has mapped
+
+
+def colour_of(robot: int) -> Colour:
+    """Return a robot's colour, blue, green, red; the first 24 have each one of their own."""
+    share, more = _SHADES[robot // len(COLOURS) % len(_SHADES)]
+    blue, green, red = (round(share * channel + more) for channel in COLOURS[robot % len(COLOURS)])
+    return blue, green, red
 
 
 def render_team(team: Team) -> Image:
@@ -42,7 +51,7 @@ def render_team(team: Team) -> Image:
     left, right = (Canvas(panel, view) for panel in panels(frame))
     paint_plan(left, ground.plan, inverse(ground.start))
     for member, placed in zip(team.members, team.frames, strict=True):
-        colour = COLOURS[member.number % len(COLOURS)]
+        colour = colour_of(member.number)
         record = member.truth.record
         left.line(thinned(transform_points(placed, record.true_poses[:, :2]), view), colour, px=2)
         left.robot(compose(placed, member.truth.pose), member.config.robot, colour)
@@ -64,7 +73,7 @@ def _paint_believed(canvas: Canvas, team: Team) -> None:
     frames = team.frames
     _paint_maps(canvas, [member.backend.grid for member in team.members], frames)
     for member, placed in zip(team.members, frames, strict=True):
-        colour = COLOURS[member.number % len(COLOURS)]
+        colour = colour_of(member.number)
         path = transform_points(placed, member.truth.record.estimates[:, :2])
         canvas.line(thinned(path, canvas.view), colour, px=2)
         canvas.robot(compose(placed, member.backend.pose), member.config.robot, colour)
@@ -83,7 +92,7 @@ def _paint_maps(canvas: Canvas, grids: list[OccupancyGrid], frames: list[Array])
             cv2.warpAffine((classes == what).astype(np.uint8), matrix, shape[::-1], flags=cv2.INTER_NEAREST) > 0
             for what in (FREE, OCCUPIED)
         )
-        tints[free] += COLOURS[number % len(COLOURS)]
+        tints[free] += colour_of(number)
         seen += free
         walls |= occupied
     known = seen > 0

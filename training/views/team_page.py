@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mecanum_env.team.picture import COLOURS
+from mecanum_env.team.picture import colour_of
 from mecanum_env.views.canvas import View
 from mecanum_env.views.paint import extent_of_truth, with_margin
 from training.episodes.recording import Recording
@@ -79,7 +79,7 @@ def team_page(
 
 def colour(robot: int) -> str:
     """Return a robot's colour as a page has it."""
-    blue, green, red = COLOURS[robot % len(COLOURS)]
+    blue, green, red = colour_of(robot)
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 

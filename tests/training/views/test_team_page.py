@@ -49,6 +49,7 @@ def test_the_page_holds_every_robots_steps(written: Written) -> None:
         assert np.allclose(true, member.truth.record.true_poses, atol=1e-5)
         assert np.allclose(robot["frame"], frame)
         assert robot["colour"] == colour(member.number)
+    assert len({colour(k) for k in range(24)}) == 24, "told apart in teams of more than eight, too"
     assert colour(0) == "#" + "".join(f"{channel:02x}" for channel in reversed(COLOURS[0]))
 
 
