@@ -140,7 +140,7 @@ def refuse_bounds(names: Iterable[str]) -> None:
             raise ValueError(f"{name} is the fastest way of one robot, and no bound of a team's; leave it out")
 
 
-def prepare(team: TeamConfig, *, out: Path, **asked: Any) -> TeamEpisode:
+def prepare(team: TeamConfig, *, out: Path, slam: str | None = None, **asked: Any) -> TeamEpisode:
     """Check everything that can be checked, and place the robots; nothing is written.
 
     As :func:`training.episodes.explore.prepare`; ``start`` is the first robot's, ``agent`` drives each of them.
@@ -152,7 +152,7 @@ def prepare(team: TeamConfig, *, out: Path, **asked: Any) -> TeamEpisode:
     """
     with bad_input():
         files = [*FILES, LANDMARKS, EXTRAS["video"], *(name for k in range(team.robots) for name in files_of(k))]
-        world, run, plan = asked_for(out=out, files=files, **asked)
+        world, run, plan = asked_for(out=out, files=files, slam=slam, **asked)
         refuse_bounds([run["agent"]])
         if team.belief == "joint" and slam is not None and slam != JOINT_SLAM:
             # What a file has may be the default: that stands for none.
