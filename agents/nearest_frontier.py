@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.stop import StationAgent, StationsConfig, StationStop
 from slam.belief import Belief
@@ -35,10 +34,6 @@ class NearestFrontier(StationAgent, Explorer):
 
     config: NearestFrontierConfig
     config_type = NearestFrontierConfig
-
-    def choose(self, belief: Belief) -> Goal | None:
-        """Return where to go next: a station, where the robot stands on one and there is something to see."""
-        return self._hop(belief) or super().choose(belief)
 
     def _station(self, stop: StationStop) -> int:
         return int(np.argmin(np.where(stop.found.worth, stop.found.way, math.inf)))

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.base import Goal
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.lattice import in_sight
 from agents.stations.stop import StationAgent, StationsConfig, StationStop
@@ -70,10 +69,6 @@ class Tour(StationAgent, Explorer):
 
     config_type = TourConfig
     _index = 0  # of the piece that the tour begins with
-
-    def choose(self, belief: Belief) -> Goal | None:
-        """Return where to go next: a station, where the robot stands on one and there is something to see."""
-        return self._hop(belief) or super().choose(belief)
 
     def _station(self, stop: StationStop) -> int:
         return begin(stop.found, draw_luck(self.config.tries, len(stop.found.places)))

@@ -90,6 +90,10 @@ class StationAgent(Agent):
         )
         return super().act(observation, belief)  # type: ignore[safe-super]
 
+    def choose(self, belief: Belief) -> Goal | None:
+        """Return where to go next: a station, where the robot stands on one and there is something to see."""
+        return self._hop(belief) or super().choose(belief)  # type: ignore[safe-super]
+
     def looked(self, belief: Belief) -> None:
         """Take note that the sensor looked from the belief's pose."""
         super().looked(belief)
