@@ -123,9 +123,8 @@ class World:
         fixed[RASTER] = self.floor.raster
         fixed[WHEELS_X], fixed[WHEELS_Y] = wheel_positions(robot).T
         fixed[HALF_X], fixed[HALF_Y], fixed[SLIP] = 0.5 * robot.length_m, 0.5 * robot.width_m, noise.slip
-        self._fastest = max(
-            robot.max_speed_m_s, robot.max_turn_rate_rad_s * robot.circumscribed_radius_m
-        )  # [m/s] of any point of the body
+        # Speed that no point of the body exceeds on its own.
+        self.fastest_m_s = max(robot.max_speed_m_s, robot.max_turn_rate_rad_s * robot.circumscribed_radius_m)
         fixed[GRIP] = 1.0
         self._segments = np.ascontiguousarray(plan.segments, dtype=np.float64).reshape(-1, 4)
         self._circles = np.ascontiguousarray(plan.circles, dtype=np.float64).reshape(-1, 3)
@@ -247,7 +246,7 @@ class World:
         body.angular_velocity = turn / dt
         # Always the same number of parts: pymunk scales the impulses it starts from with the ratio of one step's
         # length to the last one's, and a wall struck in a short step throws the robot back in a long one.
-        return max(1, math.ceil(self._fastest * dt / MAX_TRAVEL_M))
+        return max(1, math.ceil(self.fastest_m_s * dt / MAX_TRAVEL_M))
 
     def settle(self, body: pymunk.Body, touch: Touch, dt: float, step: int) -> bool:
         """Take over where pymunk has brought the body in a physics step; tell whether anything was touched."""
@@ -316,11 +315,6 @@ class World:
     def robot_collisions(self) -> int:
         """Those of the contacts in which another robot was touched."""
         return self._contacts.with_robots
-
-    @property
-    def fastest_m_s(self) -> float:
-        """Speed that no point of the body exceeds on its own [m/s]."""
-        return self._fastest
 
     @property
     def last_impulse(self) -> float:

@@ -24,31 +24,28 @@ class TeamCoverage:
         In the frame of the team's first robot.
     frames : sequence of GroundTruth
         One a robot, in the frame of its belief: the same object where the frames are the same.
+
+    Attributes
+    ----------
+    each_step : bool
+        Whether an update costs little: where frames differ, it goes over the whole map.
+    layers : NDArray[np.bool_]
+        What each robot rightly has as free ``(robots, rows, cols)``, on the truth's raster; live.
     """
 
     def __init__(self, ground: GroundTruth, frames: Sequence[GroundTruth]) -> None:
         self._ground = ground
-        self._shared = all(frame is ground for frame in frames)
-        self._layers = np.zeros((len(frames), *ground.mappable.shape), np.bool_)
+        self.each_step = all(frame is ground for frame in frames)
+        self.layers = np.zeros((len(frames), *ground.mappable.shape), np.bool_)
         self._counts = np.zeros(ground.mappable.shape, np.uint8)
         self._covered = 0
         self._frames = tuple(frames)
-        self._cells = None if self._shared else [_same_cells(ground, frame) for frame in frames]
+        self._cells = None if self.each_step else [_same_cells(ground, frame) for frame in frames]
 
     @property
     def share(self) -> float:
         """The coverage in [0, 1]."""
         return self._covered / self._ground.mappable_cells
-
-    @property
-    def layers(self) -> NDArray[np.bool_]:
-        """What each robot rightly has as free ``(robots, rows, cols)``, on the truth's raster; live."""
-        return self._layers
-
-    @property
-    def each_step(self) -> bool:
-        """Whether an update costs little: where frames differ, it goes over the whole map."""
-        return self._shared
 
     def update(self, robot: int, changes: NDArray[np.int32] | None, grid: OccupancyGrid) -> None:
         """Take over a robot's own grid, in which these cells have changed (see ``Coverage``), or any (None)."""
@@ -60,12 +57,12 @@ class TeamCoverage:
                 layer = np.append(layer, False)[self._cells[robot]].reshape(self._counts.shape)
             layer &= self._ground.mappable
             self._counts += layer
-            self._counts -= self._layers[robot]
-            self._layers[robot] = layer
+            self._counts -= self.layers[robot]
+            self.layers[robot] = layer
             self._covered = int(np.count_nonzero(self._counts))
         else:
             row0, col0 = self._ground.lattice_origin
-            self._covered += _mark(changes, self._ground.mappable, row0, col0, self._layers[robot], self._counts)
+            self._covered += _mark(changes, self._ground.mappable, row0, col0, self.layers[robot], self._counts)
 
 
 def _same_cells(ground: GroundTruth, frame: GroundTruth) -> NDArray[np.int64]:

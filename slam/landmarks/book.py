@@ -62,8 +62,8 @@ class LandmarkBook:
         self.policy = p = policy
         self.count = 0
         self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
-        self._next_id = 0
-        self._now = 0  # updates reviewed
+        self.next_id = 0  # of the next landmark that gets its own
+        self.now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
         self._marks = np.zeros((32, MARKS))
         self._tentative = np.zeros((_TENTATIVE, 9))
@@ -88,19 +88,9 @@ class LandmarkBook:
         return self._marks[: self.count]
 
     @property
-    def now(self) -> int:
-        """The number of updates reviewed."""
-        return self._now
-
-    @property
     def ids(self) -> NDArray[np.int64]:
         """Ids ``(n,)``; an id is never used twice. A view."""
         return self._ids[: self.count]
-
-    @property
-    def next_id(self) -> int:
-        """The id of the next landmark that gets its own."""
-        return self._next_id
 
     def row(self, landmark_id: int) -> int:
         """Return the row of a landmark, or -1."""
@@ -116,18 +106,18 @@ class LandmarkBook:
         bend: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         """Append a landmark; without a known id it gets the next one. ``extent`` and ``bend``: see ``marks``."""
-        new_id = self._next_id if known_id is None else known_id
+        new_id = self.next_id if known_id is None else known_id
         if new_id < 0:
             raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
         self._make_room(self.count + 1)
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
         self._ids[self.count] = new_id
-        seen = -math.inf if kind == VIRTUAL else self._now
+        seen = -math.inf if kind == VIRTUAL else self.now
         first = kind, wrap_scalar(direction), 1.0, 0.0, 0.0, seen
         self._marks[self.count] = (*first, *extent, *bend, 0.0, 0.0, 0.0)
         self.row_of_id[new_id] = self.count
-        self._next_id = max(self._next_id, new_id + 1)
+        self.next_id = max(self.next_id, new_id + 1)
         self.count += 1
 
     def drop(self, row: int) -> None:
@@ -153,7 +143,7 @@ class LandmarkBook:
 
         ``points`` ``(n, 2)`` are the estimates: x, y, or of a wall α, r.
         """
-        return _seen_at(self._now, self._marks, self._ids, points)
+        return _seen_at(self.now, self._marks, self._ids, points)
 
     def _make_room(self, count: int) -> None:
         while count > len(self._ids):
@@ -162,10 +152,10 @@ class LandmarkBook:
 
     def count_sightings(self, match: NDArray[np.int64]) -> None:
         """Count an update in which these rows (negative: none) were seen, all of them known from outside."""
-        self._now += 1
+        self.now += 1
         seen = match[match >= 0]
         self._marks[seen, _SEEN] += 1.0
-        self._marks[seen, LAST_SEEN] = self._now
+        self._marks[seen, LAST_SEEN] = self.now
 
     def review(
         self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan | None = None, *,
@@ -179,12 +169,12 @@ class LandmarkBook:
         its first sighting. ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their
         landmarks.
         """
-        self._now += 1
+        self.now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
         seen = scan or _NO_SCAN
         count, self._tentative_count, doubtful = _review(
-            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, self._now,
+            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, self.now,
             self._marks[: self.count], self._tentative, self._tentative_count, self._limits, at_once, self._new,
         )  # fmt: skip
         return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []

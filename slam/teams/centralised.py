@@ -374,7 +374,7 @@ class _TeamBook(LandmarkBook):
         ids, size = other.ids, len(other.row_of_id)
         other._seen = np.full(size, -np.inf)
         other._seen[ids] = other.marks[:, LAST_SEEN]
-        self.count, self._next_id, self.row_of_id = other.count, other._next_id, other.row_of_id
+        self.count, self.next_id, self.row_of_id = other.count, other.next_id, other.row_of_id
         self._ids, self._marks = other._ids, other._marks
         seen = np.full(size, -np.inf)
         seen[: len(self._seen)] = self._seen

@@ -221,7 +221,7 @@ def test_what_a_team_covers_is_the_union_whatever_the_frames() -> None:
         union = np.zeros(team.ground.mappable.shape, bool)
         if known:
             for m in team.members:
-                union |= team.coverage._layers[m.number]
+                union |= team.coverage.layers[m.number]
             assert team.coverage_share == union.sum() / team.ground.mappable_cells
     assert shares[0] == pytest.approx(shares[1], abs=0.02)
 
