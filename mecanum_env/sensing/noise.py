@@ -37,7 +37,9 @@ _LANES = 4  # states side by side in _fill_raw
 
 
 class NoiseStream:
-    """Yields what ``np.random.Generator(bits)`` would yield; ``bits`` itself stays where it is.
+    """Where a stream of random numbers is: :func:`fill_normal` and :func:`fill_uniform` draw from its ``words``.
+
+    They draw what ``np.random.Generator(bits)`` would; ``bits`` itself stays where it is.
 
     Attributes
     ----------
@@ -57,14 +59,6 @@ class NoiseStream:
             if k in (1, _LANES):
                 numbers += [multiplier, offset]
         self.words = np.array([[v >> 64, v & _MASK] for v in numbers], np.uint64)
-
-    def standard_normal(self, *, out: Array) -> None:
-        """Fill ``out`` ``(n,)`` with normal numbers."""
-        fill_normal(self.words, out)
-
-    def random(self, *, out: Array) -> None:
-        """Fill ``out`` ``(n,)`` with uniform numbers in [0, 1)."""
-        fill_uniform(self.words, out)
 
 
 RandomNumbers = np.random.Generator | NoiseStream
