@@ -14,18 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Goal
-from agents.driving.control import ControlConfig
-from agents.driving.driver import Driver
+from agents.driving.driver import Driver, DriverConfig
 from agents.view_points.frontiers import FrontierConfig, Frontiers, find, frontier_cells
 from agents.view_points.gain import expected_area
 from agents.view_points.sight import Track, Watch, view_points
-from agents.view_points.troubles import PatienceConfig
-from agents.ways.cost_map import CostMap, PlannerConfig, belief_classes
-from agents.ways.giving_way import GivingWayConfig
+from agents.ways.cost_map import CostMap, belief_classes
 from agents.ways.planning import TravelCosts, travel_costs
 from slam import geometry
 from slam.belief import Belief
-from slam.settings import Config
 from slam.types import Array
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig"]
@@ -35,14 +31,10 @@ _REMOTE_RAYS = 60
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExplorerConfig(Config):
+class ExplorerConfig(DriverConfig):
     """The parts of a map-driven agent."""
 
     frontiers: FrontierConfig = field(default_factory=FrontierConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
-    control: ControlConfig = field(default_factory=ControlConfig)
-    patience: PatienceConfig = field(default_factory=PatienceConfig)
-    giving_way: GivingWayConfig = field(default_factory=GivingWayConfig)  # in a team
 
 
 @dataclass(frozen=True, eq=False)

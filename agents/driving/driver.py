@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from agents.ways.giving_way import GivingWay, GivingWayConfig
 from agents.ways.planning import TravelCosts, shortest_path
 from slam import geometry
 from slam.belief import Belief
+from slam.settings import Config
 from slam.types import Array
 
 __all__ = ["Driver", "DriverConfig"]
@@ -26,24 +28,14 @@ _LOST = 0.1  # health of a belief below which it is no good for driving
 _LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
-class DriverConfig(Protocol):
-    """What of an agent's configuration is about driving."""
+@dataclass(frozen=True, kw_only=True)
+class DriverConfig(Config):
+    """The parts of an agent that drives on the map."""
 
-    @property
-    def planner(self) -> PlannerConfig:
-        """What ways cost."""
-
-    @property
-    def control(self) -> ControlConfig:
-        """From a path to the next twist."""
-
-    @property
-    def patience(self) -> PatienceConfig:
-        """When to choose anew, and when to give up."""
-
-    @property
-    def giving_way(self) -> GivingWayConfig:
-        """To other robots of a team."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    control: ControlConfig = field(default_factory=ControlConfig)
+    patience: PatienceConfig = field(default_factory=PatienceConfig)
+    giving_way: GivingWayConfig = field(default_factory=GivingWayConfig)  # in a team
 
 
 class Driver(Agent):
