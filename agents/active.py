@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.driving.control import ControlConfig
 from agents.driving.grip import GentleFollower, SlipConfig, WheelWatch
@@ -28,7 +27,7 @@ from agents.view_points.anchoring import anchoring, marks_of, spread_m
 from agents.view_points.sightings import SensorModel, expected_sightings
 from slam.belief import Belief
 from slam.settings import Config, Count, Duration, Length, NotNegative, Positive, Rate, argument, from_mapping
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["ActiveConfig", "ActiveSlam", "DriftConfig", "LookConfig"]
 
@@ -82,7 +81,7 @@ class ActiveSlam(PpoFrontier):
         self._looked_s: float | None = 0.0  # at the start; None once it has driven off
         self._lately: deque[tuple[Array, Array]] = deque(maxlen=self._drift.steps + 1)  # poses, covariances
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action: looking first, then to the goal, slowly where the place grows unsure."""
         self._wheels.look(observation, belief)
         if self._looked_s is not None:
@@ -96,7 +95,7 @@ class ActiveSlam(PpoFrontier):
 
     # ---- looking first ---------------------------------------------------------------------------------------
 
-    def _look(self, belief: Belief) -> NDArray[np.float32]:
+    def _look(self, belief: Belief) -> Floats:
         """Stand for a step; a goal is there from the beginning, if the first scan shows one."""
         assert self._looked_s is not None
         self._keep_watch(belief)

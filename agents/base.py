@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig, StepTime, resolve
 from slam.belief import Belief
 from slam.settings import argument, checked, from_mapping
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["ENDINGS", "Agent", "Goal"]
 
@@ -109,7 +108,7 @@ class Agent(ABC):
         """Return where to go next, or ``None`` when nothing is left to explore."""
 
     @abstractmethod
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the action ``(3,)`` in [-1, 1]: the body twist vx, vy, ω as fractions of the robot's limits.
 
         Parameters
@@ -121,7 +120,7 @@ class Agent(ABC):
             What the robot believes now.
         """
 
-    def _to_action(self, twist: Array) -> NDArray[np.float32]:
+    def _to_action(self, twist: Array) -> Floats:
         speed, turn_rate = self._robot.max_speed_m_s, self._robot.max_turn_rate_rad_s
         # Three numbers: plain arithmetic takes a fraction of what array calls do.
         shares = (twist[0] / speed, twist[1] / speed, twist[2] / turn_rate)

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.driving.control import PathFollower
@@ -19,7 +18,7 @@ from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import Angle, Config, Length, Positive
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
 
@@ -129,7 +128,7 @@ class ExploreAndReturn(NearestFrontier):
 
     # ---- driving -------------------------------------------------------------------------------------------
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
         action = super().act(observation, belief)
         if self._returning and self._status == "driving":

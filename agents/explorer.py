@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.driving.driver import Driver, DriverConfig
@@ -22,7 +21,7 @@ from agents.ways.cost_map import CostMap, belief_classes
 from agents.ways.planning import TravelCosts, travel_costs
 from slam import geometry
 from slam.belief import Belief
-from slam.types import Array
+from slam.types import Array, Cells, Flags, Indices
 
 __all__ = ["Candidates", "Explorer", "ExplorerConfig"]
 
@@ -44,7 +43,7 @@ class Candidates:
     cost_map: CostMap
     travel: TravelCosts
     frontiers: Frontiers
-    cells: NDArray[np.int64]  # (m, 2) row, column of the view points
+    cells: Cells  # (m, 2) row, column of the view points
     # See Explorer._costs_asked for those that are far away.
     costs: Array  # (m,) travel cost [weighted m], inf where out of reach or given up
     current: int | None  # the piece it is driving to now, if it is still there
@@ -196,7 +195,7 @@ class Explorer(Driver):
 
     def _views(
         self, cost_map: CostMap, travel: TravelCosts, frontiers: Frontiers, watch: Watch, at_last: bool
-    ) -> tuple[NDArray[np.int64], Array]:
+    ) -> tuple[Indices, Array]:
         """Return cells ``(m, 2)`` and costs ``(m,)`` of :class:`Candidates`; take note of why none may be left."""
         config = self.config
         troubles = self._troubles.near(frontiers.targets)
@@ -222,15 +221,13 @@ class Explorer(Driver):
             costs[avoided] = np.inf
         return cells, costs
 
-    def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> NDArray[np.bool_]:
+    def _may_open(self, cost_map: CostMap, frontiers: Frontiers) -> Flags:
         """Return which pieces ``(m,)`` may show a room, narrow as they are: asked when no others are left."""
         config = self.config.frontiers
         cells = cost_map.to_cells(frontiers.targets)
         return expected_area(cost_map, cells, range_m=0.5 * config.view_range_m) >= config.opening_m2
 
-    def _too_far(
-        self, cost_map: CostMap, frontiers: Frontiers, costs: Array, asked: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
+    def _too_far(self, cost_map: CostMap, frontiers: Frontiers, costs: Array, asked: Flags) -> Flags:
         """Return which of the pieces asked about ``(m,)`` show too little for so long a way."""
         config = self.config.frontiers
         remote = np.flatnonzero(asked & np.isfinite(costs) & (costs > config.remote_m))

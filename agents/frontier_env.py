@@ -19,6 +19,7 @@ from mecanum_env.env import ExploreEnv
 from slam.belief import Belief
 from slam.files import quoted
 from slam.settings import Within, argument, checked, from_mapping
+from slam.types import Flags
 
 __all__ = ["ChoiceEnv", "ExploreFrontierEnv", "as_observation", "choice_space"]
 
@@ -77,7 +78,7 @@ class ChoiceEnv(gymnasium.Env[Observation, SupportsInt]):
         self.observation_space = cast("spaces.Space[Observation]", choice_space(driver))
         self._choice: Choice | None = None
 
-    def action_masks(self) -> NDArray[np.bool_]:
+    def action_masks(self) -> Flags:
         """Return which actions stand for a candidate ``(K,)``; the first always counts as one."""
         masks = np.arange(self.driver.choice.most) < (0 if self._choice is None else len(self._choice.index))
         masks[0] = True

@@ -17,7 +17,6 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
@@ -26,7 +25,7 @@ from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief
 from slam.settings import Length, NotNegative, Within
-from slam.types import Array, Cells
+from slam.types import Array, Cells, Flags
 
 __all__ = ["NextBestView", "NextBestViewConfig"]
 
@@ -123,7 +122,7 @@ class NextBestView(Explorer):
         return np.vstack([goal, lattice])
 
 
-def _within(cost_map: CostMap, targets: Cells, reach_m: float) -> NDArray[np.bool_]:
+def _within(cost_map: CostMap, targets: Cells, reach_m: float) -> Flags:
     """Return the cells within ``reach_m`` of one of the ``targets``: a disc laid over each of these few."""
     span = math.ceil(reach_m / cost_map.resolution)
     apart = np.ones((2 * span + 1, 2 * span + 1), dtype=np.uint8)

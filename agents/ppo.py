@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
 from agents.driving.safety import scan_shares
@@ -23,7 +22,7 @@ from slam import geometry
 from slam.belief import Belief
 from slam.grids.occupancy import FREE
 from slam.settings import Config, Duration, Gap, Length, Positive, checked, require
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["FORMAT", "SHIPPED", "Ppo", "PpoConfig", "load_drive_policy"]
 
@@ -51,7 +50,7 @@ def load_drive_policy(path: Path) -> tuple[DriveNetwork, dict[str, Any]]:
     return read_policy(path, FORMAT, _made)
 
 
-def _made(weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]) -> DriveNetwork:
+def _made(weights: Mapping[str, Floats], described: Mapping[str, Any]) -> DriveNetwork:
     told = described["planning"]
     require(set(told) == set(_PLANNING), f"planning must have {', '.join(_PLANNING)} and nothing else")
     settings = {name: checked(f"planning.{name}", kind, told[name]) for name, kind in _PLANNING.items()}
@@ -86,7 +85,7 @@ class Ppo(Agent):
         """Return the way that the network's planning layer sees on the belief's maps."""
         return _goal(self._memory.way(belief), belief)
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the network's action; what the observation lacks is drawn from the belief."""
         if self._done(belief):
             self._sent, self._goal = np.zeros(3, np.float32), None
@@ -128,7 +127,7 @@ class Ppo(Agent):
             given["scan"] = self._scan(scan.astype(np.float32))
         return seen | given
 
-    def _scan(self, scan: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _scan(self, scan: Floats) -> Floats:
         lidar = self._lidar
         if lidar.beams == BEAMS and lidar.field_of_view_deg == 360.0 and lidar.range_max_m == RANGE_M:
             return scan

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.learned.choice import CANDIDATE, STATE
@@ -18,6 +17,7 @@ from agents.learned.chooser import Chooser, ChooserConfig
 from agents.learned.policy_files import read_policy
 from slam.belief import Belief
 from slam.settings import Config, Few, argument, checked, from_mapping, require
+from slam.types import Floats
 
 __all__ = ["FORMAT", "SHIPPED", "PpoFrontier", "PpoFrontierConfig", "load_choice_policy"]
 
@@ -42,9 +42,7 @@ def load_choice_policy(path: Path) -> tuple[ChoiceEnsemble, ChooserConfig, dict[
     return network, driver, described
 
 
-def _made(
-    weights: Mapping[str, NDArray[np.float32]], described: Mapping[str, Any]
-) -> tuple[ChoiceEnsemble, ChooserConfig]:
+def _made(weights: Mapping[str, Floats], described: Mapping[str, Any]) -> tuple[ChoiceEnsemble, ChooserConfig]:
     if [described.get("candidate"), described.get("state")] != [list(CANDIDATE), list(STATE)]:
         raise ValueError("it was trained on other columns than this version shows; train it anew")
     network = ChoiceEnsemble(weights, heads=checked("heads", Few, described["heads"]))

@@ -14,6 +14,7 @@ from agents.base import Agent, Goal
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import Config, Duration, Within
+from slam.types import Floats
 
 __all__ = ["RandomAgent", "RandomConfig"]
 
@@ -48,7 +49,7 @@ class RandomAgent(Agent):
         poses = [geometry.compose(belief.pose, geometry.exp(twist * t)) for t in times]
         return Goal(pose=poses[-1], path=np.array([p[:2] for p in poses]))
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action of the walk; neither observation nor belief has a say."""
         keep = math.exp(-self._step_s / self.config.correlation_s)
         # The exact discretisation: whatever the step, the spread of the walk stays the same.

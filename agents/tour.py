@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.stations.lattice import in_sight
@@ -21,7 +20,7 @@ from agents.ways.routing import best_tour, draw_luck, tours_begun_with
 from agents.ways.travel import between
 from slam.belief import Belief
 from slam.settings import Few, Gap, NotNegative
-from slam.types import Array, Cells
+from slam.types import Array, Cells, Flags
 
 __all__ = ["Outlook", "Tour", "TourConfig"]
 
@@ -44,7 +43,7 @@ class Outlook:
     """What a tour is planned from: view points, what is seen from each, and the ways between them."""
 
     pieces: Cells  # (n,) piece of frontier that each view point belongs to
-    sight: NDArray[np.bool_]  # (n + 1, m) what each place sees of the pieces; row 0 is the robot's
+    sight: Flags  # (n + 1, m) what each place sees of the pieces; row 0 is the robot's
     distance: Array  # (n + 1, n + 1) [weighted m]
     weight: Array  # (n + 1,) price of reaching each place a metre later
 
@@ -112,7 +111,7 @@ class Tour(StationAgent, Explorer):
         self._order, _ = self._outlook.tour(self.config.tries)
         return int(owner[self._order[1] - 1])
 
-    def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> NDArray[np.bool_]:
+    def _sight(self, found: Candidates, places: Cells, pieces: Cells) -> Flags:
         """Return which pieces are in good sight from which places ``(n, m)``; none from the first, the robot's."""
         reach = self._watch_kept().range_m / found.cost_map.resolution
         targets = found.cost_map.to_cells(found.frontiers.targets[pieces])

@@ -39,7 +39,7 @@ from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.odometry.filters import make_odometry_filter
 from slam.settings import check_name
-from slam.types import Array, Odometry, Scan
+from slam.types import Array, Floats, Odometry, Scan
 
 __all__ = ["ExploreEnv"]
 
@@ -48,7 +48,7 @@ ACTIONS = {"twist": 3, "wheels": 4}
 _NOTHING = Scan(np.zeros(0), 0.0, 0.0, 0.0)
 
 
-class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+class ExploreEnv(gymnasium.Env[Observation, Floats]):
     """A mecanum robot in rooms it has never seen; see the documentation of ``mecanum_env/Explore-v0``.
 
     Parameters
@@ -172,7 +172,7 @@ class ExploreEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._remember()
         return self._info(self.own_coverage.update(backend.grid), true_pose)
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Floats) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Act for one control step; see :mod:`mecanum_env.reward` for the reward."""
         if not self._ready:
             raise RuntimeError("call reset() before step()")

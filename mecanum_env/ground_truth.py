@@ -14,7 +14,7 @@ from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError
 from mecanum_env.sensing.sensors import Lidar
 from slam.geometry import compose, inverse, transform_points, wrap_scalar
 from slam.grids.occupancy import FREE, OccupancyGrid
-from slam.types import Array, Scan
+from slam.types import Array, Flags, Indices, Scan
 
 __all__ = ["Coverage", "GroundTruth"]
 
@@ -92,7 +92,7 @@ class GroundTruth:
             grid.take_changes()
         return grid
 
-    def _surfaces(self, grid: OccupancyGrid) -> NDArray[np.bool_]:
+    def _surfaces(self, grid: OccupancyGrid) -> Flags:
         """Rasterise every surface on the lattice of ``grid``."""
         raster = np.zeros(grid.shape, np.uint8)
         to_start = inverse(self.start)
@@ -138,9 +138,7 @@ class Coverage:
         return self._right / self._truth.mappable_cells
 
 
-def on_lattice(
-    raster: NDArray[np.bool_], origin: tuple[int, int], truth: GroundTruth, margin: int = 0
-) -> NDArray[np.bool_]:
+def on_lattice(raster: Flags, origin: tuple[int, int], truth: GroundTruth, margin: int = 0) -> Flags:
     """Return a raster of the belief's lattice cut or padded to the truth's, with a margin of cells around it."""
     rows, cols = truth.mappable.shape
     out = np.zeros((rows + 2 * margin, cols + 2 * margin), bool)
@@ -153,7 +151,7 @@ def on_lattice(
     return out
 
 
-def _one_a_block(mask: NDArray[np.bool_], side: int) -> NDArray[np.int64]:
+def _one_a_block(mask: Flags, side: int) -> Indices:
     """Return for each block of ``side`` × ``side`` cells that has any the one nearest its middle: rows, columns.
 
     Of cells at the same distance it is the first by row, then by column.
@@ -186,7 +184,7 @@ def _in_frame(pose: Array, frame: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _count_right(changes: NDArray[np.int32], mappable: NDArray[np.bool_], row0: int, col0: int) -> int:
+def _count_right(changes: NDArray[np.int32], mappable: Flags, row0: int, col0: int) -> int:
     total = 0
     for k in range(changes.shape[0]):
         r, c = changes[k, 0] - row0, changes[k, 1] - col0

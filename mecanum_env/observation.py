@@ -14,11 +14,11 @@ from mecanum_env.config import EnvConfig
 from slam.backend import Backend
 from slam.gaussian.joint_gaussian import OBSERVED_LIMIT
 from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Array, Scan
+from slam.types import Array, Bytes, Floats, Scan
 
 __all__ = ["LOCAL_CELL_M", "MAP_SIZE", "draw_maps", "map_frame", "observation_space", "observe"]
 
-Observation = dict[str, NDArray[np.uint8] | NDArray[np.float32]]
+Observation = dict[str, Bytes | Floats]
 
 MAP_SIZE = 64
 """Pixels a side of either map channel."""
@@ -144,12 +144,11 @@ def draw_maps(grid: OccupancyGrid, pose: Array) -> Observation:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill(
-    map_local: NDArray[np.uint8], map_global: NDArray[np.uint8], scan_out: NDArray[np.float32],
-    pose_out: NDArray[np.float32], cov_out: NDArray[np.float32], twist_out: NDArray[np.float32],
-    progress_out: NDArray[np.float32], health_out: NDArray[np.float32], cells: NDArray[np.uint8],
-    trail: NDArray[np.uint8], rows: int, cols: int, row0: int, col0: int, resolution: float,
-    overview: NDArray[np.int32], block: int, ranges: Array, range_max: float, pose: Array, cov: Array, vx: float,
-    vy: float, omega: float, time_used: float, known_area_m2: float, health: float,
+    map_local: Bytes, map_global: Bytes, scan_out: Floats, pose_out: Floats, cov_out: Floats, twist_out: Floats,
+    progress_out: Floats, health_out: Floats, cells: Bytes, trail: Bytes, rows: int, cols: int, row0: int,
+    col0: int, resolution: float, overview: NDArray[np.int32], block: int, ranges: Array, range_max: float,
+    pose: Array, cov: Array, vx: float, vy: float, omega: float, time_used: float, known_area_m2: float,
+    health: float,
 ) -> None:  # fmt: skip
     """Fill everything but the landmarks, in one call."""
     centre_x, centre_y, half = _map_frame(row0, col0, overview.shape[1], overview.shape[2], block, resolution)
@@ -181,7 +180,7 @@ def _within(value: float, limit: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _fill_local(
-    out: NDArray[np.uint8], cells: NDArray[np.uint8], trail: NDArray[np.uint8], rows: int, cols: int, row0: int,
+    out: Bytes, cells: Bytes, trail: Bytes, rows: int, cols: int, row0: int,
     col0: int, resolution: float, x: float, y: float, theta: float,
 ) -> None:  # fmt: skip
     """Fill the robot-centred map: row 0 is farthest ahead, column 0 farthest to the left.
@@ -227,7 +226,7 @@ def _fill_local(
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)  # else it does not vectorise
 def find_row_cells(
-    x0: np.float32, y0: np.float32, along: NDArray[np.float32], offset: NDArray[np.float32],
+    x0: np.float32, y0: np.float32, along: Floats, offset: Floats,
     rows: int, cols: int, first: NDArray[np.int32], second: NDArray[np.int32], middle: NDArray[np.int32],
 ) -> None:  # fmt: skip
     """Write which cells of a grid a row of pixels looks at; all numbers are in cells.
@@ -269,7 +268,7 @@ def find_row_cells(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_global(out: NDArray[np.uint8], overview: NDArray[np.int32], block: int, x: float, y: float) -> None:
+def _fill_global(out: Bytes, overview: NDArray[np.int32], block: int, x: float, y: float) -> None:
     """Fill the whole map in the start frame: row 0 at the highest y, the overview in the middle."""
     size = out.shape[1]
     known, probability, visited = overview[0], overview[1], overview[2]

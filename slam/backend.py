@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.belief import Belief
 from slam.features.extraction import FeatureConfig, FeatureExtractor
@@ -21,7 +20,7 @@ from slam.health.relocalisation import RelocalisationConfig
 from slam.metrics.measures import nees_pose
 from slam.motion import OdometryNoise
 from slam.settings import Config, Within
-from slam.types import Array, Observations, Odometry, Scan
+from slam.types import Array, Floats, Indices, Observations, Odometry, Scan
 
 __all__ = ["Backend", "BackendConfig", "SurfaceBackend", "found_cov"]
 
@@ -191,11 +190,11 @@ class Backend(abc.ABC):
         """Number of landmarks in the map."""
         return 0
 
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+    def landmark_details(self) -> tuple[Indices, Array]:
         """Return per landmark how often it was seen ``(n,)`` and its direction [rad] (nan: unknown)."""
         return np.zeros(0, np.int64), np.zeros(0)
 
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+    def near_landmarks(self, out: Floats) -> None:
         """Write the nearest landmarks in the robot frame, nearest first.
 
         Rows of ``(k, 6)``: x, y [m], σxx, σxy, σyy [m²] of the landmark's own covariance, 1; zeros where

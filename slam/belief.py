@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import OccupancyGrid
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Belief", "Teammate"]
 
@@ -41,7 +41,7 @@ class Belief:
     pose_cov: Array  # (3, 3)
     landmarks: Array  # (n, 2) [m]
     landmark_cov: Array  # (n, 2, 2) [m²]
-    landmark_ids: NDArray[np.int64]  # (n,) never reused within an episode
+    landmark_ids: Indices  # (n,) never reused within an episode
     grid: OccupancyGrid
     joint_cov: Array | None = None  # (3 + 2n, 3 + 2n), robot first, where the backend has one
     landmark_kinds: NDArray[np.int8] = field(  # (n,) CONVEX, CONCAVE or 0 where not known

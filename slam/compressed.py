@@ -20,7 +20,6 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import read_block, state_rows
@@ -30,7 +29,7 @@ from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
 from slam.landmarks.book import MARKS
 from slam.settings import Gap, Within
-from slam.types import LINE, Array, Observations, Scan
+from slam.types import LINE, Array, Indices, Observations, Scan
 
 __all__ = ["Change", "CompressedEkfConfig", "CompressedEkfSlam"]
 
@@ -148,7 +147,7 @@ class CompressedEkfSlam(EkfSlam):
         if beyond or moved > self._leave_at or self._reach < 0.5 * self._made_for:
             self._choose_region(np.zeros(0, np.int64))
 
-    def _choose_region(self, also: NDArray[np.int64]) -> None:
+    def _choose_region(self, also: Indices) -> None:
         """Filter from now on what is near the robot, and the landmarks with these ids."""
         self._settle_beliefs()
         self._leave()
@@ -259,7 +258,7 @@ class CompressedEkfSlam(EkfSlam):
 
     # ---- the belief ----------------------------------------------------------------------------------------
 
-    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
+    def _covariance(self, landmarks: Indices) -> Array:
         if not len(self._far):
             return super()._covariance(landmarks)
         places = np.concatenate([self._near, self._far])
@@ -271,7 +270,7 @@ class CompressedEkfSlam(EkfSlam):
         read_block(p, rows, out)
         return out
 
-    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+    def _own_covariances(self, landmarks: Indices) -> Array:
         near = landmarks[landmarks < self._book.count]
         far = self._far[landmarks[len(near) :] - self._book.count]
         covs = super()._own_covariances(near)
@@ -286,10 +285,10 @@ class CompressedEkfSlam(EkfSlam):
         return np.vstack([self._book.marks, self._map_marks[self._far]]) if len(self._far) else self._book.marks
 
     @property
-    def _ids(self) -> NDArray[np.int64]:
+    def _ids(self) -> Indices:
         return np.concatenate([self._book.ids, self._map_ids[self._far]]) if len(self._far) else self._book.ids
 
-    def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
+    def _map_points(self) -> tuple[Array, Indices]:
         """Return every landmark's estimate ``(n, 2)``, the region's first, and which row an id has."""
         if not len(self._far):
             return super()._map_points()
@@ -327,7 +326,7 @@ def _copy_upper(p: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _read_rows(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+def _read_rows(p: Array, rows: Indices, out: Array) -> None:
     """Write rows of the symmetric matrix whose upper triangle is p, as many columns as ``out`` has."""
     for k in range(rows.shape[0]):
         i = rows[k]
@@ -338,7 +337,7 @@ def _read_rows(p: Array, rows: NDArray[np.int64], out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _write_rows(p: Array, a: NDArray[np.int64], b: NDArray[np.int64], block: Array, cross: Array) -> None:
+def _write_rows(p: Array, a: Indices, b: Indices, block: Array, cross: Array) -> None:
     """Write P_aa, an upper triangle, and P_ab, whose columns are the map's own, into p's upper triangle."""
     for k in range(a.shape[0]):
         i = a[k]
@@ -349,7 +348,7 @@ def _write_rows(p: Array, a: NDArray[np.int64], b: NDArray[np.int64], block: Arr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _far_blocks(p: Array, left: Array, right: Array, places: NDArray[np.int64], out: Array) -> None:
+def _far_blocks(p: Array, left: Array, right: Array, places: Indices, out: Array) -> None:
     """Write the covariances ``(m, 2, 2)`` of landmarks by themselves: P's, and what Lᵀ R adds."""
     for k in range(places.shape[0]):
         i = 3 + 2 * places[k]

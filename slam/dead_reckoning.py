@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.belief import Belief
@@ -42,7 +41,7 @@ class OdometrySlam(EkfSlam):
         self._p[:3, : self._n] = 0.0
         self._p[:3, :3] = np.eye(3) * 1e-18
 
-    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+    def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None:
         # Without limits: what is believed to be known of the pose is untrue, and scans will say so.
         self._pin()
         pose = self._x[:3].copy()

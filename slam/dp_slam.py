@@ -37,7 +37,7 @@ from slam.particles.resampling import (
 )
 from slam.particles.shared_grid import CopiedGrids, SharedGrid
 from slam.settings import Few, Gap, PositiveShare, Sigma, Within
-from slam.types import Array, Odometry, Scan
+from slam.types import Array, Indices, Odometry, Scan
 
 __all__ = ["DpSlam", "DpSlamConfig"]
 
@@ -218,7 +218,7 @@ class DpSlam(SurfaceBackend):
         error.draw(pose, tiles, np.bincount(groups, minlength=len(tiles)).astype(np.float64))
         self._drawn_from = pose.copy()
 
-    def _choose_survivors(self) -> NDArray[np.int64]:
+    def _choose_survivors(self) -> Indices:
         """Return whom each particle descends from after this update; ``resampled`` tells whether that is news."""
         n = self.config.particles
         self.n_eff = effective_particles(self._weights)
@@ -231,7 +231,7 @@ class DpSlam(SurfaceBackend):
             self._lead = int(np.argmax(self._weights))
         return ancestors
 
-    def _resample(self, ancestors: NDArray[np.int64]) -> None:
+    def _resample(self, ancestors: Indices) -> None:
         n = self.config.particles
         self._lead = int(np.flatnonzero(ancestors == self._lead)[0])
         self.grids.resample(ancestors)

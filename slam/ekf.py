@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.backend import found_cov
 from slam.gaussian import joint_gaussian as joint
@@ -36,7 +35,7 @@ from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.landmarks.wall_evidence import take_back, take_evidence
 from slam.metrics.chi_square import chi2_quantile
 from slam.motion import Twist
-from slam.types import LINE, Array, Observations, Odometry, Scan
+from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
 
@@ -205,7 +204,7 @@ class EkfSlam(HeldByMap):
             self._correct(found.rows, match)
             self._known.forget()
 
-    def _associate(self, z: Array) -> NDArray[np.int64]:
+    def _associate(self, z: Array) -> Indices:
         config, book = self.config, self._book
         if config.association == "joint":
             match = self._associate_jointly(z)
@@ -218,7 +217,7 @@ class EkfSlam(HeldByMap):
         )  # fmt: skip
         return match
 
-    def _associate_jointly(self, z: Array) -> NDArray[np.int64]:
+    def _associate_jointly(self, z: Array) -> Indices:
         config, match = self.config, self._match[: len(z)]
         joint_compatibility(
             self._x, self._p, config.lidar_offset_m, z, self._book.marks, config.landmarks.new_distance_m,
@@ -226,12 +225,12 @@ class EkfSlam(HeldByMap):
         )  # fmt: skip
         return match
 
-    def _put_off(self, z: Array, match: NDArray[np.int64]) -> bool:
+    def _put_off(self, z: Array, match: Indices) -> bool:
         """Leave out old landmarks that one match alone does not make sure, at first; tell whether there are."""
         book, sigma, offset = self._book, self.config.loop_sigma_m, self.config.lidar_offset_m
         return sigma < math.inf and put_off(self._x, self._p, offset, z, book.marks, book.now, sigma, match) > 0
 
-    def _close_loop(self, z: Array, match: NDArray[np.int64]) -> None:
+    def _close_loop(self, z: Array, match: Indices) -> None:
         """Match and correct by old landmarks, after all the others, where several of them agree."""
         config, book = self.config, self._book
         rows, closing = np.flatnonzero(match < 0), np.full(len(match), UNMATCHED)
@@ -243,16 +242,14 @@ class EkfSlam(HeldByMap):
             closing[rows] = more
             self._accept_also(z, match, closing)
 
-    def _rescue(self, z: Array, match: NDArray[np.int64]) -> None:
+    def _rescue(self, z: Array, match: Indices) -> None:
         """Match and correct by what left its gate, now that the others have put the pose right."""
         more, gates = np.empty(len(z), np.int64), self._gates
         offset, book = self.config.lidar_offset_m, self._book
         if match_missed(self._x, self._p, offset, z, book.marks, book.now, gates, match, more) > 0:
             self._accept_also(z, match, more, JOINT_LIMITS)
 
-    def _accept_also(
-        self, z: Array, match: NDArray[np.int64], more: NDArray[np.int64], limits: Array = NO_LIMITS
-    ) -> None:
+    def _accept_also(self, z: Array, match: Indices, more: Indices, limits: Array = NO_LIMITS) -> None:
         """Correct by further matches, and count them to those that there are."""
         nis, dof = self.nis, self.nis_dof
         if self._accept(z, more, limits):
@@ -260,7 +257,7 @@ class EkfSlam(HeldByMap):
             nis, dof = nis + self.nis, dof + self.nis_dof
         self.nis, self.nis_dof = nis, dof
 
-    def _allow_for_spinning_wheels(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> NDArray[np.int64]:
+    def _allow_for_spinning_wheels(self, z: Array, usual: Indices, scan: Scan) -> Indices:
         """Associate again as though the wheels had turned in vain; return ``usual`` unless that explains more.
 
         See :mod:`slam.landmarks.spinning_wheels`.
@@ -288,7 +285,7 @@ class EkfSlam(HeldByMap):
             spinning.allowed_for()
         return match if spun else usual
 
-    def _held_back(self, z: Array, usual: NDArray[np.int64], scan: Scan) -> Place | None:
+    def _held_back(self, z: Array, usual: Indices, scan: Scan) -> Place | None:
         """Return where a robot that touches something stayed while its wheels went on, by the scan alone."""
         n, spinning = self._n, self._spinning
         if not spinning.touching:
@@ -303,14 +300,14 @@ class EkfSlam(HeldByMap):
         fit = self.grid.agreement(self.sensor_pose(place.pose), scan)
         return place if spinning.surely(fit, usual_fit) else None
 
-    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
+    def _fit(self, z: Array, match: Indices, scan: Scan) -> float:
         """Correct by a match; return how well the scan fits the map from there. It is only a trial."""
         kept = self._beside.snapshot()
         self._correct(z, match)
         self._beside.restore(kept)
         return self.grid.agreement(self.sensor_pose(), scan)
 
-    def _accept(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> bool:
+    def _accept(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> bool:
         """Correct by a match, curved walls made straight; tell whether it stands: its joint NIS may be refused."""
         offset, marks, lines = self.config.lidar_offset_m, self._book.marks, self.config.lines
         if lines:
@@ -327,14 +324,14 @@ class EkfSlam(HeldByMap):
             take_back(before, marks, self._lasting)
         return stands
 
-    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+    def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None:
         """Make one stacked update of all matched observations, unless their NIS is above the limit of so many."""
         self.nis_dof, self.nis = stacked_update(
             self._x, self._p, self._n, z, match, self.config.lidar_offset_m, self._h, self._w, self._s, limits
         )
         self._beside.correct(self._n, match, self._h, self._w, self._s, self.nis_dof)
 
-    def _manage(self, z: Array, match: NDArray[np.int64], scan: Scan | None) -> None:
+    def _manage(self, z: Array, match: Indices, scan: Scan | None) -> None:
         """Tentative → confirmed → dropped (see :mod:`slam.landmarks.book`)."""
         # The start's pose is known; landmarks that had to wait would be placed by the wheels alone.
         at_once = scan is not None and self._book.now == 0

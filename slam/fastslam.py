@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.backend import BackendConfig
 from slam.belief import Belief
@@ -39,7 +38,7 @@ from slam.particles.resampling import (
     systematic,
 )
 from slam.settings import Count, NotNegative, Positive, Within
-from slam.types import Array, Indices, Observations, Odometry, Scan
+from slam.types import Array, Floats, Indices, Observations, Odometry, Scan
 
 __all__ = ["FastSlam", "FastSlam1", "FastSlam2", "FastSlamConfig"]
 
@@ -349,7 +348,7 @@ class FastSlam(LandmarkBackend):
             beyond(self._inherited.cov[None, :3, :3], self._cov[None], common_descent(self._origin, self._weights))
         return self._cov.copy()
 
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+    def near_landmarks(self, out: Floats) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
         points, covs = self._landmark_moments()
         ahead = points - self._mean[:2]

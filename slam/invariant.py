@@ -14,7 +14,6 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.compressed import Change, CompressedEkfConfig, CompressedEkfSlam
 from slam.gaussian.companions import Companions
@@ -26,7 +25,7 @@ from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
 from slam.settings import Within
-from slam.types import LINE, Array, Odometry, Scan
+from slam.types import LINE, Array, Indices, Odometry, Scan
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -78,7 +77,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
             odometry = Odometry(self._beside.corrected(odometry.numbers), odometry.dt, odometry.slip)
         super().predict(odometry)
 
-    def _correct(self, z: Array, match: NDArray[np.int64], limits: Array = NO_LIMITS) -> None:
+    def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None:
         n, w = self._n, self._w
         self.nis_dof, self.nis = invariant_update(
             self._x, self._p, n, z, match, self.config.lidar_offset_m, self._book.marks, self._h, w, self._s,
@@ -97,7 +96,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         _turn_columns(self._beside.cross, self._n, self._delta)
         self._turned += float(self._delta[2])
 
-    def _fit(self, z: Array, match: NDArray[np.int64], scan: Scan) -> float:
+    def _fit(self, z: Array, match: Indices, scan: Scan) -> float:
         turned = self._turned
         value = super()._fit(z, match, scan)
         self._turned = turned
@@ -157,7 +156,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def invariant_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, marks: Array, h: Array,
+    x: Array, p: Array, n: int, z: Array, match: Indices, offset: float, marks: Array, h: Array,
     w: Array, s: Array, delta: Array, limits: Array,
 ) -> tuple[int, float]:  # fmt: skip
     """Make one right-invariant EKF update of all observations with ``match`` ≥ 0; return the dof and the NIS.

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.files import quoted
@@ -52,7 +51,7 @@ class LandmarkBackend(Backend):
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 
-    def _rows(self, ids: Sequence[int]) -> NDArray[np.int64]:
+    def _rows(self, ids: Sequence[int]) -> Indices:
         """Return the book's row of each landmark ``(m,)``, or -1."""
         return np.array([self._book.row(i) for i in ids], np.int64)
 
@@ -85,7 +84,7 @@ class LandmarkBackend(Backend):
         """Number of confirmed landmarks, walls included."""
         return int(np.count_nonzero(self._marks[:, 0] != VIRTUAL))
 
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+    def landmark_details(self) -> tuple[Indices, Array]:
         """Return per point landmark how often it was seen and its direction in the belief's frame [rad]."""
         marks = self._marks
         marks = marks[marks[:, 0] < LINE]
@@ -107,10 +106,10 @@ class LandmarkBackend(Backend):
         return np.zeros(0, np.int64)
 
     @abc.abstractmethod
-    def _cov_with(self, rows: NDArray[np.int64]) -> Array:
+    def _cov_with(self, rows: Indices) -> Array:
         """Return the covariance ``(3 + 2k, 3 + 2k)`` of the pose and some of the book's landmarks."""
 
-    def _map_points(self) -> tuple[Array, NDArray[np.int64]]:
+    def _map_points(self) -> tuple[Array, Indices]:
         """Return every landmark's estimate ``(n, 2)``, and which row an id has."""
         return self._points, self._book.row_of_id
 

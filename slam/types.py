@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
-    "CONCAVE", "CONVEX", "LINE", "VIRTUAL", "Array", "Cells", "Floats", "Indices", "Observations", "Odometry",
-    "Scan", "Sighting",
+    "CONCAVE", "CONVEX", "LINE", "VIRTUAL", "Array", "Bytes", "Cells", "Flags", "Floats", "Indices",
+    "Observations", "Odometry", "Scan", "Sighting",
 ]  # fmt: skip
 
 Array = NDArray[np.float64]
@@ -21,7 +21,11 @@ Floats = NDArray[np.float32]
 Cells = NDArray[np.int64]
 """Rows and columns on a grid, or cells counted row by row."""
 Indices = NDArray[np.int64]
-"""Places in other arrays."""
+"""Other whole numbers: places in arrays, ids, counts."""
+Flags = NDArray[np.bool_]
+"""Of which it is so, and of which not."""
+Bytes = NDArray[np.uint8]
+"""Pictures, masks, and what else one number in 256 says."""
 
 CONVEX = 1
 """A corner that stands out into free space: the end of a wall, the edge of a cupboard."""
@@ -102,4 +106,4 @@ class Observations:
 
     range_bearing: Array  # (m, 2): range [m], bearing [rad]
     cov: Array  # (m, 2, 2): their covariance [m², m·rad, rad²], positive definite
-    ids: NDArray[np.int64] | None = None  # (m,) where the association is known, from 0 to 10⁶
+    ids: Indices | None = None  # (m,) where the association is known, from 0 to 10⁶

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Agent, Goal
 from agents.driving.control import ControlConfig, PathFollower
@@ -20,7 +19,7 @@ from agents.ways.planning import TravelCosts, shortest_path
 from slam import geometry
 from slam.belief import Belief
 from slam.settings import Config
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["Driver", "DriverConfig"]
 
@@ -75,7 +74,7 @@ class Driver(Agent):
     def _is_frontier(self, belief: Belief, point: Array) -> bool:
         """Whether there is anything left to see around the point."""
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
         if belief.health < _LOST:
             return self._wait(observation, belief)
@@ -135,7 +134,7 @@ class Driver(Agent):
         self._follower.set_path(path, None)
         return True
 
-    def _wait(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def _wait(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Stand still while the belief is lost; after a while creep to where the scan has most room.
 
         From where it stands, two places may look alike.

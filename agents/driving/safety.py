@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import clearance
 from mecanum_env.config import LidarConfig, RobotConfig
 from slam.belief import Belief
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = [
     "Guard", "LocalMap", "body_gaps", "clearance_at", "escape_twist", "footprint", "local_map", "safe_twist",
@@ -41,7 +41,7 @@ _SLACK_M = 0.002  # by which what is drawn and measured of a wall differs from s
 class LocalMap(NamedTuple):
     """Clearance around the robot: the distance [m] from each fine cell's centre to the nearest occupied edge."""
 
-    clearance: NDArray[np.float32]  # (rows, cols) [m]
+    clearance: Floats  # (rows, cols) [m]
     origin: Array  # (2,) lower-left corner of cell (0, 0) in the belief's frame [m]
     resolution: float  # [m]
 

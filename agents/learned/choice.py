@@ -25,7 +25,7 @@ from mecanum_env.config import LidarConfig
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, OCCUPIED
 from slam.settings import Config, Duration, Few, Length, Within
-from slam.types import Array, Floats
+from slam.types import Array, Bytes, Cells, Floats, Indices
 
 __all__ = ["CANDIDATE", "SIDEWAYS", "STATE", "Choice", "ChoiceConfig", "describe", "mirrored"]
 
@@ -67,8 +67,8 @@ class ChoiceConfig(Config):
 class TourPlan:
     """The best tour found over n view points, and what it takes to begin with another of them."""
 
-    cells: NDArray[np.int64]  # (n, 2) row, column of the view points
-    order: NDArray[np.int64]  # (k,) those on the tour, in its order
+    cells: Cells  # (n, 2) row, column of the view points
+    order: Indices  # (k,) those on the tour, in its order
     losses_m: Array  # (n,) of beginning with each: how much later all is seen, on average
 
 
@@ -76,10 +76,10 @@ class TourPlan:
 class Choice:
     """A choice, described: m candidates, cheapest first. Pieces of frontier that share a view point are one."""
 
-    index: NDArray[np.int64]  # (m,) of the candidate among all that were found
+    index: Indices  # (m,) of the candidate among all that were found
     candidates: Floats  # (m, CANDIDATE)
     # Share of free and of occupied, then the same in the wider patch, the frontier's normal to the right.
-    patches: NDArray[np.uint8]  # (m, 4, s, s)
+    patches: Bytes  # (m, 4, s, s)
     distances: Floats  # (m, m) travel costs between the view points [10 weighted m]
     state: Floats  # (STATE,)
 
@@ -161,7 +161,7 @@ def mirrored(choice: Choice) -> Choice:
     return replace(choice, candidates=rows, patches=np.flip(choice.patches, axis=-2))
 
 
-def _in_tour(plan: TourPlan, cells: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _in_tour(plan: TourPlan, cells: Cells) -> tuple[Array, Array, Array]:
     """Return for each view point ``(m, 2)`` whether the tour begins there, when it comes by, and the loss else.
 
     Those that the tour was not planned over, the farthest, come last and cost most.
@@ -184,7 +184,7 @@ def _sigmas(cov: Array) -> tuple[float, float]:
     return math.log10(math.sqrt(max(position, 0.0)) + 1e-4), math.log10(math.sqrt(max(heading, 0.0)) + 1e-5)
 
 
-def _apart(found: Candidates, most: int) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+def _apart(found: Candidates, most: int) -> tuple[Indices, Indices, int]:
     """Return one candidate a view point, cheapest first, and the number of pieces that are seen from each.
 
     Of several at one view point it is the one that the robot is driving to, or the first. The last number
@@ -222,7 +222,7 @@ def _landmarks_left(
 
 
 @njit(cache=True, nogil=True)
-def _first_turns(step: NDArray[np.int8], cells: NDArray[np.int64], heading: float, leg: float) -> Array:
+def _first_turns(step: NDArray[np.int8], cells: Cells, heading: float, leg: float) -> Array:
     """Return by how much the way to each cell turns off the heading at its beginning, 0 … π."""
     turns = np.zeros(len(cells))
     for i in range(len(cells)):
@@ -253,7 +253,7 @@ def _direction(vectors: Array, heading: float) -> Array:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut_patches(
     classes: NDArray[np.int8], frame: Array, targets: Array, normals: Array, cell_m: float, beyond_m: float,
-    robot: Array, out: NDArray[np.uint8],
+    robot: Array, out: Bytes,
 ) -> None:  # fmt: skip
     """Sample what is around each frontier, its normal along +x of the patch: nine points a cell."""
     rows, cols = classes.shape

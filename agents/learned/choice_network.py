@@ -11,11 +11,10 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored
 from agents.learned.layers import Layers
-from slam.types import Floats
+from slam.types import Bytes, Floats
 
 __all__ = ["ChoiceEnsemble", "ChoiceNetwork", "apart", "joined"]
 
@@ -40,7 +39,7 @@ class ChoiceNetwork(Layers):
         """Return the score of each candidate ``(m,)``; the policy takes the highest."""
         return self._scores(choice.candidates, choice.patches, choice.distances, choice.state)
 
-    def _scores(self, candidates: Floats, patches: NDArray[np.uint8], distances: Floats, state: Floats) -> Floats:
+    def _scores(self, candidates: Floats, patches: Bytes, distances: Floats, state: Floats) -> Floats:
         """Return the scores ``(…, m)`` of candidates ``(…, m, CANDIDATE)`` and patches ``(…, m, 4, s, s)``."""
         looked = patches.reshape(*patches.shape[:-3], -1).astype(np.float32) / np.float32(255.0)
         x = (

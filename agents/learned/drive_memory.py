@@ -19,11 +19,10 @@ from agents.learned.drive_plan import descend, distances, node_prices
 from agents.ways.boxes import Box, carried
 from slam.belief import Belief
 from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Array, Floats
+from slam.types import Array, Bytes, Flags, Floats
 
 __all__ = ["CELL_M", "CHANNELS", "LOG_PRICES", "MARGIN", "MapMemory", "Plan", "PlanSettings", "draw_memory"]
 
-Bytes = NDArray[np.uint8]
 
 CELL_M = 0.1
 """Side of a pixel of the memory [m], or the next power of two of the grid's cells below it."""
@@ -240,7 +239,7 @@ def _draw(log_odds: NDArray[np.int8], visited: Bytes, block: int, out: Bytes) ->
             out[3, r, c] = 0 if been else 1
 
 
-def _used(known: NDArray[np.bool_]) -> tuple[slice, slice]:
+def _used(known: Flags) -> tuple[slice, slice]:
     """Return the rows and columns in which anything is known, and a margin."""
     whole = Box(0, 0, *known.shape)
     used = Box.of(known).grown(MARGIN).within(whole)

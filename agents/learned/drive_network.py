@@ -11,15 +11,13 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.learned.drive_memory import CHANNELS, PATH_POINTS, MapMemory, Plan, PlanSettings
 from agents.learned.layers import Layers
-from slam.types import Floats
+from slam.types import Bytes, Floats
 
 __all__ = ["BEAMS", "NUMBERS", "RANGE_M", "SECTORS", "DriveNetwork", "Inputs", "sectors"]
 
-Bytes = NDArray[np.uint8]
 
 BEAMS, RANGE_M = 360, 8.0
 """The lidar that scans are taken with [beams, m]; the first beam looks backwards."""

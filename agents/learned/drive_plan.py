@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.planning import D_COL, D_ROW
-from slam.types import Floats
+from slam.types import Floats, Indices
 
 __all__ = ["EDGES", "descend", "distances", "gradient", "node_prices"]
 
@@ -135,7 +135,7 @@ def node_prices(price: Floats, length: float) -> Floats:
 
 
 @njit(cache=True, nogil=True)
-def descend(parent: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
+def descend(parent: NDArray[np.int8], row: int, col: int) -> Indices:
     """Return the pixels ``(n, 2)`` from one to the end that its distance is to."""
     rows, cols = parent.shape
     way = np.empty((rows * cols, 2), np.int64)

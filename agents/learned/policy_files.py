@@ -15,6 +15,7 @@ from safetensors.numpy import load, save
 
 from slam.files import quoted, read_bytes, read_json
 from slam.formats import atomic_write
+from slam.types import Floats
 
 __all__ = ["MOST_BYTES", "policy_format", "read_policy", "write_policy"]
 
@@ -36,7 +37,7 @@ def policy_format(path: Path) -> str:
 
 
 def read_policy(
-    path: Path, wanted: str, make: Callable[[dict[str, NDArray[np.float32]], dict[str, Any]], Made]
+    path: Path, wanted: str, make: Callable[[dict[str, Floats], dict[str, Any]], Made]
 ) -> tuple[Made, dict[str, Any]]:
     """Return what ``make`` makes of a policy's weights and of what the JSON file says, and the latter.
 
@@ -91,7 +92,7 @@ def _described(path: Path) -> dict[str, Any]:
     return described if isinstance(described, dict) else {}
 
 
-def _weights(path: Path) -> dict[str, NDArray[np.float32]]:
+def _weights(path: Path) -> dict[str, Floats]:
     try:
         weights = load(read_bytes(path, what="policy", limit=MOST_BYTES))
     except (SafetensorError, LookupError, TypeError, ValueError) as error:

@@ -18,7 +18,7 @@ from agents.learned.choice_network import apart
 from agents.learned.layers import Layers
 from agents.stations.survey import STRIDE, Openings, Survey
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Array, Cells, Floats
+from slam.types import Array, Cells, Flags, Floats
 
 __all__ = [
     "PLANES",
@@ -54,7 +54,7 @@ class Picture(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def picture(
-    known: NDArray[np.int8], visited: NDArray[np.bool_], first: tuple[int, int], cell_m: float, found: Survey
+    known: NDArray[np.int8], visited: Flags, first: tuple[int, int], cell_m: float, found: Survey
 ) -> Picture:
     """Draw what is known; arguments are those of :func:`agents.stations.survey.survey`."""
     r0, c0 = first[0] % STRIDE - _HALF, first[1] % STRIDE - _HALF  # corner of the pixel of station (0, 0)

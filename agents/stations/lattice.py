@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import FREE
-from slam.types import Array, Cells
+from slam.types import Array, Cells, Flags, Indices
 
 __all__ = ["count_in_sight", "edges", "in_sight", "join", "lengths", "line_is_free", "ways"]
 
@@ -60,7 +60,7 @@ def join(classes: NDArray[np.int8], cells: Cells, places: Cells, index: Cells, h
 
 
 @njit(cache=True, nogil=True)
-def in_sight(classes: NDArray[np.int8], cells: Cells, points: Cells, reach: float) -> NDArray[np.bool_]:
+def in_sight(classes: NDArray[np.int8], cells: Cells, points: Cells, reach: float) -> Flags:
     """Return ``(n, m)``: which points lie nearer than ``reach`` cells to a station, with a free line to it."""
     seen = np.zeros((len(cells), len(points)), dtype=np.bool_)
     for i in range(len(cells)):
@@ -72,7 +72,7 @@ def in_sight(classes: NDArray[np.int8], cells: Cells, points: Cells, reach: floa
 
 
 @njit(cache=True, nogil=True)
-def count_in_sight(classes: NDArray[np.int8], cells: Cells, points: Cells, reach: float) -> NDArray[np.int64]:
+def count_in_sight(classes: NDArray[np.int8], cells: Cells, points: Cells, reach: float) -> Indices:
     """Return ``(n,)``: how many points are in sight of each station."""
     count = np.zeros(len(cells), dtype=np.int64)
     for i in range(len(cells)):

@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
+from slam.types import Flags, Indices
 
 __all__ = ["BLIND", "SENSORS", "Rays", "look", "rays"]
 
@@ -85,7 +86,7 @@ def _line(dr: int, dc: int) -> Iterator[tuple[int, int]]:
 
 
 @njit(cache=True, nogil=True)
-def look(free: NDArray[np.bool_], row: int, col: int, sensor: Rays, known: NDArray[np.int8]) -> NDArray[np.int64]:
+def look(free: Flags, row: int, col: int, sensor: Rays, known: NDArray[np.int8]) -> Indices:
     """Write into ``known`` ``(rows, cols)`` what the sensor sees of ``free`` from a cell.
 
     Returns ``(4,)`` the first and last row and column in which a cell became known; the last ones −1 where none

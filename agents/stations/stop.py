@@ -18,7 +18,7 @@ from agents.stations.survey import HOP, STRIDE, VOXEL, Survey, find_pieces, no_p
 from slam.belief import Belief
 from slam.grids.occupancy import FREE, UNKNOWN
 from slam.settings import Config, Few, Gap, Length, OneOf, require
-from slam.types import Array
+from slam.types import Array, Cells, Flags, Floats
 
 __all__ = ["StationAgent", "StationStop", "StationsConfig"]
 
@@ -40,7 +40,7 @@ class StationStop:
     """Where the robot stands, and what there is to do. Cells are those of ``known``."""
 
     known: NDArray[np.int8]  # (rows, cols) classes of what is known, with a margin
-    visited: NDArray[np.bool_]  # (rows, cols) cells that were looked from
+    visited: Flags  # (rows, cols) cells that were looked from
     corner: Cell  # lattice row and column of the first cell
     first: Cell  # the station that the lattice goes through
     robot: Cell
@@ -61,7 +61,7 @@ class StationStop:
         x0, y0, x1, y1 = (round(value / self.resolution) for value in extent)
         return y0 - self.corner[0], x0 - self.corner[1], y1 - self.corner[0], x1 - self.corner[1]
 
-    def _point(self, cells: NDArray[np.int64]) -> Array:
+    def _point(self, cells: Cells) -> Array:
         return np.asarray((cells[..., ::-1] + np.array(self.corner[::-1]) + 0.5) * self.resolution)
 
 
@@ -76,7 +76,7 @@ class StationAgent(Agent):
         super().reset(belief, seed)
         self._began_at, self._looked_at = np.array(belief.pose[:2], dtype=np.float64), ()
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action; see :meth:`agents.base.Agent.act`.
 
         Raises

@@ -18,7 +18,7 @@ from agents.stations.lattice import edges, join, lengths, line_is_free, ways
 from agents.stations.sensor import Rays, look
 from agents.ways.routing import best_tour, draw_luck, improve, order_cost
 from slam.grids.occupancy import FREE, UNKNOWN
-from slam.types import Array, Cells
+from slam.types import Array, Cells, Flags
 
 __all__ = [
     "HOP",
@@ -36,7 +36,6 @@ __all__ = [
 ]
 
 Classes = NDArray[np.int8]
-Flags = NDArray[np.bool_]
 
 STRIDE = 10
 """Cells between two stations."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.brisk_tour import BRISK
 from agents.driving.control import ControlConfig
@@ -18,6 +17,7 @@ from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from agents.teams.crew import Crew
 from agents.teams.shared import Shared, SharingConfig
 from agents.teams.sharing import assign
+from slam.types import Indices
 
 __all__ = ["Assigned", "AssignedConfig"]
 
@@ -36,7 +36,7 @@ class Assigned(Shared, NearestFrontier):
     config: AssignedConfig
     config_type = AssignedConfig
 
-    def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
+    def _owned(self, crew: Crew, found: Candidates) -> Indices:
         """Return the column that is assigned to this robot: of each cluster the piece that it is nearest to."""
         costs = crew.held(self.config.sharing.hold_m)
         clusters = found.frontiers.target_labels[crew.pieces]

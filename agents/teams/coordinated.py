@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.brisk_tour import BRISK
 from agents.cost_utility import CostUtility, CostUtilityConfig
@@ -22,7 +21,7 @@ from agents.stations.lattice import in_sight
 from agents.teams.crew import Crew
 from agents.teams.shared import Shared, SharingConfig
 from agents.view_points.gain import expected_area
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Coordinated", "CoordinatedConfig", "pair_off"]
 
@@ -41,7 +40,7 @@ class Coordinated(Shared, CostUtility):
     config: CoordinatedConfig
     config_type = CoordinatedConfig
 
-    def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
+    def _owned(self, crew: Crew, found: Candidates) -> Indices:
         """Return the column that is paired with this robot."""
         config, cost_map = self.config, found.cost_map
         range_m = min(config.range_m, 0.8 * self._lidar.range_max_m)
@@ -60,7 +59,7 @@ class Coordinated(Shared, CostUtility):
         return np.array([column] if column >= 0 else [], dtype=np.int64)
 
 
-def pair_off(utility: Array, overlap: Array, price: Array, bound: NDArray[np.int64]) -> NDArray[np.int64]:
+def pair_off(utility: Array, overlap: Array, price: Array, bound: Indices) -> Indices:
     """Return the target that each robot goes to ``(k,)``, −1 for none.
 
     Parameters

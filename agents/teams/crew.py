@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates
 from agents.view_points.sight import view_points
 from agents.ways.giving_way import costs_from
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief, Teammate
-from slam.types import Array, Cells
+from slam.types import Array, Cells, Flags
 
 __all__ = ["Crew", "muster"]
 
@@ -33,7 +32,7 @@ class Crew:
     cells: Cells  # (n, 2) where each piece is looked at from by the robot that is nearest to it
     travel: TravelCosts  # of the first robot: from the same tree all work out the same
 
-    def of(self, kept: NDArray[np.bool_]) -> Crew:
+    def of(self, kept: Flags) -> Crew:
         """Return the crew with some of the pieces ``(n,)`` alone."""
         column = np.where(kept, np.cumsum(kept) - 1, -1)
         bound = np.where(self.bound >= 0, np.append(column, -1)[self.bound], -1)
@@ -50,7 +49,7 @@ class Crew:
 
 
 def muster(
-    belief: Belief, found: Candidates, goal: Array | None, left: NDArray[np.bool_], *, trust_s: float,
+    belief: Belief, found: Candidates, goal: Array | None, left: Flags, *, trust_s: float,
     range_m: float, beyond_m: float, same_m: float,
 ) -> Crew | None:  # fmt: skip
     """Return who is counted on, or ``None`` where this robot is alone or has nowhere to go.

@@ -17,13 +17,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.base import Goal
 from agents.teams.team_tour import TeamTour, TeamTourConfig
 from slam.belief import Belief
 from slam.settings import Config, Duration, Rate
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
 
@@ -103,7 +102,7 @@ class Rendezvous(TeamTour):
         self._target, self._meeting, self._status = self._place, True, "driving"
         return goal
 
-    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> NDArray[np.float32]:
+    def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
         self._keep_book(observation, belief)
         action = super().act(observation, belief)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.explorer import Candidates, Explorer
 from agents.teams.crew import Crew, muster
@@ -13,6 +12,7 @@ from agents.teams.sharing import FAR_M, share_tours
 from agents.ways.travel import between
 from slam.belief import Belief
 from slam.settings import Config, Duration, Few, NotNegative
+from slam.types import Indices
 
 __all__ = ["Shared", "SharingConfig"]
 
@@ -38,7 +38,7 @@ class Shared(Explorer):
         sharing: SharingConfig = getattr(self.config, "sharing", _USUAL)
         return sharing
 
-    def _owned(self, crew: Crew, found: Candidates) -> NDArray[np.int64]:
+    def _owned(self, crew: Crew, found: Candidates) -> Indices:
         """Return the crew's columns that fall to this robot: the tour that does when all are shared out."""
         config = self._sharing()
         near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]

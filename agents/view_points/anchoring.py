@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.belief import Belief
 from slam.landmarks.association import predicted
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Flags
 
 __all__ = ["Marks", "anchoring", "d_optimality", "marks_of", "spread_m"]
 
@@ -70,7 +69,7 @@ def spread_m(pose_cov: Array, lever_m: float) -> float:
     return math.sqrt(d_optimality(pose_cov * scale * scale[:, None]))
 
 
-def anchoring(marks: Marks, seen: NDArray[np.bool_], offset_m: float) -> Array:
+def anchoring(marks: Marks, seen: Flags, offset_m: float) -> Array:
     """Return how badly the landmarks in sight alone would tell the pose ``(3, 3)``: the error a map starts with.
 
     Each speaks by what is uncertain of it *relative to the robot*, H P Hᵀ. A robot that leaves its well known

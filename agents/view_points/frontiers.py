@@ -14,7 +14,7 @@ from agents.view_points.sight import Watch, in_good_sight
 from agents.ways.cost_map import CostMap
 from slam.grids.occupancy import FREE, UNKNOWN
 from slam.settings import Config, Count, Gap, Length, NotNegative, Within
-from slam.types import Array
+from slam.types import Array, Bytes, Cells, Flags, Floats, Indices
 
 __all__ = ["FrontierConfig", "Frontiers", "find", "frontier_cells"]
 
@@ -64,11 +64,11 @@ class Frontiers:
     """Frontier cells in clusters, and the pieces that the clusters are looked at in."""
 
     points: Array  # (n, 2) centres of the frontier cells [m]
-    labels: NDArray[np.int64]  # (n,) cluster of each, 0 … clusters − 1
+    labels: Indices  # (n,) cluster of each, 0 … clusters − 1
     extents: Array  # (clusters,) longer side of the bounding box [m]
     targets: Array  # (m, 2) one frontier cell's centre per piece [m]
-    target_labels: NDArray[np.int64]  # (m,) cluster of each piece
-    sizes: NDArray[np.int64]  # (m,) frontier cells in each piece
+    target_labels: Indices  # (m,) cluster of each piece
+    sizes: Indices  # (m,) frontier cells in each piece
     normals: Array  # (m, 2) unit vectors from free towards unknown; zero where they cancel
 
 
@@ -118,7 +118,7 @@ def find(cost_map: CostMap, config: FrontierConfig, watch: Watch | None = None) 
     return Frontiers(points, own, extent[large], points[chosen], own[chosen], sizes, normals[chosen])
 
 
-def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArray[np.uint8]:
+def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> Bytes:
     """Return, not 0, the cells beside unknown regions that are neither thin (inside a wall) nor small."""
     unknown = ((cost_map.classes == UNKNOWN) & ~cost_map.suspect).view(np.uint8)
     # Odd, or the opening would shift what it opens.
@@ -139,9 +139,7 @@ def _borders_a_large_pocket(cost_map: CostMap, config: FrontierConfig) -> NDArra
     return near[span:-span, span:-span]
 
 
-def _clusters(
-    cells: NDArray[np.int64], shape: tuple[int, ...], reach: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _clusters(cells: Cells, shape: tuple[int, ...], reach: int) -> tuple[Indices, Indices]:
     """Return each cell's cluster ``(n,)`` and the clusters' height and width ``(clusters, 2)``.
 
     With a ``reach`` of 1 they are 8-connected.
@@ -155,9 +153,7 @@ def _clusters(
     return labels, boxes[:count]
 
 
-def _pieces(
-    cells: NDArray[np.int64], labels: NDArray[np.int64], span: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _pieces(cells: Cells, labels: Indices, span: int) -> tuple[Indices, Indices]:
     """Split clusters along a lattice of ``span`` cells; return the middle cell's index and size of each piece."""
     if not len(cells):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -175,7 +171,7 @@ def _pieces(
     return chosen[keep], sizes[keep]
 
 
-def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
+def _normals(classes: NDArray[np.int8], cells: Cells) -> Array:
     """Return unit vectors ``(m, 2)`` (x, y) from each cell towards the unknown cells within two cells of it."""
     vector = np.zeros((len(cells), 2))
     _towards_unknown(classes, cells, vector)
@@ -184,7 +180,7 @@ def _normals(classes: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def _towards_unknown(classes: NDArray[np.int8], cells: NDArray[np.int64], vector: Array) -> None:
+def _towards_unknown(classes: NDArray[np.int8], cells: Cells, vector: Array) -> None:
     """Add up the steps (x, y) to unknown cells; beyond the grid all is as on its rim."""
     rows, cols = classes.shape
     for i in range(len(cells)):
@@ -198,9 +194,8 @@ def _towards_unknown(classes: NDArray[np.int8], cells: NDArray[np.int64], vector
 
 @njit(cache=True, nogil=True)
 def _bordering(
-    classes: NDArray[np.int8], clearance: NDArray[np.float32], suspect: NDArray[np.bool_], near: NDArray[np.uint8],
-    min_clearance: float,
-) -> NDArray[np.int64]:  # fmt: skip
+    classes: NDArray[np.int8], clearance: Floats, suspect: Flags, near: Bytes, min_clearance: float
+) -> Indices:
     """Return the FREE, unsuspected cells ``(n, 2)`` near the unknown that are no gaps in a wall, row by row."""
     cells = np.empty((1024, 2), dtype=np.int64)
     count = 0
@@ -218,9 +213,8 @@ def _bordering(
 
 @njit(cache=True, nogil=True)
 def _join(
-    cells: NDArray[np.int64], order: NDArray[np.int64], index: NDArray[np.int32], reach: int,
-    labels: NDArray[np.int64], boxes: NDArray[np.int64],
-) -> int:  # fmt: skip
+    cells: Cells, order: Indices, index: NDArray[np.int32], reach: int, labels: Indices, boxes: Indices
+) -> int:
     """Flood each cluster from its first cell in ``order``; ``index`` ``(rows, cols)`` is 0 all over."""
     rows, cols = index.shape
     for i in range(len(cells)):

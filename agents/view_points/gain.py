@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import OCCUPIED, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Cells
 
 __all__ = ["expected_area"]
 
@@ -23,7 +23,7 @@ _STEP = 0.7  # cells: less than one, so that no wall is stepped over, diagonal o
 
 
 def expected_area(
-    cost_map: CostMap, cells: NDArray[np.int64], *, range_m: float, depth_m: float = math.inf, rays: int = _RAYS
+    cost_map: CostMap, cells: Cells, *, range_m: float, depth_m: float = math.inf, rays: int = _RAYS
 ) -> Array:
     """Return the unknown area ``(m,)`` [m²] in view of a sensor that sees all round.
 
@@ -47,9 +47,7 @@ def expected_area(
 
 
 @njit(cache=True, nogil=True)
-def _cast(
-    classes: NDArray[np.int8], cells: NDArray[np.int64], reach: float, depth: float, rays: int, area: Array
-) -> None:
+def _cast(classes: NDArray[np.int8], cells: Cells, reach: float, depth: float, rays: int, area: Array) -> None:
     sector = _STEP * 2.0 * math.pi / rays
     for i in range(cells.shape[0]):
         if cells[i, 0] < 0:

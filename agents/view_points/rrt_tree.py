@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap, kind_at
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Tree", "mean_shift"]
 
@@ -44,7 +44,7 @@ class Tree:
         return self._nodes[: self._count].copy()
 
     @property
-    def parents(self) -> NDArray[np.int64]:
+    def parents(self) -> Indices:
         """Each node's parent ``(n,)``; the root is its own."""
         return self._parents[: self._count].copy()
 
@@ -79,7 +79,7 @@ class Tree:
         return np.asarray(hits[:found] * resolution + origin)
 
 
-def mean_shift(points: Array, bandwidth: float) -> NDArray[np.int64]:
+def mean_shift(points: Array, bandwidth: float) -> Indices:
     """Return the indices ``(k,)`` of one of ``points`` ``(n, 2)`` per cluster: the one nearest to its mode.
 
     A flat kernel (Comaniciu and Meer, 2002): each point moves to the mean of the points within ``bandwidth`` until
@@ -127,7 +127,7 @@ def _walk(classes: NDArray[np.int8], ax: float, ay: float, bx: float, by: float)
 
 @njit(cache=True, nogil=True)
 def _grow(
-    classes: NDArray[np.int8], nodes: Array, parents: NDArray[np.int64], count: int, goals: Array, stride: float,
+    classes: NDArray[np.int8], nodes: Array, parents: Indices, count: int, goals: Array, stride: float,
     restart: bool, hits: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Fill ``nodes``, ``parents`` and ``hits``; return how many there are of the first and the last."""
@@ -159,7 +159,7 @@ def _grow(
 
 
 @njit(cache=True, nogil=True)
-def _prune(classes: NDArray[np.int8], cells: Array, parents: NDArray[np.int64], nodes: Array) -> int:
+def _prune(classes: NDArray[np.int8], cells: Array, parents: Indices, nodes: Array) -> int:
     """Close the gaps in ``nodes`` and ``parents`` that the lost ones leave; return how many are left."""
     place = np.full(cells.shape[0], -1, dtype=np.int64)  # of each old node among the kept ones
     kept = 0
@@ -178,7 +178,7 @@ def _prune(classes: NDArray[np.int8], cells: Array, parents: NDArray[np.int64], 
 
 
 @njit(cache=True, nogil=True)
-def _shift(points: Array, bandwidth: float, modes: Array, chosen: NDArray[np.int64]) -> int:
+def _shift(points: Array, bandwidth: float, modes: Array, chosen: Indices) -> int:
     """Fill ``modes`` with one mode per cluster and ``chosen`` with the point nearest to it; return how many."""
     count = 0
     for i in range(points.shape[0]):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from agents.ways.cost_map import CostMap, kind_at
 from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
-from slam.types import Array
+from slam.types import Array, Cells, Flags, Floats, Indices
 
 __all__ = ["Track", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
 
@@ -54,7 +54,7 @@ class Track:
         self._count += 1
 
 
-def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, watch: Watch) -> NDArray[np.bool_]:
+def in_good_sight(cost_map: CostMap, cells: Cells, normals: Array, watch: Watch) -> Flags:
     """Return which frontier cells ``(n, 2)`` (row, column) were in good sight from any of the watch's poses.
 
     ``normals`` ``(n, 2)`` point from free to unknown; where one is zero, every direction is as good.
@@ -88,13 +88,13 @@ def in_good_sight(cost_map: CostMap, cells: NDArray[np.int64], normals: Array, w
 
 def first_in_good_sight(
     cost_map: CostMap,
-    cells: NDArray[np.int64],
+    cells: Cells,
     normals: Array,
     places: Array,
     worth: Array,
     least: Array,
     range_m: float,
-) -> NDArray[np.int64]:
+) -> Indices:
     """Return, for each frontier cell ``(n, 2)``, the first place that has it in good sight, −1 where none has.
 
     Parameters
@@ -121,7 +121,7 @@ def first_in_good_sight(
 
 def view_points(
     cost_map: CostMap, travel: TravelCosts, targets: Array, normals: Array, *, range_m: float, beyond_m: float
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[Indices, Array]:
     """Return, for each piece of frontier ``(m, 2)`` [m], the cheapest cell that has it in good sight.
 
     Row and column ``(m, 2)``, −1 where there is none, and the cell's travel cost ``(m,)``, there infinite.
@@ -145,9 +145,9 @@ def view_points(
 
 @njit(cache=True, nogil=True)
 def _first_seen(
-    classes: NDArray[np.int8], cells: NDArray[np.int64], normals: Array, poses: Array, first: NDArray[np.int64],
-    beyond: NDArray[np.int64], reach: float, half_view: float,
-) -> NDArray[np.int64]:  # fmt: skip
+    classes: NDArray[np.int8], cells: Cells, normals: Array, poses: Array, first: Indices,
+    beyond: Indices, reach: float, half_view: float,
+) -> Indices:  # fmt: skip
     """Return each cell's first pose, from ``first`` to before ``beyond``, that has it in good sight; or −1."""
     found = np.full(len(cells), -1, dtype=np.int64)
     for i in range(len(cells)):
@@ -191,8 +191,8 @@ def _is_free_line(classes: NDArray[np.int8], x0: float, y0: float, x1: float, y1
 
 @njit(cache=True, nogil=True)
 def _look(
-    classes: NDArray[np.int8], cost: NDArray[np.float32], targets: Array, normals: Array, reach: float,
-    beyond: float, enough: Array, cells: NDArray[np.int64], costs: Array,
+    classes: NDArray[np.int8], cost: Floats, targets: Array, normals: Array, reach: float,
+    beyond: float, enough: Array, cells: Cells, costs: Array,
 ) -> None:  # fmt: skip
     """Find the cheapest cell in sight of each target, or one that costs no more than ``enough`` of it.
 
@@ -212,8 +212,8 @@ def _look(
 
 @njit(cache=True, nogil=True)
 def _sweep(
-    classes: NDArray[np.int8], cost: NDArray[np.float32], x: float, y: float, nx: float, ny: float, reach: float,
-    push: float, blind: float, index: int, enough: float, cells: NDArray[np.int64], costs: Array,
+    classes: NDArray[np.int8], cost: Floats, x: float, y: float, nx: float, ny: float, reach: float,
+    push: float, blind: float, index: int, enough: float, cells: Cells, costs: Array,
 ) -> None:  # fmt: skip
     """Walk sight lines from ``push`` cells behind (x, y) and keep to the places that see it well.
 

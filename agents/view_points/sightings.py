@@ -18,7 +18,7 @@ from agents.ways.cost_map import CostMap, kind_at
 from mecanum_env.config import LidarConfig
 from slam.grids.occupancy import FREE
 from slam.settings import Config, Length, Positive, Sigma
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Flags
 
 __all__ = ["SensorModel", "expected_sightings"]
 
@@ -46,7 +46,7 @@ class SensorModel(Config):
 def expected_sightings(
     cost_map: CostMap, poses: Array, marks: Array, kinds: Array, ends: Array, *, lidar: LidarConfig,
     model: SensorModel, most: int,
-) -> tuple[NDArray[np.bool_], Array]:  # fmt: skip
+) -> tuple[Flags, Array]:  # fmt: skip
     """Return what is seen from each pose, and how well.
 
     Parameters
@@ -83,7 +83,7 @@ def expected_sightings(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_round(
     classes: NDArray[np.int8], frame: Array, poses: Array, marks: Array, kinds: Array, ends: Array, limits: Array,
-    most: int, seen: NDArray[np.bool_], cov: Array,
+    most: int, seen: Flags, cov: Array,
 ) -> None:  # fmt: skip
     sensor = np.empty(3)
     for k in range(poses.shape[0]):

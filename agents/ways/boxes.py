@@ -7,6 +7,8 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.types import Flags
+
 __all__ = ["NOTHING", "Box", "carried"]
 
 Kind = TypeVar("Kind", bound=np.generic)
@@ -73,7 +75,7 @@ class Box(NamedTuple):
         return [band for band in bands if not band.empty]
 
     @classmethod
-    def of(cls, marks: NDArray[np.bool_]) -> Box:
+    def of(cls, marks: Flags) -> Box:
         """Return the box around the marks of a plane ``(rows, cols)``."""
         rows, cols = np.flatnonzero(marks.any(axis=1)), np.flatnonzero(marks.any(axis=0))
         return cls(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1) if len(rows) else NOTHING

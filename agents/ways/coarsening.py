@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
+from slam.types import Bytes, Flags, Floats, Indices
 
 __all__ = ["FAR_M", "OCCUPIED_LEAST", "Blocks", "fill_blocks", "known_extent", "to_walls"]
 
@@ -36,8 +37,8 @@ class Blocks:
     """Blocks of fine cells, and a ring of unknown ones around them."""
 
     classes: NDArray[np.int8]  # (rows, cols): occupied if any fine cell is, free if most are
-    clearance: NDArray[np.float32]  # (rows, cols) [m] from the block's centre to the nearest occupied edge
-    suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
+    clearance: Floats  # (rows, cols) [m] from the block's centre to the nearest occupied edge
+    suspect: Flags  # (rows, cols) where something was hit that is not settled to be a wall
 
     @classmethod
     def blank(cls, rows: int, cols: int) -> Self:
@@ -49,7 +50,7 @@ class Blocks:
         )
 
 
-def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
+def to_walls(log_odds: NDArray[np.int8]) -> Floats:
     """Return each cell's distance to the nearest occupied cell's centre, in cells, infinite without any."""
     free_of_wall = cv2.LUT(log_odds.view(np.uint8), _NO_WALL)
     if cv2.countNonZero(free_of_wall) == free_of_wall.size:
@@ -58,7 +59,7 @@ def to_walls(log_odds: NDArray[np.int8]) -> NDArray[np.float32]:
 
 
 @njit(cache=True, nogil=True)
-def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+def known_extent(log_odds: NDArray[np.int8], visited: Bytes) -> tuple[int, int, int, int]:
     """Return the box of what is known or was visited: first row and column, and those beyond the last.
 
     Of an empty grid the first are beyond all. Each row is looked at only outside the columns that are in the box
@@ -84,7 +85,7 @@ def known_extent(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> tupl
 
 
 @njit(cache=True, nogil=True)
-def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
+def _is_blank(log_odds: NDArray[np.int8], visited: Bytes) -> bool:
     found = np.uint8(0)
     for col in range(log_odds.shape[0]):  # to the end: then it is many at a time
         found |= np.uint8(log_odds[col]) | visited[col]
@@ -93,9 +94,8 @@ def _is_blank(log_odds: NDArray[np.int8], visited: NDArray[np.uint8]) -> bool:
 
 @njit(cache=True, nogil=True)
 def fill_blocks(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], extent: Corners,
-    box: Corners, resolution: float, factor: int, row_pad: int, col_pad: int, classes: NDArray[np.int8],
-    clearance: NDArray[np.float32], suspect: NDArray[np.bool_],
+    log_odds: NDArray[np.int8], visited: Bytes, distance: Floats, extent: Corners, box: Corners, resolution: float,
+    factor: int, row_pad: int, col_pad: int, classes: NDArray[np.int8], clearance: Floats, suspect: Flags,
 ) -> None:  # fmt: skip
     """Fill a box of blocks, a row of them at a time.
 
@@ -152,8 +152,8 @@ def fill_blocks(
 
 @njit(cache=True, nogil=True)
 def _read(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], distance: NDArray[np.float32], resolution: np.float32,
-    far: np.float32, metres: NDArray[np.float32], marks: NDArray[np.int64],
+    log_odds: NDArray[np.int8], visited: Bytes, distance: Floats, resolution: np.float32,
+    far: np.float32, metres: Floats, marks: Indices,
 ) -> None:  # fmt: skip
     """Write each fine cell's clearance [m] and what it is, in a row; without branches, for many at a time."""
     half = np.float32(0.5)  # a cell: from the occupied cell's centre to its edge
@@ -169,9 +169,8 @@ def _read(
 
 @njit(cache=True, nogil=True)
 def _add(
-    metres: NDArray[np.float32], marks: NDArray[np.int64], shift: int, factor: int, totals: NDArray[np.float64],
-    counts: NDArray[np.int64],
-) -> None:  # fmt: skip
+    metres: Floats, marks: Indices, shift: int, factor: int, totals: NDArray[np.float64], counts: Indices
+) -> None:
     """Add to each block the cell of a row that lies ``shift`` cells from the block's beginning, if any."""
     first, beyond = 1 if shift < 0 else 0, (metres.shape[0] - 1 - shift) // factor + 1
     start = factor * first + shift

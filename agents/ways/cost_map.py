@@ -23,7 +23,7 @@ from mecanum_env.config import RobotConfig
 from slam.belief import Belief
 from slam.grids.occupancy import CLASS_OF, FREE, OCCUPIED, UNKNOWN
 from slam.settings import Config, Gap, NotNegative, Within
-from slam.types import Array
+from slam.types import Array, Bytes, Cells, Flags, Floats, Indices
 
 __all__ = [
     "CostMap", "CostMaps", "PlannerConfig", "belief_classes", "build", "clearance", "kind_at", "position_sigma",
@@ -65,20 +65,20 @@ class CostMap:
     """The planning grid. Row = y, column = x; its outermost ring is unknown, so that no walk leaves it."""
 
     classes: NDArray[np.int8]  # (rows, cols) UNKNOWN, FREE or OCCUPIED
-    clearance: NDArray[np.float32]  # (rows, cols) [m] from the cell's centre to the nearest occupied edge
-    weight: NDArray[np.float32]  # (rows, cols) price of a metre here, ≥ 1; 0 where the centre may not be
+    clearance: Floats  # (rows, cols) [m] from the cell's centre to the nearest occupied edge
+    weight: Floats  # (rows, cols) price of a metre here, ≥ 1; 0 where the centre may not be
     resolution: float  # [m]
     origin: tuple[float, float]  # lower-left corner of cell (0, 0) in the belief's frame [m]
     start: tuple[int, int]  # the robot's cell
-    suspect: NDArray[np.bool_]  # (rows, cols) where something was hit that is not settled to be a wall
-    plain: NDArray[np.float32]  # (rows, cols) the weight as it is for whatever robot: wherever they all stand
+    suspect: Flags  # (rows, cols) where something was hit that is not settled to be a wall
+    plain: Floats  # (rows, cols) the weight as it is for whatever robot: wherever they all stand
 
-    def to_points(self, cells: NDArray[np.int64] | Array) -> Array:
+    def to_points(self, cells: Cells | Array) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` (row, column)."""
         cells = np.asarray(cells, dtype=np.float64)
         return np.asarray((cells[:, ::-1] + 0.5) * self.resolution + np.asarray(self.origin))
 
-    def to_cells(self, points: Array) -> NDArray[np.int64]:
+    def to_cells(self, points: Array) -> Indices:
         """Return the cells ``(n, 2)`` (row, column) of points ``(n, 2)`` [m], held within the grid."""
         index = np.floor(self.in_cells(np.asarray(points))).astype(np.int64)
         limit = np.array(self.classes.shape, dtype=np.int64) - 1
@@ -105,7 +105,7 @@ def belief_classes(belief: Belief, rows: slice = _ALL, cols: slice = _ALL) -> ND
     return classes
 
 
-def clearance(log_odds: NDArray[np.int8], resolution: float) -> NDArray[np.float32]:
+def clearance(log_odds: NDArray[np.int8], resolution: float) -> Floats:
     """Return each cell's distance [m] ``(rows, cols)`` from its centre to the nearest occupied cell's edge."""
     distance = to_walls(log_odds)
     # Half a cell: from the occupied cell's centre to its edge.
@@ -126,7 +126,7 @@ class CostMaps:
         self._config, self._robot = config, robot
         self._kept: KeptBlocks | None = None
         self._box, self._levels = NOTHING, (0.0, 0.0, 0.0)  # of the weights
-        self._weight: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self._weight: Floats = np.zeros((0, 0), dtype=np.float32)
         self._passing: list[Box] = []  # where the robot was let out of where it stood, and others made it dearer
 
     def of(self, belief: Belief, sigma_m: float | None = None) -> CostMap:
@@ -169,7 +169,7 @@ class CostMaps:
         )
 
     def _beside_others(
-        self, belief: Belief, corner: tuple[float, float], resolution: float, weight: NDArray[np.float32]
+        self, belief: Belief, corner: tuple[float, float], resolution: float, weight: Floats
     ) -> list[Box]:
         """Make ways dearer where they lead through other robots; return the boxes of cells in which they do."""
         config, robot = self._config, self._robot
@@ -192,7 +192,7 @@ class CostMaps:
                 boxes.append(box)
         return boxes
 
-    def _weigh(self, blocks: Blocks, changed: list[Box], resolution: float, sigma_m: float) -> NDArray[np.float32]:
+    def _weigh(self, blocks: Blocks, changed: list[Box], resolution: float, sigma_m: float) -> Floats:
         """Return the price of a metre in each block, weighed anew where it may be another."""
         config, robot = self._config, self._robot
         assert self._kept is not None
@@ -236,7 +236,7 @@ def position_sigma(pose_cov: Array) -> float:
     return math.sqrt(max(float(mean + spread), 0.0))
 
 
-def _near_unknown(classes: NDArray[np.int8], part: Box, reach: float) -> NDArray[np.uint8]:
+def _near_unknown(classes: NDArray[np.int8], part: Box, reach: float) -> Bytes:
     """Return, not 0, the cells of a part that are nearer than ``reach`` cells to an unknown one."""
     span = math.ceil(reach)
     apart = np.ones((2 * span + 1, 2 * span + 1), dtype=np.uint8)
@@ -250,7 +250,7 @@ def _near_unknown(classes: NDArray[np.int8], part: Box, reach: float) -> NDArray
 
 @njit(cache=True, nogil=True)
 def _classify(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], table: NDArray[np.int8], classes: NDArray[np.int8]
+    log_odds: NDArray[np.int8], visited: Bytes, table: NDArray[np.int8], classes: NDArray[np.int8]
 ) -> None:
     for row in range(classes.shape[0]):
         for col in range(classes.shape[1]):
@@ -260,9 +260,8 @@ def _classify(
 
 @njit(cache=True, nogil=True)
 def _weigh_cells(
-    classes: NDArray[np.int8], wall: NDArray[np.float32], near_unknown: NDArray[np.uint8],
-    part: tuple[int, int, int, int], levels: tuple[float, float, float], near_cost: float, tight_cost: float,
-    weight: NDArray[np.float32],
+    classes: NDArray[np.int8], wall: Floats, near_unknown: Bytes, part: tuple[int, int, int, int],
+    levels: tuple[float, float, float], near_cost: float, tight_cost: float, weight: Floats,
 ) -> None:  # fmt: skip
     """Weigh a part of the cells; ``near_unknown`` is as large as that."""
     tight, comfortable, preferred = levels
@@ -283,7 +282,7 @@ def _weigh_cells(
 
 @njit(cache=True, nogil=True)
 def _free_start(
-    classes: NDArray[np.int8], wall: NDArray[np.float32], weight: NDArray[np.float32], row: int, col: int,
+    classes: NDArray[np.int8], wall: Floats, weight: Floats, row: int, col: int,
     reach: float, body: float, highest: float,
 ) -> None:  # fmt: skip
     """Let the robot out of where it stands: cells around it, never occupied ones, at the highest price."""

@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts, travel_costs, way_cells
 from mecanum_env.config import RobotConfig
 from slam.belief import Belief, Teammate
 from slam.settings import Config, Duration, Length, Rate
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
 
@@ -116,7 +115,7 @@ class GivingWay:
         return travel, (int(best[0]), int(best[1]))
 
 
-def _way(cost_map: CostMap, mate: Teammate) -> NDArray[np.int64]:
+def _way(cost_map: CostMap, mate: Teammate) -> Indices:
     """Return the cells ``(n, 2)`` that another's centre will pass over, as far as is known."""
     here = cost_map.to_cells(np.asarray(mate.pose)[None, :2])
     if mate.goal is None:

@@ -10,11 +10,11 @@ import math
 from dataclasses import fields
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.ways.boxes import NOTHING, Box, carried
 from agents.ways.coarsening import FAR_M, OCCUPIED_LEAST, Blocks, fill_blocks, known_extent, to_walls
 from slam.grids.occupancy import OccupancyGrid
+from slam.types import Floats
 
 __all__ = ["KeptBlocks"]
 
@@ -43,7 +43,7 @@ class KeptBlocks:
         self._revision = self._drawing = -1
         self._known = NOTHING  # box of what is known or visited …
         self._extent = NOTHING  # … and the robot; both in cells of the lattice
-        self._distance: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+        self._distance: Floats = np.zeros((0, 0), dtype=np.float32)
         self._frame = NOTHING  # what the distances cover, in cells of the lattice
         self.blocks, self.box = Blocks.blank(0, 0), NOTHING
 

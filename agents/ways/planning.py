@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
-from slam.types import Array
+from slam.types import Array, Bytes, Floats, Indices
 
 __all__ = [
     "D_COL", "D_ROW", "TravelCosts", "cell_before", "resample", "shortest_path", "travel_costs", "way_cells",
@@ -32,7 +32,7 @@ _ALL_BUCKETS = 2**30  # more than there are
 class TravelCosts:
     """Cost of the cheapest way from the robot to each cell, and the step that way ends with."""
 
-    cost: NDArray[np.float32]  # (rows, cols) weighted metres, inf where it cannot get
+    cost: Floats  # (rows, cols) weighted metres, inf where it cannot get
     step: NDArray[np.int8]  # (rows, cols) direction 0–7 of the last step, −1 at the start and where none is known
     beyond_m: float = math.inf  # this is the cost of all that costs at least so much: it was not searched for
 
@@ -87,7 +87,7 @@ def shortest_path(
     return resample(points[keep], spacing_m)
 
 
-def way_cells(travel: TravelCosts, cell: tuple[int, int]) -> NDArray[np.int64]:
+def way_cells(travel: TravelCosts, cell: tuple[int, int]) -> Indices:
     """Return the cells ``(n, 2)`` of the cheapest way from the robot to a cell, both included."""
     return np.asarray(_chain(travel.step, int(cell[0]), int(cell[1])))
 
@@ -103,9 +103,8 @@ def resample(path: Array, spacing_m: float) -> Array:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _dial(
-    weight: NDArray[np.float32], start_row: int, start_col: int, buckets: int, last: int,
-    cost: NDArray[np.float32], step: NDArray[np.int8],
-) -> bool:  # fmt: skip
+    weight: Floats, start_row: int, start_col: int, buckets: int, last: int, cost: Floats, step: NDArray[np.int8]
+) -> bool:
     """Fill ``cost`` in cells (not metres): the cheapest edge is 1, the width of a bucket.
 
     Bucket ``last`` and those after it are left; return whether there was none of them.
@@ -186,9 +185,7 @@ def _dial(
 
 
 @njit(cache=True, nogil=True)
-def _to_metres(
-    cost: NDArray[np.float32], resolution: np.float32, reached: NDArray[np.uint8], beyond: np.float32
-) -> None:
+def _to_metres(cost: Floats, resolution: np.float32, reached: Bytes, beyond: np.float32) -> None:
     """Turn cells into metres, and what is unknown into ``beyond`` where it was ``reached``: 2."""
     for row in range(cost.shape[0]):
         for col in range(cost.shape[1]):
@@ -197,7 +194,7 @@ def _to_metres(
 
 
 @njit(cache=True, nogil=True)
-def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _ahead() -> tuple[Indices, Indices]:
     """Return the neighbours to look at after each step ``(9, 8)``, in order, and how many; last the start's.
 
     Where a step has come from needs no look: the cell itself, and the two on either side of it, which are its
@@ -216,7 +213,7 @@ def _ahead() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 @njit(cache=True, nogil=True)
-def _edges(ahead: NDArray[np.int64], cols: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _edges(ahead: Indices, cols: int) -> tuple[Indices, Indices, Array]:
     """Return where the neighbours lie ``(9, 8)``, and the two cells beside each step ``(9, 8, 2)``, by index.
 
     And half the length of each step ``(9, 8)``.
@@ -241,7 +238,7 @@ def cell_before(step: NDArray[np.int8], row: int, col: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
+def _chain(step: NDArray[np.int8], row: int, col: int) -> Indices:
     cells = [(row, col)]
     while step[row, col] >= 0:
         row, col = cell_before(step, row, col)
@@ -251,7 +248,7 @@ def _chain(step: NDArray[np.int8], row: int, col: int) -> NDArray[np.int64]:
 
 @njit(cache=True, nogil=True)
 def _segment(
-    a: Array, b: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
+    a: Array, b: Array, weight: Floats, wall: Floats, resolution: float, origin: Array
 ) -> tuple[float, float]:
     """Price of the straight line a–b (inf where it leaves passable cells, or the map) and its least clearance."""
     length = math.hypot(b[0] - a[0], b[1] - a[1])
@@ -271,9 +268,7 @@ def _segment(
 
 
 @njit(cache=True, nogil=True)
-def _cut_straight(
-    points: Array, weight: NDArray[np.float32], wall: NDArray[np.float32], resolution: float, origin: Array
-) -> NDArray[np.int64]:
+def _cut_straight(points: Array, weight: Floats, wall: Floats, resolution: float, origin: Array) -> Indices:
     """Return the indices of the points to keep."""
     n = points.shape[0]
     keep = np.empty(n, dtype=np.int64)

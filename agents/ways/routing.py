@@ -9,13 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from slam.types import Array, Indices
+from slam.types import Array, Flags, Indices
 
 __all__ = ["best_tour", "cover", "draw_luck", "improve", "nearest_order", "order_cost", "tours_begun_with"]
-
-Sight = NDArray[np.bool_]
 
 _MOST_ROUNDS = 100  # of improvement: each makes the tour shorter, so that this is never reached in practice
 _LEAST = 1e-7  # [m] an improvement
@@ -104,7 +101,7 @@ def _move(order: Indices, first: int, length: int, at: int, turned: bool, out: I
 
 
 @njit(cache=True, nogil=True)
-def cover(sight: Sight, rank: Array, luck: Array) -> Indices:
+def cover(sight: Flags, rank: Array, luck: Array) -> Indices:
     """Return places that together see all that any place sees, place 0 (the robot's) left out.
 
     Greedily: most that none of the others sees, times the place's ``luck`` ``(n,)``; of equals, lowest ``rank``.
@@ -142,7 +139,7 @@ def draw_luck(tries: int, places: int) -> Array:
 
 
 @njit(cache=True, nogil=True)
-def best_tour(sight: Sight, distance: Array, weight: Array, luck: Array) -> tuple[Indices, float]:
+def best_tour(sight: Flags, distance: Array, weight: Array, luck: Array) -> tuple[Indices, float]:
     """Return places in the order of the best tour found from place 0, and what it costs.
 
     Parameters
@@ -174,7 +171,7 @@ def best_tour(sight: Sight, distance: Array, weight: Array, luck: Array) -> tupl
 
 
 @njit(cache=True, nogil=True)
-def tours_begun_with(sight: Sight, distance: Array, weight: Array, tour: Indices) -> Array:
+def tours_begun_with(sight: Flags, distance: Array, weight: Array, tour: Indices) -> Array:
     """Return what a tour costs that begins with each place ``(n,)``, 0 for place 0.
 
     Each is ``tour`` with that place put first, those left out that then see nothing alone, and the rest in a
@@ -195,7 +192,7 @@ def tours_begun_with(sight: Sight, distance: Array, weight: Array, tour: Indices
 
 
 @njit(cache=True, nogil=True)
-def _without_idle(sight: Sight, places: Indices) -> Indices:
+def _without_idle(sight: Flags, places: Indices) -> Indices:
     """Return the places without those, the first aside, that see nothing but what others of them see."""
     count = _seen_by(sight, places)
     kept = np.ones(len(places), dtype=np.bool_)
@@ -212,7 +209,7 @@ def _without_idle(sight: Sight, places: Indices) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def _seen_by(sight: Sight, places: Indices) -> Indices:
+def _seen_by(sight: Flags, places: Indices) -> Indices:
     """Return how many of the places on a tour see each piece ``(m,)``."""
     count = np.zeros(sight.shape[1], dtype=np.int64)
     for k in range(len(places)):
@@ -222,7 +219,7 @@ def _seen_by(sight: Sight, places: Indices) -> Indices:
 
 
 @njit(cache=True, nogil=True)
-def _exchange(sight: Sight, distance: Array, weight: Array, places: Indices) -> bool:
+def _exchange(sight: Flags, distance: Array, weight: Array, places: Indices) -> bool:
     """Exchange each place of a tour, in place, for the best that sees what only it does; return if any was."""
     count = _seen_by(sight, places)
     exchanged = False

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts, cell_before, travel_costs
-from slam.types import Array
+from slam.types import Array, Cells, Floats
 
 __all__ = ["between"]
 
 _CELLS = 100_000  # that may be searched for exact costs in one call: some 5 ms
 
 
-def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64], *, searched: int = _CELLS) -> Array:
+def between(cost_map: CostMap, travel: TravelCosts, cells: Cells, *, searched: int = _CELLS) -> Array:
     """Return the travel costs ``(n, n)`` [weighted m] between reachable cells ``(n, 2)``, the robot's first.
 
     The way back along the tree of shortest ways from the robot is one that exists; it is the shortest wherever
@@ -35,7 +35,7 @@ def between(cost_map: CostMap, travel: TravelCosts, cells: NDArray[np.int64], *,
 
 
 @njit(cache=True, nogil=True)
-def _along_tree(cost: NDArray[np.float32], step: NDArray[np.int8], cells: NDArray[np.int64]) -> Array:
+def _along_tree(cost: Floats, step: NDArray[np.int8], cells: Cells) -> Array:
     n = len(cells)
     out = np.zeros((n, n))
     passed = np.zeros(cost.shape, dtype=np.int32)  # by the way to which place, from 1; zeros take no time

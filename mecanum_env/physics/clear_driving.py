@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mecanum_env.physics.robot import INCREMENTS, STATE_SIZE, motor_constants, turn_wheels
 from slam.geometry import wrap_scalar
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = [
     "CONSTANTS", "FIXED_SIZE", "GRIP", "HALF_X", "HALF_Y", "LOST", "MOTION", "RADII", "RASTER", "SLIP",
@@ -42,7 +40,7 @@ FIXED_SIZE = 32
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def wheel_step(work: Array, fixed: Array, friction: NDArray[np.float32], h: float, substeps: int) -> None:
+def wheel_step(work: Array, fixed: Array, friction: Floats, h: float, substeps: int) -> None:
     """Run :func:`turn_wheels` over a physics step with the μ that the wheels stand on at its start."""
     state, raster, mu, grip = work[STATE], fixed[RASTER], work[MU], fixed[GRIP]
     wheels_x, wheels_y = fixed[WHEELS_X], fixed[WHEELS_Y]
@@ -88,7 +86,7 @@ def _box_is_clear(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def drive_clear(
-    work: Array, fixed: Array, friction: NDArray[np.float32], clearance: NDArray[np.float32], segments: Array,
+    work: Array, fixed: Array, friction: Floats, clearance: Floats, segments: Array,
     circles: Array, dt: float, substeps: int, steps: int, readings: Array,
 ) -> int:  # fmt: skip
     """Run up to ``steps`` physics steps for as long as nothing can be touched in them.

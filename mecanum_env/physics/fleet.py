@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mecanum_env.physics.collisions import add_robots, build_space
 from mecanum_env.physics.world import World, divide
 from mecanum_env.rooms.floor_plan import FloorPlanError
-from slam.types import Array
+from slam.types import Array, Flags
 
 __all__ = ["Fleet", "outlines"]
 
@@ -69,7 +69,7 @@ class Fleet:
                 at = ", ".join(f"{v:.2f}" for v in self.worlds[k].pose)
                 raise FloorPlanError(f"robot {k} touches something at its start ({at}); choose another")
 
-    def near_others(self, duration_s: float) -> NDArray[np.bool_]:
+    def near_others(self, duration_s: float) -> Flags:
         """Return which robots ``(n,)`` may touch another within a time [s]."""
         xy = np.array([world.pose[:2] for world in self.worlds])
         apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
@@ -89,7 +89,7 @@ class Fleet:
             self._step_together(np.flatnonzero(near).tolist(), before, wheel_targets, step_s, physics_step_s)
 
     def _step_together(
-        self, near: list[int], before: NDArray[np.bool_], wheel_targets: Sequence[ArrayLike], step_s: float,
+        self, near: list[int], before: Flags, wheel_targets: Sequence[ArrayLike], step_s: float,
         physics_step_s: float,
     ) -> None:  # fmt: skip
         """Step those that are near others; what they touched lasts of those that were so ``before``."""

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from mecanum_env.config import NoiseConfig
-from slam.types import Array
+from slam.types import Array, Floats
 
 if TYPE_CHECKING:
     from mecanum_env.rooms.floor_plan import FloorPlan
@@ -26,8 +25,8 @@ _PATCH_RADIUS_M = (0.25, 0.8)
 class Floor:
     """What a raster over the plan knows of the places a robot may come to."""
 
-    friction: NDArray[np.float32]  # (rows, cols) μ
-    clearance: NDArray[np.float32]  # (rows, cols) [m]: no surface is nearer to any point of the cell
+    friction: Floats  # (rows, cols) μ
+    clearance: Floats  # (rows, cols) [m]: no surface is nearer to any point of the cell
     patches: Array  # (p, 4) slippery discs: x, y, radius [m], μ
     raster: Array  # (3,) world x, y of the lower-left corner, cells per metre
 
@@ -95,9 +94,7 @@ def _segment_samples(segments: Array, spacing: float) -> Array:
     return out
 
 
-def _draw_patches(
-    plan: FloorPlan, noise: NoiseConfig, rng: np.random.Generator, friction: NDArray[np.float32]
-) -> Array:
+def _draw_patches(plan: FloorPlan, noise: NoiseConfig, rng: np.random.Generator, friction: Floats) -> Array:
     """Draw slippery discs into ``friction`` until they cover their share of the free cells; return them."""
     rows, cols = plan.free.shape
     x0, y0 = plan.origin

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
@@ -17,12 +16,11 @@ from mecanum_env.rooms.layout.furniture import CELL_M
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.smooth_outline import facets, level_loops, rasterise, signed_area
 from slam.settings import Config, Share, Span, require
-from slam.types import Array
+from slam.types import Array, Bytes, Flags, Floats
 
 __all__ = ["CaveConfig", "cave"]
 
-Field = NDArray[np.float32]  # single precision: a quarter of a million cells, and half a hundred passes over them
-Mask = NDArray[np.bool_]
+Field = Floats  # single precision: a quarter of a million cells, and half a hundred passes over them
 
 _ATTEMPTS = 60
 _AREA_WIDTH = 1.05  # of area_m2: its upper limit by the lower, at least
@@ -209,13 +207,13 @@ def _drivable(field: Field) -> Array | None:
     return np.asarray(cv2.GaussianBlur(signed, (0, 0), _BLUR_CELLS), np.float64)
 
 
-def _rolled(free: Mask) -> Mask | None:
+def _rolled(free: Flags) -> Flags | None:
     """Return what a disc sweeps that rolls through the largest part of free space it can."""
     reach = largest_part(clearance_of(free, CELL_M) >= _DISC_M)
     return None if reach is None else np.asarray(_distance(~reach) <= _DISC_M)
 
 
-def _distance(mask: Mask | NDArray[np.uint8]) -> Field:
+def _distance(mask: Flags | Bytes) -> Field:
     """Return how far [m] each cell of a mask is from the nearest one that is not of it."""
     return np.asarray(distance_to_zero(mask) * CELL_M, np.float32)
 
@@ -233,7 +231,7 @@ def _walls(field: Array) -> tuple[Array, tuple[int, int]]:
     return walls, (int(size[0]), int(size[1]))
 
 
-def _pillars(free: Mask, config: CaveConfig, rng: np.random.Generator) -> Array:
+def _pillars(free: Flags, config: CaveConfig, rng: np.random.Generator) -> Array:
     """Return round pillars ``(n, 3)``: x, y, radius [m], that can be driven around."""
     pillars = np.zeros((0, 3))
     for _ in range(int(rng.integers(config.pillars[0], config.pillars[1] + 1))):
@@ -247,7 +245,7 @@ def _pillars(free: Mask, config: CaveConfig, rng: np.random.Generator) -> Array:
     return pillars
 
 
-def _under(pillars: Array, size: tuple[int, int]) -> Mask:
+def _under(pillars: Array, size: tuple[int, int]) -> Flags:
     """Cells whose centres pillars stand on."""
     x, y = (np.arange(n) + 0.5 for n in size)
     mask = np.zeros(size[::-1], np.bool_)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mecanum_env.rooms.outlines.corners import find_corners
 from mecanum_env.rooms.outlines.distance import distance_to_zero
-from slam.types import Array
+from slam.types import Array, Flags, Floats
 
 __all__ = ["FloorPlan", "FloorPlanError", "clearance_of"]
 
@@ -27,7 +27,7 @@ class FloorPlanError(ValueError):
     """A plan that cannot be used: no free space, a start inside a wall, a damaged file."""
 
 
-def clearance_of(free: NDArray[np.bool_], resolution: float) -> NDArray[np.float32]:
+def clearance_of(free: Flags, resolution: float) -> Floats:
     """Return the distance [m] from each free cell's centre to the nearest edge of a non-free cell.
 
     What lies outside the raster counts as not free. The value is exact in front of walls along the cells and at
@@ -59,7 +59,7 @@ class FloorPlan:
     walls: Array  # (w, 4) segments x1, y1, x2, y2
     polygons: tuple[Array, ...] = ()  # obstacles: (k, 2) vertices each, convex; kept counter-clockwise
     circles: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) obstacles: x, y, radius
-    free: NDArray[np.bool_]  # (rows, cols) True where a point is in free space; row 0 at the lowest y
+    free: Flags  # (rows, cols) True where a point is in free space; row 0 at the lowest y
     resolution: float  # [m] of a cell of ``free``
     origin: tuple[float, float] = (0.0, 0.0)  # world position of the lower-left corner of cell (0, 0)
     start: tuple[float, float, float]  # x, y, θ: a pose in which the robot touches nothing
@@ -148,29 +148,29 @@ class FloorPlan:
         """Area of free space [m²]."""
         return float(np.count_nonzero(self.free)) * self.resolution**2
 
-    def is_free(self, points: Array) -> NDArray[np.bool_]:
+    def is_free(self, points: Array) -> Flags:
         """Return for points ``(n, 2)`` [m] whether each lies in a free cell ``(n,)``; outside the raster: no."""
         x, y = ((np.asarray(points, np.float64).reshape(-1, 2) - self.origin) / self.resolution).T
         rows, cols = self.free.shape
         # Compared as floats: a far-away or NaN point must not wrap round in the conversion to integers.
-        found: NDArray[np.bool_] = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
+        found: Flags = (x >= 0) & (x < cols) & (y >= 0) & (y < rows)
         found[found] = self.free[y[found].astype(np.int64), x[found].astype(np.int64)]
         return found
 
-    def clearance(self) -> NDArray[np.float32]:
+    def clearance(self) -> Floats:
         """Return for each cell ``(rows, cols)`` the distance [m] to the nearest non-free cell (a fresh array).
 
         See :func:`clearance_of`.
         """
         return clearance_of(self.free, self.resolution)
 
-    def reachable(self, clearance_m: float, start: Array) -> NDArray[np.bool_]:
+    def reachable(self, clearance_m: float, start: Array) -> Flags:
         """Return which cells ``(rows, cols)`` have a clearance [m] and hang together with a start ``(≥ 2,)`` [m].
 
         The start may stand nearer to a surface than that: what counts is the cell with that clearance that is
         nearest to it. Where no cell has it, none is reachable.
         """
-        roomy: NDArray[np.bool_] = self.clearance() >= clearance_m
+        roomy: Flags = self.clearance() >= clearance_m
         rows, cols = roomy.shape
         dx = (np.arange(cols) + 0.5) * self.resolution + self.origin[0] - start[0]
         dy = (np.arange(rows) + 0.5) * self.resolution + self.origin[1] - start[1]

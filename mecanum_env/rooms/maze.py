@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, clearance_of
 from mecanum_env.rooms.layout.assembly import START_M, choose_start, generator, unreached
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, cells
 from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
 from slam.settings import Config, Share, Span
+from slam.types import Flags
 
 __all__ = ["Grid", "MazeConfig", "draw_grid", "maze"]
 
@@ -36,8 +36,8 @@ class MazeConfig(Config):
 class Grid:
     """Which neighbouring cells of a maze are open to each other."""
 
-    east: NDArray[np.bool_]  # (rows, columns - 1): from (row, column) to (row, column + 1)
-    north: NDArray[np.bool_]  # (rows - 1, columns): from (row, column) to (row + 1, column)
+    east: Flags  # (rows, columns - 1): from (row, column) to (row, column + 1)
+    north: Flags  # (rows - 1, columns): from (row, column) to (row + 1, column)
 
 
 def maze(config: MazeConfig, *, seed: int) -> FloorPlan:

@@ -18,7 +18,7 @@ from mecanum_env.sensing.noise import NoiseStream, RandomNumbers, fill_normal, f
 from mecanum_env.sensing.raycast import beam_directions, cast_rays
 from mecanum_env.sensing.slip import add_up, follow, mean_of_slipperiest, slipperiest, spread, traction_constants
 from slam.odometry.filters import OdometryFilter
-from slam.types import Array, Odometry, Scan
+from slam.types import Array, Flags, Odometry, Scan
 
 __all__ = ["FilteredEncoders", "Lidar", "WheelEncoders"]
 
@@ -70,7 +70,7 @@ def _noisy_sweep(
 @njit(cache=True, nogil=True)
 def _without(
     bodies: Array, segments: Array, circles: Array, pose: Array, directions: Array, limits: Array, ranges: Array,
-    seen: NDArray[np.bool_],
+    seen: Flags,
 ) -> None:  # fmt: skip
     """Write NaN for the ranges of beams that come back from bodies, and tell of which bodies some do."""
     offset, angle_min, angle_increment, range_max = limits[0], limits[1], limits[2], limits[3]
@@ -150,7 +150,7 @@ class Lidar:
 
     def without(
         self, bodies: Array, segments: Array, circles: Array, pose: Array, scan: Scan
-    ) -> tuple[Scan, NDArray[np.bool_]]:
+    ) -> tuple[Scan, Flags]:
         """Return a scan with NaN for each beam that a body sent back, and of which bodies ``(n,)`` there are such.
 
         Parameters

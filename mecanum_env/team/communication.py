@@ -6,17 +6,16 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.team.config import CommunicationConfig
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["groups", "walls_between"]
 
 
-def groups(config: CommunicationConfig, places: Array, plan: FloorPlan) -> NDArray[np.int64]:
+def groups(config: CommunicationConfig, places: Array, plan: FloorPlan) -> Indices:
     """Return for each robot ``(n,)`` the number of its group: those that hear each other, directly or by others.
 
     Parameters

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mecanum_env.ground_truth import GroundTruth, on_lattice
 from slam.geometry import inverse, transform_points
 from slam.grids.occupancy import FREE, OccupancyGrid
+from slam.types import Bytes, Flags, Indices
 
 __all__ = ["TeamCoverage"]
 
@@ -65,7 +66,7 @@ class TeamCoverage:
             self._covered += _mark(changes, self._ground.mappable, row0, col0, self.layers[robot], self._counts)
 
 
-def _same_cells(ground: GroundTruth, frame: GroundTruth) -> NDArray[np.int64]:
+def _same_cells(ground: GroundTruth, frame: GroundTruth) -> Indices:
     """Return for each cell of ``ground`` the index of the same place in another frame's raster, or its size."""
     rows, cols = ground.mappable.shape
     row0, col0 = ground.lattice_origin
@@ -81,10 +82,7 @@ def _same_cells(ground: GroundTruth, frame: GroundTruth) -> NDArray[np.int64]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _mark(
-    changes: NDArray[np.int32], mappable: NDArray[np.bool_], row0: int, col0: int, layer: NDArray[np.bool_],
-    counts: NDArray[np.uint8],
-) -> int:  # fmt: skip
+def _mark(changes: NDArray[np.int32], mappable: Flags, row0: int, col0: int, layer: Flags, counts: Bytes) -> int:
     """Take over changed cells of one robot; return by how many cells the team's coverage went up."""
     gained = 0
     for k in range(changes.shape[0]):

@@ -23,7 +23,7 @@ from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.teams.apart import Start
 from slam.teams.centralised import JointMember
-from slam.types import Array, Scan, Sighting
+from slam.types import Array, Floats, Scan, Sighting
 
 __all__ = ["Member", "member_observation_space"]
 
@@ -126,7 +126,7 @@ class Member(ExploreEnv):
             self._remember()  # its map is another one now
         return coverage
 
-    def wheel_targets(self, action: NDArray[np.float32]) -> Array:
+    def wheel_targets(self, action: Floats) -> Array:
         """Return the wheels' speeds ``(4,)`` [rad/s] that an action asks for."""
         return np.asarray(self._to_wheels(action), np.float64)
 
@@ -179,7 +179,7 @@ class Member(ExploreEnv):
         measured = np.array([math.hypot(dx, dy) + off[0], bearing, wrap_scalar(other_theta - theta + off[2])])
         return Sighting(other, measured, self._sighting_cov)
 
-    def _observed_teammates(self) -> NDArray[np.float32]:
+    def _observed_teammates(self) -> Floats:
         rows = [[0.0] * 6] * (self._team.robots - 1)
         x, y, theta = self._pose.tolist()
         c, s = math.cos(theta), math.sin(theta)

@@ -7,7 +7,6 @@ from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from mecanum_env.arguments import check_arguments
 from mecanum_env.observation import Observation
@@ -17,7 +16,7 @@ from mecanum_env.team.team import Team
 from slam.belief import Belief
 from slam.files import quoted
 from slam.settings import check_name, require
-from slam.types import Array
+from slam.types import Array, Bytes, Floats
 
 try:
     from pettingzoo import ParallelEnv
@@ -28,7 +27,7 @@ except ImportError as error:
 
 __all__ = ["ExploreParallelEnv"]
 
-Action = NDArray[np.float32]
+Action = Floats
 
 
 class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore[misc]
@@ -128,7 +127,7 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
         )
         self.member(agent).knowledge.goal = place
 
-    def render(self) -> NDArray[np.uint8] | None:
+    def render(self) -> Bytes | None:
         """Return the true plan with all robots beside what they have mapped together, as an RGB image."""
         self._check_begun()
         return render_team(self.team) if self.render_mode == "rgb_array" else None

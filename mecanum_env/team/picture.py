@@ -6,21 +6,20 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.views.canvas import FLOOR, WALL, Canvas, Colour, View
 from mecanum_env.views.paint import UNSEEN, extent_of_truth, paint_plan, thinned, with_margin
 from mecanum_env.views.render import blank_frame, panels, view_of_truth, write_backend, write_readouts
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
-from slam.types import Array
+from slam.types import Array, Bytes
 
 if TYPE_CHECKING:
     from mecanum_env.team.team import Team
 
 __all__ = ["COLOURS", "colour_of", "draw_maps", "render_team"]
 
-Image = NDArray[np.uint8]
+Image = Bytes
 
 COLOURS = (
     (180, 119, 31), (14, 127, 255), (44, 160, 44), (40, 39, 214), (189, 103, 148), (75, 86, 140), (194, 119, 227),

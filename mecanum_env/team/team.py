@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.utils.seeding import np_random
-from numpy.typing import NDArray
 
 from mecanum_env.arguments import check_arguments, make_config, make_plan, reset_options, room_seed_of
 from mecanum_env.config import EnvConfig, Steps
@@ -30,7 +29,7 @@ from slam.geometry import compose, inverse
 from slam.metrics.chi_square import chi2_quantile
 from slam.settings import argument, checked, from_mapping
 from slam.teams.centralised import JointEkf
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["JOINT_SLAM", "Outcome", "Team"]
 
@@ -175,7 +174,7 @@ class Team:
             for k, start in enumerate(starts)
         ]  # fmt: skip
 
-    def step(self, actions: Mapping[int, NDArray[np.float32]]) -> dict[int, Outcome]:
+    def step(self, actions: Mapping[int, Floats]) -> dict[int, Outcome]:
         """Act for one control step; ``actions`` and what is returned are by the numbers of the active robots."""
         if not self.active:
             raise RuntimeError("no robot is exploring: the episode is over, or has not begun; call reset()")

@@ -25,17 +25,16 @@ from mecanum_env.vector.board import Board
 from mecanum_env.vector.workers import CALL, LISTEN, RESET, SET, STEP, Answer, Share, Worker
 from slam.files import quoted
 from slam.settings import Within, check_name, checked, require
-from slam.types import Array
+from slam.types import Array, Flags, Floats
 
 __all__ = ["ExploreVectorEnv"]
 
-Flags = NDArray[np.bool_]
 Observations = dict[str, NDArray[Any]]
 
 Environments = Annotated[int, Within("[1, 4096]")]
 
 
-class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
+class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
     """Many exploration environments, stepped by the caller and its worker processes over shared memory.
 
     Each is what ``gym.make`` makes, and with the same seeds all that ``reset`` and ``step`` return is as from
@@ -150,7 +149,7 @@ class ExploreVectorEnv(VectorEnv[Observations, NDArray[np.float32], Any]):
         infos = self._infos(page, self._ask(RESET, parts))
         return self._observations(page), infos
 
-    def step(self, actions: NDArray[np.float32]) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
+    def step(self, actions: Floats) -> tuple[Observations, Array, Flags, Flags, dict[str, Any]]:
         """Step every environment by its row of the actions ``(num_envs, a)``, in the action space's precision."""
         board = self._board
         if np.shape(actions) != board.actions.shape:

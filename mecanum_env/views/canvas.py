@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from mecanum_env.config import RobotConfig
 from mecanum_env.physics.robot import wheel_positions
 from slam.geometry import transform_points
-from slam.types import Array
+from slam.types import Array, Bytes
 
 __all__ = [
     "FLOOR", "FURNITURE", "FURNITURE_EDGE", "INK", "PAGE", "ROBOT", "WALL", "Canvas", "View", "put_text",
     "text_width",
 ]  # fmt: skip
 
-Image = NDArray[np.uint8]
+Image = Bytes
 Colour = tuple[int, int, int]
 
 PAGE: Colour = (244, 246, 247)

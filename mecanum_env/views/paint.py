@@ -6,7 +6,6 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.ground_truth import GroundTruth
 from mecanum_env.rooms.floor_plan import FloorPlan
@@ -14,7 +13,7 @@ from mecanum_env.rooms.outlines.smooth_outline import signed_area
 from mecanum_env.views.canvas import FLOOR, FURNITURE, FURNITURE_EDGE, WALL, Canvas, Colour, View
 from slam.belief import Belief
 from slam.geometry import transform_points
-from slam.types import Array
+from slam.types import Array, Flags
 
 __all__ = [
     "BEAM", "BELIEVED_PATH", "FRONTIER", "LANDMARK", "PLANNED_PATH", "SIGMAS", "TRUE_PATH", "UNSEEN", "Box",
@@ -122,7 +121,7 @@ def extent_of_truth(ground: GroundTruth) -> Box:
     return extent(ground.mappable, ground.resolution, origin) or (-1.0, -1.0, 1.0, 1.0)
 
 
-def extent(mask: NDArray[np.bool_], resolution: float, origin: tuple[float, float]) -> Box | None:
+def extent(mask: Flags, resolution: float, origin: tuple[float, float]) -> Box | None:
     """Return the box x_min, y_min, x_max, y_max [m] around the cells that are set."""
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):

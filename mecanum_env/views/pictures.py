@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
 from mecanum_env.ground_truth import GroundTruth
@@ -30,11 +29,11 @@ from mecanum_env.views.paint import (
 from slam.belief import Belief
 from slam.geometry import inverse
 from slam.grids.occupancy import OCCUPIED, UNKNOWN, OccupancyGrid
-from slam.types import Array
+from slam.types import Array, Bytes
 
 __all__ = ["draw_map", "draw_truth", "episode_view"]
 
-Image = NDArray[np.uint8]
+Image = Bytes
 
 _FOOTER_PX = 64
 _TITLE_GAP = " " * 3

@@ -7,16 +7,16 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan
 from mecanum_env.views.canvas import INK, PAGE, ROBOT, Canvas, View, put_text, text_width
 from mecanum_env.views.paint import paint_plan, with_margin
+from slam.types import Bytes
 
 __all__ = ["contact_sheet", "draw_plan"]
 
-Image = NDArray[np.uint8]
+Image = Bytes
 
 _MAX_SIDE_PX = 8192
 _OVERSAMPLING = 4  # drawn so much larger, then averaged: OpenCV's own anti-aliasing swells every outline

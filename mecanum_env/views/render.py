@@ -13,7 +13,6 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.config import EnvConfig
 from mecanum_env.ground_truth import GroundTruth
@@ -36,14 +35,14 @@ from mecanum_env.views.paint import (
 from slam.belief import Belief
 from slam.geometry import compose, inverse, transform_points
 from slam.grids.occupancy import FREE, PROBABILITY_BYTE, OccupancyGrid
-from slam.types import Array, Scan
+from slam.types import Array, Bytes, Flags, Scan
 
 __all__ = [
     "FRAME_SHAPE", "Shown", "blank_frame", "frontier_cells", "panels", "render_frame", "view_of_truth",
     "write_backend", "write_readouts",
 ]  # fmt: skip
 
-Image = NDArray[np.uint8]
+Image = Bytes
 
 FRAME_SHAPE = (720, 1280)
 """Height and width of a video frame [pixels]."""
@@ -132,7 +131,7 @@ def render_frame(env: Shown, *, planned_path: Array | None = None) -> Image:
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def frontier_cells(grid: OccupancyGrid) -> NDArray[np.bool_]:
+def frontier_cells(grid: OccupancyGrid) -> Flags:
     """Return ``(rows, cols)``: free cells beside cells never observed, in pieces of some size (for drawing)."""
     free = (grid.classes() == FREE).astype(np.uint8)
     unseen = cv2.dilate((grid.log_odds == 0).astype(np.uint8), np.ones((3, 3), np.uint8))

@@ -13,14 +13,14 @@ import cv2
 import gymnasium
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
-from numpy.typing import NDArray
 
 from mecanum_env.views.canvas import PAGE
 from mecanum_env.views.render import FRAME_SHAPE, Shown, render_frame
+from slam.types import Bytes
 
 __all__ = ["NoDisplay", "NoViewer", "Viewer", "Window", "load_pygame", "make_viewer"]
 
-Image = NDArray[np.uint8]
+Image = Bytes
 
 NO_DISPLAY_REMEDY = "run it on a desktop, or set SDL_VIDEODRIVER=dummy to run without a screen"
 _NOWHERE = ("dummy", "offscreen", "evdev")  # SDL's drivers that show nothing to anybody

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from slam.backend import Backend
 from slam.settings import require
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Account"]
 
@@ -29,10 +29,10 @@ class Account:
     stamp: float  # [s] when it was so
     pose: Array  # (3,) x [m], y [m], θ [rad]
     points: Array  # (n, 2) corners [m]
-    point_ids: NDArray[np.int64]  # (n,) as the backend numbers them
+    point_ids: Indices  # (n,) as the backend numbers them
     kinds: NDArray[np.int8]  # (n,) CONVEX, CONCAVE or 0 where not known
     directions: Array  # (n,) of the bisector into free space [rad], nan where not known
-    times_seen: NDArray[np.int64]  # (n,)
+    times_seen: Indices  # (n,)
     walls: Array  # (k, 2) α [rad], r [m]: x cos α + y sin α = r, the normal points into the wall, r may be < 0
     wall_ends: Array  # (k, 4) x1, y1, x2, y2 [m]: as far as they were seen
     cov: Array  # (3 + 2n + 2k,) squared: of pose, points, walls (α, r), in ordinary coordinates

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from slam.features.corners import all_on, edge, meet, walls_first
 from slam.features.surfaces import ENDS, FIRST, LAST, MAX_LINES, MAX_STEP, fit, points_in_order, split
 from slam.settings import Config, Count, Gap, Length, NotNegative, Positive, Sigma, Within
-from slam.types import Array, Scan
+from slam.types import Array, Indices, Scan
 
 __all__ = ["FeatureConfig", "FeatureExtractor"]
 
@@ -154,7 +154,7 @@ class FeatureExtractor:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _extract(
     ranges: Array, rays: Array, increment: float, range_min: float, range_max: float, limits: Array, gaps: Array,
-    xy: Array, reach: Array, places: NDArray[np.int64], surface: NDArray[np.int16], lines: Array, corners: Array,
+    xy: Array, reach: Array, places: Indices, surface: NDArray[np.int16], lines: Array, corners: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Fill ``surface``, ``lines`` and ``corners`` from a scan; return how many lines and corners there are.
 

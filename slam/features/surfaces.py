@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Indices
 
 MAX_LINES = 128
 GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
@@ -45,7 +44,7 @@ def _breaks(r0: float, r1: float, step: int, gaps: Array, sigma: float) -> bool:
 @njit(cache=True, nogil=True, error_model="numpy")
 def points_in_order(
     ranges: Array, rays: Array, increment: float, range_min: float, limits: Array, gaps: Array, xy: Array,
-    reach: Array, beam: NDArray[np.int64], apart: NDArray[np.int64],
+    reach: Array, beam: Indices, apart: Indices,
 ) -> int:  # fmt: skip
     """Write the points in order of bearing, starting after a break, so that no surface is cut at ±π.
 
@@ -85,9 +84,8 @@ def points_in_order(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_breaks(
-    reach: Array, count: int, gaps: Array, sigma: float, apart: NDArray[np.int64], beams: int, holes: int,
-    beam: NDArray[np.int64],
-) -> None:  # fmt: skip
+    reach: Array, count: int, gaps: Array, sigma: float, apart: Indices, beams: int, holes: int, beam: Indices
+) -> None:
     """Write :func:`_breaks` of each point and the next; after which points beams were lost, ``apart`` ends with.
 
     As though no beam had been lost first, in a loop that vectorises, then anew where some were.
@@ -108,10 +106,7 @@ def _mark_breaks(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def split(
-    xy: Array, n: int, limits: Array, apart: NDArray[np.int64], stack: NDArray[np.int64],
-    pieces: NDArray[np.int64],
-) -> int:  # fmt: skip
+def split(xy: Array, n: int, limits: Array, apart: Indices, stack: Indices, pieces: Indices) -> int:
     """Write the straight pieces (first, last, 1 where it goes on from the piece before); return their number.
 
     ``xy`` and ``apart`` are those of :func:`points_in_order`.

@@ -10,14 +10,13 @@ import weakref
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.belief import Belief
 from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.settings import EkfConfig
 from slam.landmark_backend import LandmarkBackend
 from slam.metrics.measures import nees_pose
-from slam.types import LINE, VIRTUAL, Array
+from slam.types import LINE, VIRTUAL, Array, Floats, Indices
 
 __all__ = ["GaussianBackend"]
 
@@ -58,24 +57,24 @@ class GaussianBackend(LandmarkBackend):
         """Covariance ``(3 + 2n, 3 + 2n)`` of the robot and every landmark, walls included."""
         return self._covariance(np.flatnonzero(self._marks[:, 0] != VIRTUAL))
 
-    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
+    def _covariance(self, landmarks: Indices) -> Array:
         """Return the covariance of the robot and some landmarks."""
         return self._cov_with(landmarks)
 
-    def _cov_with(self, rows: NDArray[np.int64]) -> Array:
+    def _cov_with(self, rows: Indices) -> Array:
         return joint.with_robot(self._p, rows)
 
-    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+    def _own_covariances(self, landmarks: Indices) -> Array:
         """Return the covariances ``(n, 2, 2)`` of some landmarks, each by itself."""
         i, p = 3 + 2 * landmarks, self._p
         return np.stack([p[i, i], p[i, i + 1], p[i, i + 1], p[i + 1, i + 1]], axis=-1).reshape(-1, 2, 2)
 
     @property
-    def _ids(self) -> NDArray[np.int64]:
+    def _ids(self) -> Indices:
         """Ids ``(n,)`` of every landmark."""
         return self._book.ids
 
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+    def near_landmarks(self, out: Floats) -> None:
         """Write the nearest landmarks in the robot frame (see the base class)."""
         joint.near_landmarks(self._x, self._p, self._book.marks, out)
 
@@ -90,7 +89,7 @@ class GaussianBackend(LandmarkBackend):
         self._given.append(weakref.ref(belief))
         return belief
 
-    def _points_and_walls(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _points_and_walls(self) -> tuple[Indices, Indices]:
         """Return the rows of both among all landmarks."""
         kinds = self._marks[:, 0]
         return np.flatnonzero(kinds < LINE), np.flatnonzero(kinds == LINE)

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.lanes import LANES, aligned_zeros
 from slam.gaussian.stacked_update import SPARE_ROWS, solve
 from slam.gaussian.tiles import add_combination, downdate, subtract
 from slam.motion import Twist, predict_robot
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Companions"]
 
@@ -86,7 +85,7 @@ class Companions:
             self.cross[:, 1] += (x[0] - before_x) * self.cross[:, 2]
 
     def correct(
-        self, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array, rows: int, *, reset: bool = False
+        self, n: int, match: Indices, h: Array, w: Array, s: Array, rows: int, *, reset: bool = False
     ) -> None:
         """Correct by an update of so many ``rows``, h, w and s as it left them.
 
@@ -137,7 +136,7 @@ class Companions:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _correct(
-    mean: Array, cov: Array, cross: Array, n: int, match: NDArray[np.int64], h: Array, w: Array, s: Array,
+    mean: Array, cov: Array, cross: Array, n: int, match: Indices, h: Array, w: Array, s: Array,
     we: Array, rows: int, own: int, reset: bool,
 ) -> None:  # fmt: skip
     """Correct by an update of landmarks, H being ``h``."""

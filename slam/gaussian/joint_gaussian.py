@@ -11,12 +11,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.lanes import aligned_zeros
 from slam.geometry import wrap_scalar
 from slam.landmarks.joint_compatibility import insert_nearest
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Floats, Indices
 
 __all__ = [
     "ANYWHERE_COV",
@@ -136,7 +135,7 @@ def symmetric_block(p: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
+def read_block(p: Array, rows: Indices, out: Array) -> None:
     """Write the block at these rows and columns of the symmetric matrix whose upper triangle is p."""
     for a in range(rows.shape[0]):
         for b in range(a, rows.shape[0]):
@@ -145,7 +144,7 @@ def read_block(p: Array, rows: NDArray[np.int64], out: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -> None:
+def near_landmarks(x: Array, p: Array, marks: Array, out: Floats) -> None:
     """Write the nearest point landmarks in the robot frame, nearest first."""
     out[:] = 0.0
     c, s = math.cos(x[2]), math.sin(x[2])
@@ -171,7 +170,7 @@ def near_landmarks(x: Array, p: Array, marks: Array, out: NDArray[np.float32]) -
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def with_robot(p: Array, landmarks: NDArray[np.int64]) -> Array:
+def with_robot(p: Array, landmarks: Indices) -> Array:
     """Return the covariance ``(3 + 2k, 3 + 2k)`` of the robot and these landmarks; p is an upper triangle."""
     rows = np.empty(3 + 2 * len(landmarks), np.int64)
     for i in range(3):
@@ -191,7 +190,7 @@ def enlarged(x: Array, p: Array, n: int) -> tuple[Array, Array]:
     return more, wider
 
 
-def state_rows(landmarks: NDArray[np.int64], *, robot: bool) -> NDArray[np.int64]:
+def state_rows(landmarks: Indices, *, robot: bool) -> Indices:
     """Return the state's indices of landmarks, after the robot's three if wanted."""
     rows = np.column_stack([3 + 2 * landmarks, 4 + 2 * landmarks]).ravel()
     return np.concatenate([np.arange(3), rows]) if robot else rows

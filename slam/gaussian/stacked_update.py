@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.gaussian.lanes import LANES, add_product, aligned_zeros, first, load, store, subtract_product, times
 from slam.gaussian.tiles import add_combination, downdate
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import predicted
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = [
     "NO_LIMITS", "SPARE_ROWS", "cholesky", "solve", "stacked_update", "whiten", "whiten_difference", "work_space",
@@ -43,9 +42,17 @@ def work_space(observations: int, size: int) -> tuple[Array, Array, Array]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def stacked_update(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array,
+    x: Array,
+    p: Array,
+    n: int,
+    z: Array,
+    match: Indices,
+    offset: float,
+    h: Array,
+    w: Array,
+    s: Array,
     limits: Array,
-) -> tuple[int, float]:  # fmt: skip
+) -> tuple[int, float]:
     """Make one EKF update of all observations with ``match`` ≥ 0; return the degrees of freedom and the NIS.
 
     ``p`` is an upper triangle; the lower one is undefined after. ``h``, ``w``, ``s`` are a :func:`work_space`.
@@ -67,7 +74,7 @@ def stacked_update(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def whiten(
-    x: Array, p: Array, n: int, z: Array, match: NDArray[np.int64], offset: float, h: Array, w: Array, s: Array
+    x: Array, p: Array, n: int, z: Array, match: Indices, offset: float, h: Array, w: Array, s: Array
 ) -> int:
     """Write W = L⁻¹ H P into ``w``; return the number of rows.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.features.surfaces import MAX_LINES
 from slam.geometry import about_z, relative
@@ -16,11 +15,9 @@ from slam.graph.pose_graph import PoseGraph, relative_jacobians
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds
 from slam.graph.window import Window
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["Atlas"]
-
-Ints = NDArray[np.int64]
 
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _PROBES = 6  # old patches by which it is asked whether those in reach are surely known
@@ -89,14 +86,14 @@ class Atlas:
         self._look_back(ends, reach_m)
         self.chart()
 
-    def _add_patches(self, ends: BeamEnds, unexplained: NDArray[np.bool_]) -> None:
+    def _add_patches(self, ends: BeamEnds, unexplained: Flags) -> None:
         for patch in new_patches(ends, unexplained, self._model):
             node = self.graph.add_node(self.window.pose)
             self._patches[node] = patch
             self.graph.add_link(self.key, node, np.zeros(3), patch.info)
             self.window.add(node, patch.info)
 
-    def _extend_patches(self, ends: BeamEnds, found: Alignment, unexplained: NDArray[np.bool_]) -> None:
+    def _extend_patches(self, ends: BeamEnds, found: Alignment, unexplained: Flags) -> None:
         """Let straight patches reach as far as their surface is seen to go on, and count those beams explained."""
         window = self.window
         if not np.any(found.beside >= 0):
@@ -124,7 +121,7 @@ class Atlas:
         """Put the window's patches where they are believed now, for the next scans to be held against."""
         self.surfaces, self.common_var = self._charted(self.window.nodes, self.window.frames)
 
-    def _charted(self, nodes: Ints, frames: Array) -> tuple[SurfaceMap, Array]:
+    def _charted(self, nodes: Indices, frames: Array) -> tuple[SurfaceMap, Array]:
         """Return patches in their frames ``(k, 3)`` as a surface map, with their common variances ``(k,)``."""
         patches = [self._patches[node] for node in nodes.tolist()]
         number = np.repeat(np.arange(len(patches)), [len(p.points) for p in patches])
@@ -138,12 +135,12 @@ class Atlas:
         turned = np.column_stack([c * nx - s * ny, s * nx + c * ny])
         return SurfaceMap(placed, turned, reach, number), np.array([p.common_var for p in patches])
 
-    def _extents(self, nodes: Ints) -> tuple[Array, Array]:
+    def _extents(self, nodes: Indices) -> tuple[Array, Array]:
         """Return centres ``(k, 2)`` and radii ``(k,)`` of patches [m], in their frames."""
         rows = np.array([self._patches[node].extent for node in nodes.tolist()]).reshape(-1, 3)
         return rows[:, :2], rows[:, 2]
 
-    def _distances(self, nodes: Ints) -> Array:
+    def _distances(self, nodes: Indices) -> Array:
         """Return how far from the robot patches begin ``(k,)`` [m]."""
         frames, (centres, radii) = self.graph.poses[nodes], self._extents(nodes)
         c, s = np.cos(frames[:, 2]), np.sin(frames[:, 2])
@@ -185,7 +182,7 @@ class Atlas:
         window.replace(graph.poses[self.key], graph.poses[nodes], nodes, cov)
         window.keep(np.concatenate([np.ones(len(nodes) - len(away), bool), sure]))
 
-    def _in_sight(self, nodes: Ints, ends: BeamEnds) -> Ints:
+    def _in_sight(self, nodes: Indices, ends: BeamEnds) -> Indices:
         """Return those of the patches that some beam ends near to."""
         surfaces, _ = self._charted(nodes, self.graph.poses[nodes])
         pose = self.window.pose
@@ -199,7 +196,7 @@ class Atlas:
         self.window.pose = self.graph.poses[self.key].copy()
         self.window.frames = self.graph.poses[self.window.nodes]
 
-    def _seen(self, nodes: Ints, cov: Array) -> tuple[Array, Array]:
+    def _seen(self, nodes: Indices, cov: Array) -> tuple[Array, Array]:
         """Return how well the middle of patches is known as seen from the robot ``(k,)``: the largest 1σ [m].
 
         ``cov`` is of the last key scan and the patches, jointly. Also returned is the covariance ``(3, 3)`` of the
@@ -220,7 +217,7 @@ class Atlas:
         j = about_z(float(frames[0, 2])) @ np.hstack([by_pose[0], by_patch[0]])
         return out, np.asarray(j @ cov[:6, :6] @ j.T, np.float64)
 
-    def _close_loop(self, ends: BeamEnds, nodes: Ints, pose_cov: Array) -> bool:
+    def _close_loop(self, ends: BeamEnds, nodes: Indices, pose_cov: Array) -> bool:
         """Hold the scan against old patches; where it and others before it agree, close the loop."""
         config, graph = self.config, self.graph
         frames = graph.poses[nodes].copy()

@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import about_z, compose, inverse, wrap
 from slam.graph.matching import Alignment, Links, SurfaceMap, align, links
@@ -23,7 +22,7 @@ from slam.graph.surfaces import BeamEnds
 from slam.grids.match_kernels import field_sum
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, search
 from slam.settings import Angle, Config, Count, Gap, Length, Positive, PositiveShare, Sigma, Within
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Candidate", "ClosingConfig", "agreeing", "find_candidate"]
 
@@ -60,11 +59,11 @@ class Candidate:
     place: Array  # (2,) where it was believed to be
     correction: Array  # (3,) transform of the world that would make it fit
     links: Links  # to patches of ``nodes``
-    nodes: NDArray[np.int64]
+    nodes: Indices
 
 
 def find_candidate(
-    surfaces: SurfaceMap, frames: Array, common_var: Array, nodes: NDArray[np.int64], ends: BeamEnds, pose: Array,
+    surfaces: SurfaceMap, frames: Array, common_var: Array, nodes: Indices, ends: BeamEnds, pose: Array,
     pose_cov: Array, config: ClosingConfig, matching: MatchConfig, *, node: int, way_m: float,
 ) -> Candidate | None:  # fmt: skip
     """Return how a scan from ``pose`` ``(3,)`` fits old patches, or None where it does not, or not beyond doubt.

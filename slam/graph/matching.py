@@ -13,15 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.graph.surfaces import BeamEnds
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Alignment", "Links", "SurfaceMap", "align", "lasting", "links"]
-
-Ints = NDArray[np.int64]
 
 _CELL_M = 0.25
 _SLACK_M = 0.03  # by which a beam may end beyond a surface point's own reach
@@ -38,11 +35,11 @@ class SurfaceMap:
         ``(m, 2)`` [m] in the map's frame.
     reach : Array
         ``(m,)`` [m] along the surface to either side that a point stands for.
-    patch : Ints
+    patch : Indices
         ``(m,)`` number of the patch.
     """
 
-    def __init__(self, points: Array, normals: Array, reach: Array, patch: Ints) -> None:
+    def __init__(self, points: Array, normals: Array, reach: Array, patch: Indices) -> None:
         self.points, self.normals, self.reach, self.patch = points, normals, reach, patch
         low = points.min(axis=0) - _CELL_M if len(points) else np.zeros(2)
         high = points.max(axis=0) + _CELL_M if len(points) else np.zeros(2)
@@ -56,7 +53,7 @@ class Alignment:
     """Where a scan fits the surface map."""
 
     pose: Array  # (3,)
-    beside: Ints  # (n,) the surface point each beam is held against, or -1
+    beside: Indices  # (n,) the surface point each beam is held against, or -1
     share: float  # of the beams that are held against one
     in_sight: float  # of those beams that a surface point is near, the share that agrees with it
 
@@ -65,7 +62,7 @@ class Alignment:
 class Links:
     """What an aligned scan tells about its pose relative to each patch that it saw: ½(d-z)ᵀH(d-z) + gᵀ(d-z)."""
 
-    patches: Ints  # (g,) numbers
+    patches: Indices  # (g,) numbers
     relative: Array  # (g, 3) z: the scan's pose as seen from the patch's frame
     info: Array  # (g, 3, 3) H
     gradient: Array  # (g, 3)
@@ -91,9 +88,7 @@ def align(
     return Alignment(pose, beside, counts[0] / n, counts[0] / max(counts[1], 1.0))
 
 
-def links(
-    surfaces: SurfaceMap, ends: BeamEnds, found: Alignment, frames: Array, common_var: Array,
-) -> Links:  # fmt: skip
+def links(surfaces: SurfaceMap, ends: BeamEnds, found: Alignment, frames: Array, common_var: Array) -> Links:
     """Return what an alignment tells of the pose relative to each patch.
 
     Parameters
@@ -124,7 +119,7 @@ def lasting(way_m: float, turn_rad: float, *, key_m: float, key_rad: float, most
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _buckets(points: Array, x0: float, y0: float, rows: int, cols: int) -> tuple[Ints, Ints]:
+def _buckets(points: Array, x0: float, y0: float, rows: int, cols: int) -> tuple[Indices, Indices]:
     m = points.shape[0]
     starts, items = np.zeros(rows * cols + 1, np.int64), np.empty(m, np.int64)
     cell = np.empty(m, np.int64)
@@ -150,9 +145,9 @@ def _robust(e: float, var: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _align(
-    points: Array, normals: Array, reach: Array, x0: float, y0: float, rows: int, cols: int, starts: Ints,
-    items: Ints, ends: Array, end_normals: Array, var: Array, pose: Array, guess: Array,
-    prior_info: Array, gate_m: float, iterations: int, beside: Ints, counts: Array,
+    points: Array, normals: Array, reach: Array, x0: float, y0: float, rows: int, cols: int, starts: Indices,
+    items: Indices, ends: Array, end_normals: Array, var: Array, pose: Array, guess: Array,
+    prior_info: Array, gate_m: float, iterations: int, beside: Indices, counts: Array,
 ) -> None:  # fmt: skip
     h, g, step = np.empty((3, 3)), np.empty(3), np.empty(3)
     gate = gate_m
@@ -224,8 +219,8 @@ def _align(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _links(
-    points: Array, normals: Array, patch: Ints, ends: Array, var: Array, pose: Array, beside: Ints, frames: Array,
-    common_var: Array, relative: Array, info: Array, gradient: Array, beams: Ints,
+    points: Array, normals: Array, patch: Indices, ends: Array, var: Array, pose: Array, beside: Indices,
+    frames: Array, common_var: Array, relative: Array, info: Array, gradient: Array, beams: Indices,
 ) -> None:  # fmt: skip
     count = frames.shape[0]
     weight = np.zeros(count)

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.features.surfaces import HIDDEN, MAX_LINES
 from slam.graph.surfaces import BeamEnds
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["ModelError", "Patch", "extended", "new_patches"]
 
@@ -58,7 +57,7 @@ class ModelError:
         return self.straight_m**2 + hidden * hidden
 
 
-def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], model: ModelError) -> list[Patch]:
+def new_patches(ends: BeamEnds, unexplained: Flags, model: ModelError) -> list[Patch]:
     """Return the patches that a scan's unexplained beams ``(n,)`` make: those that nothing known is near."""
     made: list[Patch] = []
     rest: list[tuple[Array, Array, Array, Array]] = []
@@ -81,9 +80,7 @@ def new_patches(ends: BeamEnds, unexplained: NDArray[np.bool_], model: ModelErro
     return made
 
 
-def extended(
-    patch: Patch, ends: BeamEnds, rows: NDArray[np.int64], relative: Array, model: ModelError
-) -> Patch | None:
+def extended(patch: Patch, ends: BeamEnds, rows: Indices, relative: Array, model: ModelError) -> Patch | None:
     """Return a straight patch that reaches as far as more beams of the same surface ended, or None.
 
     None where they do not lie on its line. ``rows`` are the beams, ``relative`` ``(3,)`` the scan's pose as seen
@@ -113,13 +110,13 @@ def extended(
     return Patch(points, np.tile(normal, (count, 1)), reach, patch.info, model.straight_var(high - low), True)
 
 
-def _information(ends: BeamEnds, rows: NDArray[np.int64], common: float) -> Array:
+def _information(ends: BeamEnds, rows: Indices, common: float) -> Array:
     n, p, weight = ends.normals[rows], ends.on[rows], 1.0 / ends.var[rows]
     j = np.column_stack([n, n[:, 1] * p[:, 0] - n[:, 0] * p[:, 1]])
     return np.asarray((j * weight[:, None]).T @ j / (1.0 + common * weight.sum()), np.float64)
 
 
-def _straight(ends: BeamEnds, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _straight(ends: BeamEnds, rows: Indices) -> tuple[Array, Array, Array]:
     """Return points along a line, as far as beams ended on it without a gap."""
     normal = ends.normals[rows[0]]
     along = np.array([-normal[1], normal[0]])
@@ -135,5 +132,5 @@ def _straight(ends: BeamEnds, rows: NDArray[np.int64]) -> tuple[Array, Array, Ar
     return points, np.tile(normal, (len(at), 1)), np.full(len(at), 0.5 * _SAMPLES_M)
 
 
-def _contour(ends: BeamEnds, rows: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+def _contour(ends: BeamEnds, rows: Indices) -> tuple[Array, Array, Array]:
     return ends.on[rows], ends.normals[rows], 0.6 * ends.spacing[rows]

@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureExtractor
 from slam.geometry import about_z, compose, inverse, rotation, wrap, wrap_scalar
@@ -24,7 +23,7 @@ from slam.graph.patches import ModelError, Patch, new_patches
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.landmarks.book import EDGE, FROM_MARK, KIND
 from slam.landmarks.seen_from import sightings
-from slam.types import VIRTUAL, Array, Indices, Scan
+from slam.types import VIRTUAL, Array, Flags, Indices, Scan
 
 __all__ = ["Places"]
 
@@ -174,7 +173,7 @@ class Places:
         k = int(np.argmin(away))
         return rows[first[k] : first[k] + 2], float(away[k])
 
-    def _grow(self, number: int, ends: BeamEnds, new: NDArray[np.bool_], at: Array) -> None:
+    def _grow(self, number: int, ends: BeamEnds, new: Flags, at: Array) -> None:
         """Add to a place what these beams ``(n,)`` of a scan from ``at`` ``(3,)`` in its frame show besides."""
         if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
             self._places[number] = _with_patches(self._places[number], patches, at)

@@ -10,16 +10,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import SuperLU, splu
 
 from slam.geometry import relative, wrap
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["PoseGraph", "relative_jacobians"]
-
-Ints = NDArray[np.int64]
 
 
 def relative_jacobians(first: Array, second: Array) -> tuple[Array, Array, Array]:
@@ -134,7 +131,7 @@ class PoseGraph:
             weight[rows] = scale[closing[rows]] ** 2
         return weight
 
-    def _loss(self, rows: Ints, off: Array) -> Array:
+    def _loss(self, rows: Indices, off: Array) -> Array:
         """Return twice what links lose against their own best fit ``(r,)``."""
         h, g = self._h[rows] + 1e-6 * np.eye(3), self._g[rows]
         best = -np.linalg.solve(h, g[..., None])[..., 0]
@@ -160,7 +157,7 @@ class PoseGraph:
             if float(np.abs(step).max()) < tolerance:
                 break
 
-    def covariance(self, nodes: Sequence[int] | Ints) -> Array:
+    def covariance(self, nodes: Sequence[int] | Indices) -> Array:
         """Return the joint marginal covariance ``(3k, 3k)`` of ``k`` nodes: a solve a column."""
         if self._factor is None:
             self._factor = _factorised(self.gradient_and_information()[1])

@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureExtractor
 from slam.features.surfaces import FIRST, GRAZING, LAST, MAX_LINES, NX, NY, R
-from slam.types import Array, Scan
+from slam.types import Array, Indices, Scan
 
 __all__ = ["BeamEnds", "beam_ends"]
-
-Ints = NDArray[np.int64]
 
 _FLATTEST = 0.15  # cosine of incidence below which a rough contour's normal means nothing
 _BENT = 1.3  # variance across, in units of what noise makes, beyond which five points go around a corner
@@ -37,7 +35,7 @@ class BeamEnds:
     on: Array  # (n, 2) [m] the point of the fitted surface; of a rough contour the measured one
     var: Array  # (n,) [m²] of the distance between the measured point and the surface, across it
     spacing: Array  # (n,) [m] between beams on the surface there
-    surface: Ints  # (n,) which one: below MAX_LINES straight, from there on pieces of contour
+    surface: Indices  # (n,) which one: below MAX_LINES straight, from there on pieces of contour
 
     def __len__(self) -> int:
         return len(self.points)
@@ -72,7 +70,8 @@ def beam_ends(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _describe(
     ranges: Array, angle_min: float, increment: float, range_min: float, reach: float,
-    surface: NDArray[np.int16], lines: Array, offset: float, sigma: float, rough: float, out: Array, labels: Ints,
+    surface: NDArray[np.int16], lines: Array, offset: float, sigma: float, rough: float, out: Array,
+    labels: Indices,
 ) -> int:  # fmt: skip
     """Write a row a beam that ended on a surface: point, normal, point on the surface, variance, spacing."""
     n = ranges.shape[0]

@@ -9,16 +9,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import compose, wrap
 from slam.graph.matching import Links
 from slam.graph.pose_graph import relative_jacobians
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["Window", "moved"]
-
-Ints = NDArray[np.int64]
 
 
 def moved(pose: Array, motion: Array) -> tuple[Array, Array, Array]:
@@ -84,7 +81,7 @@ class Window:
         cov = self.cov - rows.T @ m[:, 1:]
         self.cov = 0.5 * (cov + cov.T)
 
-    def _part(self, links: Links) -> Ints:
+    def _part(self, links: Links) -> Indices:
         return np.concatenate([np.arange(3), (3 + 3 * links.patches[:, None] + np.arange(3)).ravel()])
 
     def _normal(self, at: Array, links: Links, pose: Array) -> tuple[Array, Array]:
@@ -117,12 +114,12 @@ class Window:
         self.frames = np.vstack([self.frames, self.pose])
         self.nodes = np.append(self.nodes, node)
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
+    def keep(self, rows: Flags) -> None:
         """Leave only some of the patches ``(m,)`` in reach."""
         part = np.concatenate([np.ones(3, bool), np.repeat(rows, 3)])
         self.cov = self.cov[np.ix_(part, part)]
         self.frames, self.nodes = self.frames[rows], self.nodes[rows]
 
-    def replace(self, pose: Array, frames: Array, nodes: Ints, cov: Array) -> None:
+    def replace(self, pose: Array, frames: Array, nodes: Indices, cov: Array) -> None:
         """Take over the graph's solution: the key scan's pose, the patches' frames and their joint covariance."""
         self.pose, self.frames, self.nodes, self.cov = pose.copy(), frames.copy(), nodes.copy(), cov

@@ -13,7 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from slam.grids.scan_drawing import IN_BETWEEN, IN_FREE, WORD
-from slam.types import Array
+from slam.types import Array, Bytes, Indices
 
 __all__ = ["SUBCELL_BITS", "crossings_of", "fill_inside", "mark_free"]
 
@@ -23,14 +23,14 @@ _FINE_BITS = 16  # of where an edge crosses a row
 _HALF_CELL = 1 << (SUBCELL_BITS - 1)
 
 
-def crossings_of(rows: int, vertices: int) -> NDArray[np.int64]:
+def crossings_of(rows: int, vertices: int) -> Indices:
     """Return work space for polygons of so many vertices in so many rows of a mask."""
     return np.empty((rows, vertices + 1), np.int64)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def mark_free(
-    mask: NDArray[np.uint8], polygon: NDArray[np.int32], crossings: NDArray[np.int64], beams: Array, ranges: Array,
+    mask: Bytes, polygon: NDArray[np.int32], crossings: Indices, beams: Array, ranges: Array,
     rays: Array, surface: NDArray[np.int16], x: float, y: float, theta: float, resolution: float,
     range_max: float, mask_row: int, mask_col: int, full_circle: bool, dense: float,
 ) -> tuple[int, int, int, int, int]:  # fmt: skip
@@ -52,9 +52,8 @@ def mark_free(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_between(
-    mask: NDArray[np.uint8], beams: Array, x0: float, y0: float, dense: float, top: int, left: int, bottom: int,
-    right: int,
-) -> None:  # fmt: skip
+    mask: Bytes, beams: Array, x0: float, y0: float, dense: float, top: int, left: int, bottom: int, right: int
+) -> None:
     """Mark as between beams what is farther than ``dense`` [cells] from (x0, y0), but for the cells under one."""
     for row in range(top, bottom + 1):
         for col in range(left, right + 1):
@@ -131,9 +130,8 @@ def _outline(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fill_inside(
-    mask: NDArray[np.uint8], polygon: NDArray[np.int32], count: int, crossings: NDArray[np.int64], top: int,
-    bottom: int,
-) -> None:  # fmt: skip
+    mask: Bytes, polygon: NDArray[np.int32], count: int, crossings: Indices, top: int, bottom: int
+) -> None:
     """Mark the cells inside a polygon, by the even-odd rule, in a mask that is empty there.
 
     Parameters
@@ -156,9 +154,7 @@ def fill_inside(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _cross_rows(
-    polygon: NDArray[np.int32], count: int, crossings: NDArray[np.int64], top: int, bottom: int
-) -> None:
+def _cross_rows(polygon: NDArray[np.int32], count: int, crossings: Indices, top: int, bottom: int) -> None:
     """Write for each row from ``top`` to ``bottom`` where edges cross its middle, in order; their number first.
 
     A vertex counts as in the middle of its row. From row to row an edge goes on by a step that is rounded up: what
@@ -186,7 +182,7 @@ def _cross_rows(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fill_rows(mask: NDArray[np.uint8], crossings: NDArray[np.int64], top: int, bottom: int) -> None:
+def _fill_rows(mask: Bytes, crossings: Indices, top: int, bottom: int) -> None:
     """Mark the cells between each row's first and second crossing, third and fourth, and so on."""
     u = np.uint64
     almost_one = (1 << _FINE_BITS) - 1
@@ -199,7 +195,7 @@ def _fill_rows(mask: NDArray[np.uint8], crossings: NDArray[np.int64], top: int, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _erase_rim(mask: NDArray[np.uint8], polygon: NDArray[np.int32], count: int) -> None:
+def _erase_rim(mask: Bytes, polygon: NDArray[np.int32], count: int) -> None:
     """Wipe the cells under the polygon's edges: Bresenham's lines between the cells of its vertices."""
     x0, y0 = _cell_of(polygon, count - 1)
     for k in range(np.uint64(count)):
@@ -219,7 +215,7 @@ def _cell_of(polygon: NDArray[np.int32], k: int) -> tuple[int, int]:
 
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
-def _erase_line(mask: NDArray[np.uint8], x: int, y: int, dx: int, dy: int) -> None:
+def _erase_line(mask: Bytes, x: int, y: int, dx: int, dy: int) -> None:
     """Wipe a line of cells from (x, y) on, ``dx`` ≥ 0 to the right and ``dy`` up or down (Bresenham 1965)."""
     down, dy = -1 if dy < 0 else 1, abs(dy)
     error = max(dx, dy) - 2 * min(dx, dy)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from slam.geometry import wrap, wrap_scalar
 from slam.grids.occupancy import OccupancyGrid
 from slam.settings import Config, Gap, Within
-from slam.types import Array, Scan
+from slam.types import Array, Flags, Indices, Scan
 
 __all__ = ["KeyScanConfig", "KeyScans", "largest_shift"]
 
@@ -102,8 +102,8 @@ class KeyScans:
         return float(self._variances[:n][near].max(initial=0.0))
 
     def keep(
-        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: NDArray[np.int64], marks: Array,
-        cov: Array, landmarks: Array | None = None, row_of_id: NDArray[np.int64] | None = None, *,
+        self, sensor_pose: Array, scan: Scan, surface: NDArray[np.int16], ids: Indices, marks: Array,
+        cov: Array, landmarks: Array | None = None, row_of_id: Indices | None = None, *,
         ahead_m: float = 0.0, variance: float = 0.0,
     ) -> None:  # fmt: skip
         """Keep a scan, and what was seen with it.
@@ -147,7 +147,7 @@ class KeyScans:
         return self._since_check >= n // 8 and n >= 2
 
     def redraw_if_moved(
-        self, grid: OccupancyGrid, landmarks: Array, row_of_id: NDArray[np.int64], others: Sequence[KeyScans] = ()
+        self, grid: OccupancyGrid, landmarks: Array, row_of_id: Indices, others: Sequence[KeyScans] = ()
     ) -> bool:
         """Redraw ``grid`` if a landmark's correction moved a key scan by more than half a cell; tell whether.
 
@@ -165,13 +165,13 @@ class KeyScans:
         grid.redraw(np.concatenate([poses for poses, _ in corrected]), [s for k in everyone for s in k._scans])
         return True
 
-    def _corrected(self, landmarks: Array, row_of_id: NDArray[np.int64]) -> tuple[Array, float]:
+    def _corrected(self, landmarks: Array, row_of_id: Indices) -> tuple[Array, float]:
         """Return where the key scans ``(n, 3)`` should be drawn, and by how much [m] one moved most."""
         self._since_check = 0
         largest = self._follow(landmarks, row_of_id, 0)
         return self._latest[: len(self._scans)].copy(), largest
 
-    def _follow(self, landmarks: Array, row_of_id: NDArray[np.int64], first: int) -> float:
+    def _follow(self, landmarks: Array, row_of_id: Indices, first: int) -> float:
         """Have the key scans from ``first`` on go with their landmarks; return the largest shift [m]."""
         return _follow(
             first, len(self._scans), self._kept, self._before, self._poses, self._anchor_ids, self._anchor_local,
@@ -196,8 +196,8 @@ def largest_shift(poses: Array, drawn: Array, lever_m: float) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _hang(
-    sensor_pose: Array, ids: NDArray[np.int64], marks: Array, cov: Array, ahead_m: float,
-    anchor_ids: NDArray[np.int64], anchor_local: Array, p: Array,
+    sensor_pose: Array, ids: Indices, marks: Array, cov: Array, ahead_m: float,
+    anchor_ids: Indices, anchor_local: Array, p: Array,
 ) -> None:  # fmt: skip
     """Write a key scan's landmarks in its pose's frame, and the covariance of it and them there."""
     count = min(ids.shape[0], anchor_ids.shape[0])
@@ -224,7 +224,7 @@ def _hang(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weigh(held: NDArray[np.bool_], local: Array, cov: Array, steps: float, gains: Array) -> None:
+def _weigh(held: Flags, local: Array, cov: Array, steps: float, gains: Array) -> None:
     """Write how far a key scan goes with the scan before and with those of its landmarks that there are."""
     of = np.empty(held.shape[0], np.int64)
     count = 0
@@ -318,9 +318,8 @@ def _pinned(gains: Array, n: int) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _follow(
-    first: int, n: int, kept: Array, before: Array, drawn: Array, ids: NDArray[np.int64], local: Array,
-    held: NDArray[np.bool_], covs: Array, steps: Array, gains: Array, landmarks: Array,
-    row_of_id: NDArray[np.int64], lever: float, out: Array,
+    first: int, n: int, kept: Array, before: Array, drawn: Array, ids: Indices, local: Array, held: Flags,
+    covs: Array, steps: Array, gains: Array, landmarks: Array, row_of_id: Indices, lever: float, out: Array,
 ) -> float:  # fmt: skip
     """Write key scans' poses as their landmarks now have them; return the largest shift [m] from where one is."""
     # Of those that are walls; for a few scans not worth while.
@@ -365,8 +364,8 @@ def _follow(
 
 @njit(nogil=True, error_model="numpy", forceinline=True)
 def _moved(
-    kept: Array, going: Array, motion: Array, ids: NDArray[np.int64], held: NDArray[np.bool_], local: Array,
-    gain: Array, landmarks: Array, normals: Array, row_of_id: NDArray[np.int64],
+    kept: Array, going: Array, motion: Array, ids: Indices, held: Flags, local: Array,
+    gain: Array, landmarks: Array, normals: Array, row_of_id: Indices,
 ) -> tuple[float, float, float]:  # fmt: skip
     """Return how a key scan moves, linearised about a motion of it."""
     c, s = math.cos(kept[2]), math.sin(kept[2])

@@ -6,21 +6,18 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.types import Array
+from slam.types import Array, Floats
 
 __all__ = ["BLOCK", "climb", "correlate", "field_sum", "prior_loss", "slope", "splat"]
-
-Values = NDArray[np.float32]
 
 BLOCK = 4
 """Shifts a side that one bound of the search stands for."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def splat(values: Values, x0: float, y0: float, cell: float, stamps: Values, points: Array) -> None:
+def splat(values: Floats, x0: float, y0: float, cell: float, stamps: Floats, points: Array) -> None:
     """Raise the cells around each point ``(n, 2)`` to what a surface there gives them."""
     phases, half = stamps.shape[0], stamps.shape[2] // 2
     rows, cols = values.shape
@@ -38,7 +35,7 @@ def splat(values: Values, x0: float, y0: float, cell: float, stamps: Values, poi
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def correlate(
-    values: Values, bounds: Values, x0: float, y0: float, cell: float, points: Array, guess: Array, shifts: int,
+    values: Floats, bounds: Floats, x0: float, y0: float, cell: float, points: Array, guess: Array, shifts: int,
     turns: int, step: float, gain: float, info: Array,
 ) -> Array:  # fmt: skip
     """Return the pose with the highest sum of field values (times ``gain``, less the prior's loss)."""
@@ -105,7 +102,7 @@ def _weights(t: float) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def field_sum(values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array) -> float:
+def field_sum(values: Floats, x0: float, y0: float, cell: float, points: Array, pose: Array) -> float:
     """Return the sum of the interpolated field under the points ``(n, 2)`` seen from a pose; 0 outside."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     rows, cols = values.shape
@@ -125,7 +122,7 @@ def field_sum(values: Values, x0: float, y0: float, cell: float, points: Array, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def slope(
-    values: Values,
+    values: Floats,
     x0: float,
     y0: float,
     cell: float,
@@ -194,7 +191,7 @@ def slope(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def climb(
-    values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array, prior: Array, info: Array,
+    values: Floats, x0: float, y0: float, cell: float, points: Array, pose: Array, prior: Array, info: Array,
     gain: float, iterations: int, curvature: Array,
 ) -> float:  # fmt: skip
     """Move ``pose`` ``(3,)`` to the top of gain × field sum - prior's loss; return the field sum there.

@@ -38,7 +38,7 @@ from slam.grids.scan_drawing import (
     mark_disc,
     sum_blocks,
 )
-from slam.types import Array, Scan
+from slam.types import Array, Cells, Floats, Indices, Scan
 
 __all__ = ["CLASS_OF", "FREE", "OCCUPIED", "PROBABILITY_BYTE", "UNKNOWN", "OccupancyGrid"]
 
@@ -145,12 +145,12 @@ class OccupancyGrid:
         """Position (x, y) [m] of the lower-left corner of cell (0, 0)."""
         return self._col0 * self.resolution, self._row0 * self.resolution
 
-    def to_cells(self, points: Array) -> NDArray[np.int64]:
+    def to_cells(self, points: Array) -> Indices:
         """Return row and column ``(n, 2)`` of points ``(n, 2)`` [m]; they may lie outside the grid."""
         cells = np.floor(np.asarray(points, dtype=np.float64) / self.resolution).astype(np.int64)
         return np.asarray(cells[..., ::-1] - np.array([self._row0, self._col0]), dtype=np.int64)
 
-    def to_points(self, cells: NDArray[np.int64]) -> Array:
+    def to_points(self, cells: Cells) -> Array:
         """Return the centres ``(n, 2)`` [m] of cells ``(n, 2)`` given as row, column."""
         lattice = np.asarray(cells)[..., ::-1] + np.array([self._col0, self._row0])
         return np.asarray((lattice + 0.5) * self.resolution, dtype=np.float64)
@@ -181,7 +181,7 @@ class OccupancyGrid:
         points = self.to_points(found + np.array([rows.start or 0, cols.start or 0]))
         return points[np.hypot(points[:, 0] - x, points[:, 1] - y) <= radius_m]
 
-    def probability(self) -> NDArray[np.float32]:
+    def probability(self) -> Floats:
         """Return the occupancy probability ``(rows, cols)``, 0.5 where nothing was observed."""
         return np.asarray(1.0 / (1.0 + np.exp(-UNIT_NAT * self.log_odds.astype(np.float32))), np.float32)
 

@@ -6,10 +6,9 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.grids.occupancy import UNKNOWN, OccupancyGrid
-from slam.types import Array
+from slam.types import Array, Bytes
 
 __all__ = ["draw_known"]
 
@@ -18,7 +17,7 @@ _UNSEEN = 175  # its tone: free cells are lighter from their first scan on, occu
 _LANDMARK, _ROBOT = (30, 110, 230), (200, 90, 20)  # blue, green, red
 
 
-def draw_known(grid: OccupancyGrid, landmarks: Array, pose: Array) -> NDArray[np.uint8]:
+def draw_known(grid: OccupancyGrid, landmarks: Array, pose: Array) -> Bytes:
     """Return what is known as a picture ``(h, w, 3)``, blue-green-red, y upwards, cropped to it.
 
     Parameters

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Bytes, Floats, Indices
 
 UNKNOWN, FREE, OCCUPIED = -1, 0, 100
 """Cell classes, with the values of a ROS ``nav_msgs/OccupancyGrid``."""
@@ -28,7 +28,7 @@ APART_M = 0.14  # between two beams, beyond which a thin wall may stand between 
 GAP_M = 0.6  # between two hits so far apart, beyond which a passage may open between them unseen
 
 
-def _tables() -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.int8]]:
+def _tables() -> tuple[Bytes, Floats, NDArray[np.int8]]:
     """Return, for each byte of a cell: probability × 255, entropy [bit], class."""
     units = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.float64)
     p = 1.0 / (1.0 + np.exp(-UNIT_NAT * units))
@@ -51,7 +51,7 @@ _COUNT = 15  # a field of counts: up to eight cells
 _ENTROPY_UNITS = float(1 << 26)  # to a bit
 
 
-def _steps() -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+def _steps() -> tuple[Bytes, Indices]:
     """Return, for each mark × 256 + byte of a cell: its byte afterwards, and what the sums gain."""
     old = np.arange(256, dtype=np.uint8).view(np.int8).astype(np.int64)
     # Between two beams that lie far apart nothing was seen: that much is likely where nothing is known, no more.
@@ -77,9 +77,7 @@ NO_SURFACE = np.zeros(0, np.int16)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_surfaces(
-    mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], dense: float, gap: float
-) -> None:
+def mark_surfaces(mask: Bytes, beams: Array, surface: NDArray[np.int16], dense: float, gap: float) -> None:
     """Mark the cells that beams ended in, and those between two hits on one straight surface.
 
     Farther off than ``dense`` [cells] there may be none between them; and where there, or across beams that were
@@ -120,9 +118,8 @@ def _step_of(marks: np.uint64, cells: np.uint64, k: int) -> np.uint64:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _take_unsettled(
-    mask: NDArray[np.uint8], cells: NDArray[np.uint8], width: int, down: int, ahead: int, top: int, left: int,
-    bottom: int, right: int,
-) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:  # fmt: skip
+    mask: Bytes, cells: Bytes, width: int, down: int, ahead: int, top: int, left: int, bottom: int, right: int
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:
     """Wipe a box of the mask; return its windows with marks that change a cell, and which words these are.
 
     A row of the windows is eight words of such marks, then the row and column that they begin at in the grid.
@@ -168,8 +165,8 @@ def _take_unsettled(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def fuse(
-    mask: NDArray[np.uint8], mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
-    cells: NDArray[np.uint8], width: int, lattice_row: int, lattice_col: int, overview: NDArray[np.int32],
+    mask: Bytes, mask_row: int, mask_col: int, top: int, left: int, bottom: int, right: int,
+    cells: Bytes, width: int, lattice_row: int, lattice_col: int, overview: NDArray[np.int32],
     shift: int, changes: NDArray[np.int32], count: int,
 ) -> tuple[int, int, float]:  # fmt: skip
     """Add the box [top, bottom] × [left, right] of a scan's mask to the grid and wipe it.
@@ -223,8 +220,8 @@ def fuse(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw(
-    mask: NDArray[np.uint8], beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
-    left: int, bottom: int, right: int, cells: NDArray[np.uint8], visited: NDArray[np.uint8], lattice_row: int,
+    mask: Bytes, beams: Array, surface: NDArray[np.int16], mask_row: int, mask_col: int, top: int,
+    left: int, bottom: int, right: int, cells: Bytes, visited: Bytes, lattice_row: int,
     lattice_col: int, overview: NDArray[np.int32], shift: int, changes: NDArray[np.int32], count: int, y: float,
     x: float, radius: float, dense: float, gap: float,
 ) -> tuple[int, int, float]:  # fmt: skip
@@ -241,9 +238,7 @@ def draw(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sum_blocks(
-    log_odds: NDArray[np.int8], visited: NDArray[np.uint8], shift: int, overview: NDArray[np.int32]
-) -> None:
+def sum_blocks(log_odds: NDArray[np.int8], visited: Bytes, shift: int, overview: NDArray[np.int32]) -> None:
     """Add up blocks of 2^shift cells a side: observed cells, their probability × 255, visited cells."""
     for i in range(log_odds.shape[0]):
         r = i >> shift
@@ -257,9 +252,7 @@ def sum_blocks(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def mark_disc(
-    visited: NDArray[np.uint8], overview: NDArray[np.int32], shift: int, y: float, x: float, radius: float
-) -> None:
+def mark_disc(visited: Bytes, overview: NDArray[np.int32], shift: int, y: float, x: float, radius: float) -> None:
     """Mark the cells whose centre lies within ``radius`` of (x, y), all in cells of the grid; none if negative."""
     if radius < 0.0:
         return

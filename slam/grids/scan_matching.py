@@ -18,15 +18,12 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.grids.match_kernels import BLOCK, climb, correlate, splat
 from slam.settings import Config, Count, Few, Length, Positive, Sigma, Within, require
-from slam.types import Array, Scan
+from slam.types import Array, Floats, Scan
 
 __all__ = ["LikelihoodField", "Match", "MatchConfig", "body_points", "match", "refine", "search", "stamps_of"]
-
-Values = NDArray[np.float32]
 
 _MOST_PLACES = 2_000_000  # of one search: some seconds
 _MARGIN_M = 1.0  # of a field around its points
@@ -105,17 +102,17 @@ class LikelihoodField:
         splat(self.values, self.x0, self.y0, cell, stamps_of(config), np.asarray(points, dtype=np.float64))
 
     @cached_property
-    def bounds(self) -> Values:
+    def bounds(self) -> Floats:
         """Cell (r, c): the largest value of the block of 4 × 4 cells that begins there."""
         kernel = np.ones((BLOCK, BLOCK), np.uint8)
         largest = cv2.dilate(self.values, kernel, anchor=(0, 0), borderType=cv2.BORDER_CONSTANT, borderValue=0.0)
         return np.asarray(largest, np.float32)
 
 
-_STAMPS: dict[tuple[float, float], Values] = {}
+_STAMPS: dict[tuple[float, float], Floats] = {}
 
 
-def stamps_of(config: MatchConfig) -> Values:
+def stamps_of(config: MatchConfig) -> Floats:
     """Return what a surface point looks like in the cells around it, ``(phases, phases, size, size)``."""
     key = (config.cell_m, config.smooth_m)
     if key not in _STAMPS:

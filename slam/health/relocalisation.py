@@ -18,18 +18,15 @@ from typing import Annotated
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import FREE, OCCUPIED, OccupancyGrid
 from slam.grids.scan_matching import LikelihoodField, MatchConfig, body_points, match, refine
 from slam.health.evidence import agreement, through_walls
 from slam.settings import Config, Count, Gap, Share, Within, require
-from slam.types import Array, Scan
+from slam.types import Array, Floats, Scan
 
 __all__ = ["Place", "RelocalisationConfig", "Relocaliser"]
-
-Values = NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +184,7 @@ class Relocaliser:
         return order[: config.candidates]
 
     @staticmethod
-    def _lattice_score(scores: Values, near: Array, pose: Array, turns: int) -> float:
+    def _lattice_score(scores: Floats, near: Array, pose: Array, turns: int) -> float:
         k = int(np.argmin(np.abs(near - pose[:2]).sum(axis=1)))
         return float(scores[k, round(float(pose[2]) / (2.0 * math.pi) * turns) % turns])
 
@@ -222,7 +219,7 @@ class Relocaliser:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _score(
-    values: Values, x0: float, y0: float, cell: float, points: Array, positions: Array, scores: Values
+    values: Floats, x0: float, y0: float, cell: float, points: Array, positions: Array, scores: Floats
 ) -> None:
     """Write the mean field value of points ``(n, 2)`` from each position ``(m, 2)`` at each heading."""
     rows, cols = values.shape

@@ -9,10 +9,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = [
     "IGNORED",
@@ -101,9 +100,7 @@ def _distance(p: Array, i: int, rho: float, bearing: float, z: Array, h: Array) 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_expected(
-    s00: float, s01: float, s11: float, p: Array, i: int, h: Array
-) -> tuple[float, float, float]:  # fmt: skip
+def add_expected(s00: float, s01: float, s11: float, p: Array, i: int, h: Array) -> tuple[float, float, float]:
     """Return a covariance of range and bearing, R or zeros, plus H P Hᵀ of landmark ``i``.
 
     Over the five states that H touches, read from the upper triangle.
@@ -120,7 +117,7 @@ def add_expected(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def refuse_unlikely(x: Array, p: Array, offset: float, z: Array, gate: float, match: NDArray[np.int64]) -> None:
+def refuse_unlikely(x: Array, p: Array, offset: float, z: Array, gate: float, match: Indices) -> None:
     """Set to IGNORED the matches, given from outside, that lie beyond a squared Mahalanobis distance."""
     h = np.empty((2, 5))
     for k in range(z.shape[0]):
@@ -209,7 +206,7 @@ _FEWEST_SURE = 2  # matches without which a scan takes those, too
 @njit(cache=True, nogil=True, error_model="numpy")
 def nearest_neighbour(
     x: Array, p: Array, offset: float, z: Array, marks: Array, gate: float, near: float, max_turn: float,
-    only_sure: bool, match: NDArray[np.int64], distance: Array,
+    only_sure: bool, match: Indices, distance: Array,
 ) -> None:  # fmt: skip
     """Match each observation to the nearest landmark of its kind within the gate, each landmark once.
 

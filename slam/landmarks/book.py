@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import UNMATCHED, beside, nearest_neighbour
 from slam.landmarks.wall_evidence import DOUBT
 from slam.settings import Config, Count, Gap, NotNegative
-from slam.types import LINE, VIRTUAL, Array, Scan
+from slam.types import LINE, VIRTUAL, Array, Indices, Scan
 
 __all__ = [
     "FROM_MARK", "KIND", "LAST_SEEN", "MARKS", "RECENT", "LandmarkBook", "LandmarkPolicy", "count_recent",
@@ -88,7 +87,7 @@ class LandmarkBook:
         return self._marks[: self.count]
 
     @property
-    def ids(self) -> NDArray[np.int64]:
+    def ids(self) -> Indices:
         """Ids ``(n,)``; an id is never used twice. A view."""
         return self._ids[: self.count]
 
@@ -129,7 +128,7 @@ class LandmarkBook:
         self.count = n - 1
         self.row_of_id[self.ids[row:]] = np.arange(row, n - 1)
 
-    def replace(self, ids: NDArray[np.int64], marks: Array) -> None:
+    def replace(self, ids: Indices, marks: Array) -> None:
         """Have these landmarks ``(n,)``, with these marks ``(n, 14)``, instead of those it has."""
         self.row_of_id[self.ids] = -1
         count = len(ids)
@@ -138,7 +137,7 @@ class LandmarkBook:
         self.row_of_id[ids] = np.arange(count)
         self.count = count
 
-    def just_seen(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    def just_seen(self, points: Array) -> tuple[Indices, Indices, Array]:
         """Return rows and ids ``(k,)`` of what the last update showed, marks ``(k, 3)`` as key scans take them.
 
         ``points`` ``(n, 2)`` are the estimates: x, y, or of a wall α, r.
@@ -150,7 +149,7 @@ class LandmarkBook:
             self._ids = np.concatenate([self._ids, np.zeros_like(self._ids)])
             self._marks = np.vstack([self._marks, np.zeros_like(self._marks)])
 
-    def count_sightings(self, match: NDArray[np.int64]) -> None:
+    def count_sightings(self, match: Indices) -> None:
         """Count an update in which these rows (negative: none) were seen, all of them known from outside."""
         self.now += 1
         seen = match[match >= 0]
@@ -158,9 +157,8 @@ class LandmarkBook:
         self._marks[seen, LAST_SEEN] = self.now
 
     def review(
-        self, x: Array, offset: float, z: Array, match: NDArray[np.int64], scan: Scan | None = None, *,
-        at_once: bool = False,
-    ) -> tuple[list[int], list[int]]:  # fmt: skip
+        self, x: Array, offset: float, z: Array, match: Indices, scan: Scan | None = None, *, at_once: bool = False
+    ) -> tuple[list[int], list[int]]:
         """Count sightings; return the observations that are new landmarks by now, and rows to drop, highest first.
 
         Dropped are, where there is a scan, points that its beams keep passing through, or never show; and walls
@@ -188,9 +186,7 @@ class LandmarkBook:
 
 
 @njit(cache=True, nogil=True)
-def _seen_at(
-    now: int, marks: Array, ids: NDArray[np.int64], points: Array
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:  # fmt: skip
+def _seen_at(now: int, marks: Array, ids: Indices, points: Array) -> tuple[Indices, Indices, Array]:
     """Do what :meth:`LandmarkBook.just_seen` does, in two thirds of the time that indexing by arrays took."""
     n = points.shape[0]
     rows, seen_ids, seen = np.empty(n, np.int64), np.empty(n, np.int64), np.empty((n, 3))
@@ -228,7 +224,7 @@ def _goes_on(x: Array, offset: float, z: Array, marks: Array, near: float) -> bo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int, int]:
+def count_recent(marks: Array, match: Indices, now: int) -> tuple[int, int]:
     """Return how many landmarks the last three updates showed, and how many of those ``match`` has again."""
     recent = still = 0
     for i in range(marks.shape[0]):
@@ -242,8 +238,8 @@ def count_recent(marks: Array, match: NDArray[np.int64], now: int) -> tuple[int,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sightings(
-    x: Array, offset: float, z: Array, match: NDArray[np.int64], now: int, marks: Array, tentative: Array,
-    n: int, limits: Array, at_once: bool, new: NDArray[np.int64],
+    x: Array, offset: float, z: Array, match: Indices, now: int, marks: Array, tentative: Array,
+    n: int, limits: Array, at_once: bool, new: Indices,
 ) -> tuple[int, int]:  # fmt: skip
     """Count sightings; return how many observations are new landmarks, and how many tentative ones there are."""
     gate, confirm_after, edge_confirm_after, baseline = limits[0], limits[1], limits[2], limits[3]
@@ -370,9 +366,8 @@ def _look_through(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _review(
-    x: Array, offset: float, z: Array, match: NDArray[np.int64], ranges: Array, angle_min: float,
-    increment: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, at_once: bool,
-    new: NDArray[np.int64],
+    x: Array, offset: float, z: Array, match: Indices, ranges: Array, angle_min: float, increment: float, now: int,
+    marks: Array, tentative: Array, n: int, limits: Array, at_once: bool, new: Indices,
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Do what :meth:`LandmarkBook.review` does; return the numbers of new and of tentative ones, and of doubts."""
     found, kept = _sightings(x, offset, z, match, now, marks, tentative, n, limits, at_once, new)
@@ -382,7 +377,7 @@ def _review(
 @njit(cache=True, nogil=True, error_model="numpy")
 def match_and_recall(
     x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, only_sure: bool,
-    match: NDArray[np.int64], distance: Array,
+    match: Indices, distance: Array,
 ) -> tuple[int, int]:  # fmt: skip
     """Match by nearest neighbour; return what :func:`count_recent` does of it."""
     gate, near, max_turn = gates[0], gates[1], gates[2]

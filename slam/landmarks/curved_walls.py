@@ -17,10 +17,9 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.features.extraction import FeatureConfig
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = ["along_wall", "curvature", "curvature_model", "first_bend", "forget", "straighten"]
 
@@ -69,7 +68,7 @@ def curvature(info: float, pull: float, model: Array) -> tuple[float, float, flo
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, model: Array) -> None:
+def straighten(x: Array, offset: float, z: Array, match: Indices, marks: Array, model: Array) -> None:
     """Turn matched pieces of curved walls, in place, into the lines that their landmarks would show.
 
     Counts their curvature first. With Δ from where the wall is tangent to its line to the middle of the piece, t
@@ -117,7 +116,7 @@ def straighten(x: Array, offset: float, z: Array, match: NDArray[np.int64], mark
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def forget(z: Array, match: NDArray[np.int64], marks: Array) -> None:
+def forget(z: Array, match: Indices, marks: Array) -> None:
     """Take back what :func:`straighten` has counted of a match that did not stand; ``z`` as before it."""
     for k in range(z.shape[0]):
         if match[k] >= 0 and z[k, 5] == LINE:

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slam.files import check_tables, open_database, plain_name, quoted
 from slam.formats import replacing
-from slam.types import CONCAVE, CONVEX, Array
+from slam.types import CONCAVE, CONVEX, Array, Indices
 
 __all__ = ["SCHEMA_VERSION", "LandmarkMap", "read_landmark_map", "relate", "write_landmark_map"]
 
@@ -82,7 +82,7 @@ class LandmarkMap(NamedTuple):
 
 def relate(
     positions: Array, cov: Array, *, joint_cov: Array | None = None, neighbours: int = 8
-) -> tuple[NDArray[np.int64], Array, Array, Array]:
+) -> tuple[Indices, Array, Array, Array]:
     r"""Relate each landmark to its nearest neighbours.
 
     For a pair with unit vector u from a to b, and covariance blocks Paa, Pbb, Pab, to first order

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.landmarks.association import gated_distance, predicted
-from slam.types import CONCAVE, CONVEX, LINE, Array
+from slam.types import CONCAVE, CONVEX, LINE, Array, Indices
 
 __all__ = ["Innovation", "innovations"]
 
@@ -26,9 +25,7 @@ class Innovation(NamedTuple):
     extent: tuple[float, float]  # from where to where a wall was seen, along it from its foot [m]
 
 
-def innovations(
-    x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64], ids: NDArray[np.int64]
-) -> list[Innovation]:
+def innovations(x: Array, p: Array, offset: float, z: Array, match: Indices, ids: Indices) -> list[Innovation]:
     """Return the innovations of the observations that were matched, each on its own (docs/reference/ekf.md).
 
     Parameters

@@ -9,12 +9,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import IGNORED, UNMATCHED, alike, beside, gated_distance, predicted, too_near
 from slam.metrics.chi_square import chi2_quantile
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = ["JOINT_GATES", "JOINT_LIMITS", "MAX_OBSERVATIONS", "extend", "insert_nearest", "joint_compatibility"]
 
@@ -32,9 +31,8 @@ _MOST_NODES = 4000  # the search stops there with the best set so far; it is exp
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def joint_compatibility(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float,
-    match: NDArray[np.int64],
-) -> float:  # fmt: skip
+    x: Array, p: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float, match: Indices
+) -> float:
     """Match as many observations as one pose can explain together; return their joint squared distance.
 
     Joint compatibility branch and bound (Neira and Tardós 2001): the innovations of all pairings at once, with
@@ -100,9 +98,8 @@ def joint_compatibility(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _compatible(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, max_turn: float, candidate: NDArray[np.int64],
-    distance: Array,
-) -> int:  # fmt: skip
+    x: Array, p: Array, offset: float, z: Array, marks: Array, max_turn: float, candidate: Indices, distance: Array
+) -> int:
     """List the landmarks that one observation could be, nearest first; return how many."""
     h = np.zeros((2, 5))
     found = 0
@@ -118,7 +115,7 @@ def _compatible(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def insert_nearest(i: int, d2: float, nearest: NDArray[np.int64], distance: Array, count: int) -> int:
+def insert_nearest(i: int, d2: float, nearest: Indices, distance: Array, count: int) -> int:
     """Put ``i`` into a list, sorted by distance, of the nearest that there is room for; return their number."""
     most = nearest.shape[0]
     if count == most and d2 >= distance[most - 1]:
@@ -133,9 +130,8 @@ def insert_nearest(i: int, d2: float, nearest: NDArray[np.int64], distance: Arra
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def extend(
-    x: Array, p: Array, offset: float, z: Array, landmark: NDArray[np.int64], pairs: int, h: Array, factor: Array,
-    y: Array,
-) -> None:  # fmt: skip
+    x: Array, p: Array, offset: float, z: Array, landmark: Indices, pairs: int, h: Array, factor: Array, y: Array
+) -> None:
     """Add a pairing's two rows to the Cholesky factor L of S and to y = L⁻¹ ν."""
     i = landmark[pairs]
     rho, bearing = predicted(x, i, z[5], offset, h[pairs])
@@ -171,9 +167,8 @@ def _cross(p: Array, i: int, hi: Array, j: int, hj: Array) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _set_aside(
-    x: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float, count: NDArray[np.int64],
-    match: NDArray[np.int64],
-) -> None:  # fmt: skip
+    x: Array, offset: float, z: Array, marks: Array, near: float, max_turn: float, count: Indices, match: Indices
+) -> None:
     """Mark as IGNORED what is unmatched, yet could be a landmark or is too near to one to be new."""
     c, s = math.cos(x[2]), math.sin(x[2])
     for k in range(z.shape[0]):

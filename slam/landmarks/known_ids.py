@@ -19,12 +19,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import compose, inverse, transform_points
 from slam.landmarks.association import IGNORED, UNMATCHED
 from slam.metrics.measures import align_se2
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["Elsewhere", "KnownIds"]
 
@@ -68,7 +67,7 @@ class KnownIds:
         self._held: dict[int, int] = {}
         self._refused: dict[int, deque[_Refusal]] = {}  # of each landmark, since it was last believed
 
-    def note(self, ids: Sequence[int], z: Array, match: NDArray[np.int64], pose: Array) -> None:
+    def note(self, ids: Sequence[int], z: Array, match: Indices, pose: Array) -> None:
         """Take note of observations ``(m, 12)`` from a pose ``(3,)``, and of those that were refused."""
         for k, landmark in enumerate(ids):
             if match[k] == UNMATCHED:
@@ -187,7 +186,7 @@ def _slack(row: Array) -> float:
     return float(min(_SLACK_M + 2.0 * math.sqrt(row[2] + row[0] ** 2 * row[4]), _WIDEST_M))
 
 
-def _best_pose(points: Array, places: Array, slack: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _best_pose(points: Array, places: Array, slack: Array) -> tuple[Array, Flags]:
     """Return the pose on which most agree, fitted to those, and who they are ``(n,)``; tried pair by pair."""
     best, most = np.zeros(len(points), bool), 0
     for i in range(len(points)):

@@ -14,12 +14,11 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.landmarks.association import IGNORED, add_expected, gated_distance, predicted
 from slam.landmarks.book import LAST_SEEN
 from slam.landmarks.joint_compatibility import JOINT_GATES, extend, joint_compatibility
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = ["agreeing", "put_off"]
 
@@ -53,9 +52,8 @@ def _expected_variance(x: Array, p: Array, i: int, offset: float, z: Array, h: A
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def put_off(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float,
-    match: NDArray[np.int64],
-) -> int:  # fmt: skip
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float, match: Indices
+) -> int:
     """Set to IGNORED the matches with old landmarks that are not expected to within ``sigma`` [m]; count them.
 
     Where too little else is seen to wait for company, leaving them out would be going blind: there only those
@@ -85,7 +83,7 @@ def put_off(
 @njit(cache=True, nogil=True, error_model="numpy")
 def agreeing(
     x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, sigma: float, near: float,
-    max_turn: float, match: NDArray[np.int64],
+    max_turn: float, match: Indices,
 ) -> int:  # fmt: skip
     """Match old landmarks that are not expected to within ``sigma`` [m] if enough of them agree; return how many.
 

@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.landmarks.association import UNMATCHED, alike, gated_distance, nearest_neighbour
 from slam.landmarks.book import LAST_SEEN, RECENT
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["match_missed"]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def match_missed(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, match: NDArray[np.int64],
-    more: NDArray[np.int64],
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, match: Indices,
+    more: Indices,
 ) -> int:  # fmt: skip
     """Match what ``match`` has not to landmarks that the last updates showed and that it has not, either.
 
@@ -61,7 +60,7 @@ def match_missed(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _worth_it(
-    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, match: NDArray[np.int64]
+    x: Array, p: Array, offset: float, z: Array, marks: Array, now: int, gates: Array, match: Indices
 ) -> bool:
     """Tell whether any observation without a match may be a landmark that is missed: one scan in eighty."""
     h, again = np.empty((2, 5)), np.zeros(marks.shape[0], np.bool_)

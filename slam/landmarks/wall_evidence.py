@@ -23,11 +23,10 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.landmarks.association import add_expected, predicted
-from slam.types import LINE, Array
+from slam.types import LINE, Array, Indices
 
 __all__ = ["DOUBT", "lasting_factor", "take_back", "take_evidence"]
 
@@ -55,7 +54,7 @@ def lasting_factor(products: Array) -> float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def take_evidence(
-    x: Array, p: Array, offset: float, z: Array, match: NDArray[np.int64], marks: Array, now: int, products: Array
+    x: Array, p: Array, offset: float, z: Array, match: Indices, marks: Array, now: int, products: Array
 ) -> Array:
     """Count what the walls that are seen say, and enlarge their noise in ``z`` by what lasts of it.
 

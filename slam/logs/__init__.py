@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.files import ROS1_BAG, ROS1_REMEDY, is_bag
 from slam.logs import carmen, dpslam, ros_bag, utias, victoria_park
@@ -21,6 +20,7 @@ from slam.logs.recorded import ObservationNoise, RecordedLog
 from slam.logs.ros_bag import BagTopics, parse_mount
 from slam.logs.scans import ScanLog
 from slam.logs.tables import read_lines
+from slam.types import Indices
 
 __all__ = [
     "AnyLog", "BagTopics", "Event", "ObservationNoise", "RecordedLog", "ScanLog", "open_log", "parse_mount",
@@ -29,7 +29,7 @@ __all__ = [
 
 AnyLog = RecordedLog | ScanLog
 
-Rows = NDArray[np.int64]
+Rows = Indices
 
 _UTIAS_FILE = re.compile(r"Robot(\d+)_Odometry\.dat(?:\.gz)?")
 

@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import wrap
 from slam.logs.log import Event, Log
 from slam.settings import Config, NotNegative, Positive
-from slam.types import Array, Observations, Odometry
+from slam.types import Array, Indices, Observations, Odometry
 
 __all__ = ["Event", "ObservationNoise", "RecordedLog", "group_by_time", "split_holds"]
 
@@ -39,7 +38,7 @@ class ObservationNoise(Config):
         out[:, 1, 1] = math.radians(self.bearing_deg) ** 2
         return out
 
-    def repeated(self, times: Array, ids: NDArray[np.int64] | None) -> Array:
+    def repeated(self, times: Array, ids: Indices | None) -> Array:
         """Return by what the covariance of each sighting grows ``(o,)`` for what those before it have told.
 
         An error that lasts is not averaged out. Of a process with variance s² and correlation exp(−t/τ) a second
@@ -79,10 +78,10 @@ class RecordedLog(Log):
     odometry_times: Array  # (k ≥ 2,) [s] never falling, the first 0; a twist is held from its time to the next
     twists: Array  # (k, 3) vx, vy [m/s], ω [rad/s] in the body frame
     observation_times: Array  # (m,) [s] rising; one entry a set
-    observation_ends: NDArray[np.int64]  # (m,) set i is the rows from the end of set i - 1 to here
+    observation_ends: Indices  # (m,) set i is the rows from the end of set i - 1 to here
     range_bearing: Array  # (o, 2) [m, rad] in the body frame
-    ids: NDArray[np.int64] | None  # (o,) where landmarks were told apart as they were seen
-    landmark_ids: NDArray[np.int64] | None  # (l,) of the surveyed landmarks
+    ids: Indices | None  # (o,) where landmarks were told apart as they were seen
+    landmark_ids: Indices | None  # (l,) of the surveyed landmarks
     landmarks: Array | None  # (l, 2) [m] in the reference's frame
     observation_noise: ObservationNoise
 
@@ -155,7 +154,7 @@ class RecordedLog(Log):
         return np.column_stack([x, y, wrap(turned)])
 
 
-def group_by_time(times: Array, begin: float, end: float) -> tuple[Array, NDArray[np.int64], slice]:
+def group_by_time(times: Array, begin: float, end: float) -> tuple[Array, Indices, slice]:
     """Group observations ``(o,)`` in time order by equal times, those within [begin, end] only.
 
     Returns

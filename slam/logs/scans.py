@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.files import plain_name
 from slam.geometry import compose, inverse, relative, wrap
 from slam.logs.log import Event, Log
 from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
-from slam.types import Array, Odometry, Scan
+from slam.types import Array, Floats, Indices, Odometry, Scan
 
 __all__ = ["SETTINGS", "ScanLog", "beam_angles", "chain", "moved_by", "rising", "scan_log", "without_returns"]
 
@@ -67,7 +66,7 @@ class ScanLog(Log):
     times: Array  # (n ≥ 1,) [s] rising, the first 0
     stamps: Array  # (n,) [s] as recorded, by which a reference is matched: not always rising
     # (n, beams) [m]; inf where nothing within reach returned, nan where the beam was lost. As precise as recorded.
-    ranges: Array | NDArray[np.float32]
+    ranges: Array | Floats
     angle_min: float  # bearing of the first beam [rad]
     angle_increment: float  # [rad]
     range_max: float  # [m]
@@ -124,7 +123,7 @@ class ScanLog(Log):
         x, y, theta = self.odometry_poses.T
         return np.column_stack([offset[0] + c * x - s * y, offset[1] + s * x + c * y, wrap(offset[2] + theta)])
 
-    def with_reference(self, rows: NDArray[np.int64], poses: Array, note: str) -> ScanLog:
+    def with_reference(self, rows: Indices, poses: Array, note: str) -> ScanLog:
         """Return the log with reference poses ``(r ≥ 1, 3)`` at the scans ``rows`` ``(r,)``, rising.
 
         The start pose becomes the reference's, by the odometry where the first scan has none.

@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.files import open_bounded
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["find", "numbers_of", "read_lines", "read_table", "read_timed"]
 
@@ -37,7 +36,7 @@ def find(folder: Path, name: str) -> Path:
     raise ValueError(f"log {folder} lacks {name} (or {name}.gz); put it beside the others")
 
 
-def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, NDArray[np.int64]]:
+def read_table(path: Path, columns: int, meaning: str) -> tuple[Array, Indices]:
     """Read white-space separated numbers; empty lines and lines that begin with ``#`` are skipped.
 
     Parameters

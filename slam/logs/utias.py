@@ -25,13 +25,12 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.files import plain_name
 from slam.geometry import wrap
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time, split_holds
 from slam.logs.tables import find, read_table, read_timed
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["FIRST_LANDMARK", "NOISE", "SETTINGS", "read"]
 
@@ -193,7 +192,7 @@ def _pulsed(odometry: Array) -> Array:
     return np.column_stack([times, commands])
 
 
-def _runs(labels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _runs(labels: Array) -> tuple[Indices, Indices]:
     """Return where runs of equal labels (k,) begin, and where they end."""
     at = np.flatnonzero(labels[1:] != labels[:-1]) + 1
     return np.append(0, at), np.append(at, len(labels))
@@ -219,7 +218,7 @@ def _codes(path: Path) -> dict[int, int]:
     return codes
 
 
-def _landmarks(path: Path) -> tuple[NDArray[np.int64], Array]:
+def _landmarks(path: Path) -> tuple[Indices, Array]:
     values, lines = read_table(path, 5, "subject, x, y, their standard deviations")
     ids = values[:, 0].astype(np.int64)
     for i, line in enumerate(lines.tolist()):

@@ -10,11 +10,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.logs.recorded import ObservationNoise, RecordedLog, group_by_time
 from slam.logs.tables import find, read_table, read_timed
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = [
     "AXLES_M",
@@ -81,7 +80,7 @@ def car_twist(wheel_speed: Array, steering: Array) -> Array:
     return np.column_stack([centre - omega * LASER_LEFT_M, omega * LASER_AHEAD_M, omega])
 
 
-def plausible(fixes: Array) -> NDArray[np.bool_]:
+def plausible(fixes: Array) -> Flags:
     """Tell which fixes ``(n, 3)`` (time [s], east, north [m]) a car could have been at ``(n,)``.
 
     Not one that it would have had to reach and to leave faster than any car drives in a park. Jumps to stay,
@@ -89,7 +88,7 @@ def plausible(fixes: Array) -> NDArray[np.bool_]:
     """
     step = np.diff(fixes, axis=0)
     fast = np.hypot(step[:, 1], step[:, 2]) > _FASTEST_M_S * step[:, 0]
-    lone: NDArray[np.bool_] = np.append(False, fast) & np.append(fast, False)
+    lone: Flags = np.append(False, fast) & np.append(fast, False)
     return ~lone
 
 
@@ -133,7 +132,7 @@ def read(folder: Path) -> RecordedLog:
     )  # fmt: skip
 
 
-def _trees(folder: Path, begin: float, end: float) -> tuple[Array, Array, NDArray[np.int64]]:
+def _trees(folder: Path, begin: float, end: float) -> tuple[Array, Array, Indices]:
     """Return times ``(m,)`` since ``begin``, trees ``(o, 2)`` and where each frame's end ``(m,)``."""
     times = _times(folder, "lasersampling.txt")
     frames: list[Array] = []
@@ -157,9 +156,7 @@ def _times(folder: Path, name: str) -> Array:
     return 1e-3 * read_timed(find(folder, name), 1, "time in ms", second=1e3)[:, 0]
 
 
-def _beside(
-    folder: Path, name: str, columns: int, meaning: str, *, rows: int, of: str
-) -> tuple[Array, NDArray[np.int64]]:
+def _beside(folder: Path, name: str, columns: int, meaning: str, *, rows: int, of: str) -> tuple[Array, Indices]:
     """Read a table that must have as many rows as another file."""
     path = find(folder, name)
     values, lines = read_table(path, columns, meaning)

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.metrics.chi_square import chi2_quantile
-from slam.types import Array
+from slam.types import Array, Flags
 
 __all__ = [
     "CornerDeviation",
@@ -35,7 +35,6 @@ __all__ = [
     "time_to",
 ]
 
-Mask = NDArray[np.bool_]
 
 # ---------------------------------------------------------------------------------------------------------
 # Trajectories (Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", IROS 2012)
@@ -211,7 +210,7 @@ def corner_deviation(estimated: ArrayLike, true: ArrayLike) -> CornerDeviation:
     return CornerDeviation(float(each.mean()), float(each.max()), each)
 
 
-def compare_walls(belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: float) -> MapScore:
+def compare_walls(belief_occupied: Flags, true_wall: Flags, *, tolerance_cells: float) -> MapScore:
     """Compare the walls of two rasters on one lattice, forgiving displacements up to a tolerance.
 
     A belief cell is *right* when a true wall cell lies within the tolerance, a true cell *found* when a
@@ -234,7 +233,7 @@ def compare_walls(belief_occupied: Mask, true_wall: Mask, *, tolerance_cells: fl
     return MapScore(_ratio(found, walls + believed - right), _ratio(right, believed), _ratio(found, walls))
 
 
-def coverage(belief_free: Mask, visible_free: Mask) -> float:
+def coverage(belief_free: Flags, visible_free: Flags) -> float:
     """Return the share of the free cells that can be seen which the belief rightly has as free."""
     belief, visible = _rasters(belief_free, visible_free)
     return _ratio(int(np.count_nonzero(belief & visible)), int(np.count_nonzero(visible)))
@@ -249,14 +248,14 @@ def time_to(coverage_curve: ArrayLike, times: ArrayLike, *, level: float) -> flo
     return float(t[reached[0]]) if len(reached) else None
 
 
-def _rasters(belief: Mask, true: Mask) -> tuple[Mask, Mask]:
+def _rasters(belief: Flags, true: Flags) -> tuple[Flags, Flags]:
     a, b = np.asarray(belief, np.bool_), np.asarray(true, np.bool_)
     if a.ndim != 2 or a.shape != b.shape:
         raise ValueError(f"rasters must share one lattice, got {a.shape} and {b.shape}")
     return a, b
 
 
-def _within(cells: Mask, tolerance: float) -> Mask:
+def _within(cells: Flags, tolerance: float) -> Flags:
     if not cells.any():  # then there is no distance to measure
         return np.zeros(cells.shape, np.bool_)
     distance = cv2.distanceTransform((~cells).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -11,14 +11,14 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.geometry import relative, wrap
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["RelationScore", "closing_relations", "local_relations", "relation_errors", "relation_score"]
 
-Pairs = NDArray[np.int64]
+Pairs = Indices
 
 LOCAL_STEPS = (1, 5, 20)
 """Of the local relations, in poses: from one scan to the next, and over two longer stretches."""

@@ -13,11 +13,10 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.odometry.differential_transform import fill_model, fit_pade
 from slam.settings import Config, OneOf, Within, require
-from slam.types import Array
+from slam.types import Array, Flags
 
 __all__ = ["RECOVERIES", "Rules", "Tolerances", "Workspace", "advance"]
 
@@ -66,7 +65,7 @@ class Workspace(NamedTuple):
     column: Array  # (K,)
     system: Array  # (order / 2, order / 2 + 1), of a fraction's denominator
     below: Array  # (entries, order / 2), every entry's denominator
-    is_fraction: NDArray[np.bool_]  # (entries,): which are recovered by a fraction
+    is_fraction: Flags  # (entries,): which are recovered by a fraction
 
     @classmethod
     def of(cls, n: int, order: int) -> Workspace:

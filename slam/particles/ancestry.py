@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+
+from slam.types import Indices
 
 __all__ = ["Ancestry"]
 
@@ -40,7 +41,7 @@ class Ancestry:
             self._split(0, np.arange(particles))
 
     @property
-    def nodes(self) -> NDArray[np.int64]:
+    def nodes(self) -> Indices:
         """The nodes there are, the inner ones included."""
         return np.flatnonzero(self.parent != _FREE)
 
@@ -53,7 +54,7 @@ class Ancestry:
         return nodes
 
     def resample(
-        self, ancestors: NDArray[np.int64], *, forget: Callable[[int], None], merge: Callable[[int, int], int],
+        self, ancestors: Indices, *, forget: Callable[[int], None], merge: Callable[[int, int], int],
     ) -> None:  # fmt: skip
         """Let particle i descend from particle ``ancestors[i]`` ``(particles,)``.
 
@@ -75,7 +76,7 @@ class Ancestry:
         for particle in np.flatnonzero(copies > 1):
             self._split(int(before[particle]), np.flatnonzero(ancestors == particle))
 
-    def _split(self, node: int, particles: NDArray[np.int64]) -> None:
+    def _split(self, node: int, particles: Indices) -> None:
         for particle in particles:
             new = self._unused.pop()
             self.parent[new], self.leaf[particle] = node, new
@@ -83,9 +84,8 @@ class Ancestry:
         self._children[node] = len(particles)
 
     def _die(
-        self, node: int, leaves: NDArray[np.int64], forget: Callable[[int], None],
-        merge: Callable[[int, int], int],
-    ) -> None:  # fmt: skip
+        self, node: int, leaves: Indices, forget: Callable[[int], None], merge: Callable[[int, int], int]
+    ) -> None:
         parent = int(self.parent[node])
         forget(node)
         self._release(node)

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.geometry import wrap
 from slam.landmarks.association import IGNORED
 from slam.particles.maps import ParticleMaps
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["refuse_unlikely"]
 
 
 def refuse_unlikely(
     poses: Array, covs: Array, weights: Array, maps: ParticleMaps, offset: float, z: Array, gate: float,
-    rows: NDArray[np.int64],
+    rows: Indices,
 ) -> None:  # fmt: skip
     """Set to IGNORED the matches ``(m,)``, given from outside, beyond a squared Mahalanobis distance.
 

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import Array, Floats
+from slam.types import Array, Floats, Indices
 
 __all__ = ["PASSES", "STOPS", "SUM_X", "SUM_Y", "Lattice", "ParticleGrids", "ScanCells", "scan_cells"]
 
@@ -102,7 +102,7 @@ class ParticleGrids(abc.ABC):
         """Add a scan's evidence to a particle's map."""
 
     @abc.abstractmethod
-    def resample(self, ancestors: NDArray[np.int64]) -> None:
+    def resample(self, ancestors: Indices) -> None:
         """Let particle i have the map of particle ``ancestors[i]``."""
 
     @abc.abstractmethod

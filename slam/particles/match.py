@@ -6,17 +6,14 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap_scalar
 from slam.grids.match_kernels import climb, prior_loss, slope
-from slam.grids.scan_matching import MatchConfig, Values, stamps_of
+from slam.grids.scan_matching import MatchConfig, stamps_of
 from slam.particles.grids import OCCUPIED_SHARE, PASSES, STOPS, SUM_X, SUM_Y, Ints, ParticleGrids
-from slam.types import Array, Floats
+from slam.types import Array, Bytes, Floats, Indices
 
 __all__ = ["ParticleMatcher"]
-
-Bytes = NDArray[np.uint8]
 
 _BLOCK = 4  # cells a side of what is read of a map at once, around each beam's end and one to every side
 _UNWANTED, _UNKNOWN, _KNOWN = 0, 1, 2
@@ -65,7 +62,7 @@ class ParticleMatcher:
         return best, curvature, log_likelihood
 
     def informations(
-        self, grids: ParticleGrids, particle: int, points: Array, pose: Array, groups: NDArray[np.int64], most: int
+        self, grids: ParticleGrids, particle: int, points: Array, pose: Array, groups: Indices, most: int
     ) -> tuple[Array, float]:
         """Tell the parts of the map apart that a fit's information is from.
 
@@ -149,7 +146,7 @@ def wanted_cells(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def draw_surfaces(
-    values: Values, plane: Bytes, row: int, col: int, cells: Ints, evidence: Floats, stamps: Values
+    values: Floats, plane: Bytes, row: int, col: int, cells: Ints, evidence: Floats, stamps: Floats
 ) -> None:
     """Draw the surfaces among the cells into the wanted part of the window."""
     phases, half = stamps.shape[0], stamps.shape[2] // 2
@@ -174,7 +171,7 @@ def draw_surfaces(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def weigh(
-    values: Values, plane: Bytes, x0: float, y0: float, cell: float, points: Array, pose: Array, prior: Array,
+    values: Floats, plane: Bytes, x0: float, y0: float, cell: float, points: Array, pose: Array, prior: Array,
     info: Array, beam_weight: float, unknown: float, free: float,
 ) -> float:  # fmt: skip
     """Return the log-likelihood of the beams' ends, less what the pose's own prior loses."""
@@ -194,7 +191,7 @@ def weigh(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def wipe(values: Values, plane: Bytes, row: int, col: int, cells: Ints) -> None:
+def wipe(values: Floats, plane: Bytes, row: int, col: int, cells: Ints) -> None:
     """Make the window as it was: blocks that hold a listed cell are all there is in it."""
     for k in range(cells.shape[0]):
         values[cells[k, 0] - row, cells[k, 1] - col] = 0.0
@@ -202,7 +199,7 @@ def wipe(values: Values, plane: Bytes, row: int, col: int, cells: Ints) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def misfit(values: Values, x0: float, y0: float, cell: float, points: Array, pose: Array, smooth: float) -> float:
+def misfit(values: Floats, x0: float, y0: float, cell: float, points: Array, pose: Array, smooth: float) -> float:
     """Return the mean d² of the field's exp(-d²/2s²) under the beams' ends, each weighed by the field itself.
 
     So a beam counts as much as it does in the fit, and one that met something unknown does not.

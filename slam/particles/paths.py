@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Paths"]
-
-Ints = NDArray[np.int64]
 
 
 class Paths:
@@ -35,7 +32,7 @@ class Paths:
         self._last = new
         self._count += n
 
-    def resample(self, ancestors: Ints) -> None:
+    def resample(self, ancestors: Indices) -> None:
         """Let particle i have the path of particle ``ancestors[i]``."""
         self._last = self._last[ancestors]
 
@@ -49,7 +46,7 @@ class Paths:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def compact(poses: Array, before: Ints, last: Ints, count: int) -> int:
+def compact(poses: Array, before: Indices, last: Indices, count: int) -> int:
     """Move the poses that some particle descends from together; return how many there are."""
     place = np.full(count, -1, np.int64)
     for k in range(last.shape[0]):

@@ -8,11 +8,10 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.geometry import wrap, wrap_scalar
 from slam.settings import Config, Count, OneOf, PositiveShare
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["ResamplingPolicy", "effective_particles", "normalise", "pose_moments", "scattered", "systematic"]
 
@@ -73,7 +72,7 @@ def effective_particles(weights: Array) -> float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def systematic(weights: Array, uniform: float, ancestors: NDArray[np.int64]) -> None:
+def systematic(weights: Array, uniform: float, ancestors: Indices) -> None:
     """Resample systematically: fill ``ancestors`` ``(n,)`` with the particle that each one descends from.
 
     The points (u + j) / n, j = 0 … n-1, on the cumulated weights: one ``uniform`` number in [0, 1) for all, and a

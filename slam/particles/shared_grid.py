@@ -16,11 +16,10 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.particles.ancestry import Ancestry
 from slam.particles.grids import Ints, ParticleGrids, ScanCells
-from slam.types import Array, Floats
+from slam.types import Array, Floats, Indices
 
 __all__ = ["TILE", "CopiedGrids", "SharedGrid"]
 
@@ -90,7 +89,7 @@ class SharedGrid(ParticleGrids):
             scan.cells, scan.evidence, scan.count,
         )  # fmt: skip
 
-    def resample(self, ancestors: NDArray[np.int64]) -> None:
+    def resample(self, ancestors: Indices) -> None:
         """Let particle i have the map of particle ``ancestors[i]``."""
         self.ancestry.resample(ancestors, forget=self._forget, merge=self._merge)
 
@@ -151,7 +150,7 @@ class CopiedGrids(ParticleGrids):
         cells = scan.cells[: scan.count]
         self._maps[particle, cells[:, 0], cells[:, 1]] += scan.evidence[: scan.count]  # every cell is there once
 
-    def resample(self, ancestors: NDArray[np.int64]) -> None:
+    def resample(self, ancestors: Indices) -> None:
         """Let particle i have the map of particle ``ancestors[i]``."""
         self._maps = self._maps[ancestors]
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slam.accounts.account import Account
 from slam.geometry import compose, inverse, wrap
@@ -22,11 +21,11 @@ from slam.settings import Config, Gap, NotNegative, Share, Within
 from slam.teams.constellation import ConstellationConfig, candidates, rigid_fit, same_landmarks
 from slam.teams.contradiction import contradiction
 from slam.teams.joint import Joint, Link, SameConfig, joint_of
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["Alignment", "AlignmentConfig", "align", "same_place"]
 
-Pairs = NDArray[np.int64]
+Pairs = Indices
 
 _IDENTITY = (np.zeros(3), np.zeros((3, 3)))
 
@@ -169,7 +168,7 @@ def _fit(
         points, walls = points[kept[: len(points)]], walls[kept[len(points) :]]
 
 
-def _agreeing(joint: Joint, config: AlignmentConfig) -> NDArray[np.bool_]:
+def _agreeing(joint: Joint, config: AlignmentConfig) -> Flags:
     """Return which links may stay: the one that is farthest off goes, while any is, or all together are, too far.
 
     Joint compatibility (Neira and Tardós 2001), by Baarda's test of one observation against the rest.

@@ -16,7 +16,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from slam.accounts.account import Account
 from slam.belief import Belief
@@ -30,7 +30,7 @@ from slam.metrics.measures import nees_pose
 from slam.settings import require
 from slam.teams.apart import EXACT_COV, Apart, Start
 from slam.teams.turns import correct_by_sighting, swap_robots
-from slam.types import LINE, Array, Observations, Odometry, Scan
+from slam.types import LINE, Array, Floats, Indices, Observations, Odometry, Scan
 
 __all__ = ["JointEkf", "JointMember"]
 
@@ -140,7 +140,7 @@ class JointEkf:
         p, cross = np.triu(at._p[:n, :n]), at._beside.cross[:, :n]
         return np.block([[p + np.triu(p, 1).T, cross.T], [cross, at._beside.cov]])
 
-    def _rows(self) -> NDArray[np.int64]:
+    def _rows(self) -> Indices:
         """Return where every pose stands ``(3N,)`` when those beside the map follow the active robot's."""
         return (3 + np.array(self._row)[:, None] + np.arange(3)).ravel()
 
@@ -300,18 +300,18 @@ class JointMember(EkfSlam):
         cov = super().pose_cov  # in the frame in which it draws
         return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
 
-    def _covariance(self, landmarks: NDArray[np.int64]) -> Array:
+    def _covariance(self, landmarks: Indices) -> Array:
         cov: Array = super()._covariance(landmarks)
         return cov if self._apart is None else cov + self._in_all(landmarks)
 
-    def _own_covariances(self, landmarks: NDArray[np.int64]) -> Array:
+    def _own_covariances(self, landmarks: Indices) -> Array:
         own: Array = super()._own_covariances(landmarks)
         if self._apart is not None and len(landmarks):
             added = self._in_all(landmarks)[3:, 3:].reshape(len(landmarks), 2, len(landmarks), 2)
             own = own + np.einsum("iajb,ij->iab", added, np.eye(len(landmarks)))
         return own
 
-    def _in_all(self, landmarks: NDArray[np.int64]) -> Array:
+    def _in_all(self, landmarks: Indices) -> Array:
         """Return what the start's error adds to the covariance of the robot and some landmarks, in their order."""
         assert self._apart is not None
         walls = self._marks[landmarks, 0] == LINE
@@ -340,7 +340,7 @@ class JointMember(EkfSlam):
         self._team._turn(self.index)
         return super().belief
 
-    def near_landmarks(self, out: NDArray[np.float32]) -> None:
+    def near_landmarks(self, out: Floats) -> None:
         """Write the landmarks nearest to this robot in its frame (see the base class)."""
         self._team._turn(self.index)
         super().near_landmarks(out)
@@ -351,7 +351,7 @@ class JointMember(EkfSlam):
         self._team._turn(self.index)
         return super().landmark_count
 
-    def landmark_details(self) -> tuple[NDArray[np.int64], Array]:
+    def landmark_details(self) -> tuple[Indices, Array]:
         """Return per point landmark how often all robots saw it and its direction in the belief's frame [rad]."""
         self._team._turn(self.index)
         return super().landmark_details()

@@ -13,17 +13,16 @@ from typing import Annotated
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from slam.accounts.account import Account
 from slam.geometry import transform_points, wrap, wrap_scalar
 from slam.settings import Angle, Config, Count, Few, Length, Within, require
 from slam.teams.frames import ends_into, points_into, walls_into
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["ConstellationConfig", "candidates", "rigid_fit", "same_landmarks"]
 
-Pairs = NDArray[np.int64]
+Pairs = Indices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +68,7 @@ def candidates(a: Account, b: Account, config: ConstellationConfig) -> Array:
     return np.array(places).reshape(-1, 3)[np.argsort(-np.array(matches), kind="stable")[: config.count]]
 
 
-def _oriented(account: Account) -> NDArray[np.int64]:
+def _oriented(account: Account) -> Indices:
     return np.flatnonzero((account.kinds != 0) & np.isfinite(account.directions))
 
 
@@ -82,9 +81,7 @@ def _pairs(points: Array, neighbours: int, shortest: float) -> Pairs:
     return np.asarray(pairs[np.isfinite(apart[pairs[:, 0], pairs[:, 1]])], np.int64)
 
 
-def _by_pairs(
-    a: Account, b: Account, rows_a: NDArray[np.int64], rows_b: NDArray[np.int64], config: ConstellationConfig
-) -> Array:
+def _by_pairs(a: Account, b: Account, rows_a: Indices, rows_b: Indices, config: ConstellationConfig) -> Array:
     """Return the frame ``(h, 3)`` by every pair of b's corners that is like one of a's."""
     # Of b more neighbours: it may have corners between those that a has.
     pairs_a = rows_a[_pairs(a.points[rows_a], config.neighbours, config.shortest_m)]
@@ -111,7 +108,7 @@ def _by_pairs(
     return np.column_stack([middle_a - turned, wrap(turn)])
 
 
-def _by_single_corners(a: Account, b: Account, rows_a: NDArray[np.int64], rows_b: NDArray[np.int64]) -> Array:
+def _by_single_corners(a: Account, b: Account, rows_a: Indices, rows_b: Indices) -> Array:
     """Return the frame ``(h, 3)`` by every corner of b's that is of the kind of one of a's."""
     p, q = (x.ravel() for x in np.meshgrid(rows_a, rows_b, indexing="ij"))
     alike = a.kinds[p] == b.kinds[q]
@@ -131,9 +128,8 @@ def _by_single_corners(a: Account, b: Account, rows_a: NDArray[np.int64], rows_b
 
 
 def _support(
-    a: Account, b: Account, rows_a: NDArray[np.int64], rows_b: NDArray[np.int64], poses: Array,
-    config: ConstellationConfig,
-) -> Array:  # fmt: skip
+    a: Account, b: Account, rows_a: Indices, rows_b: Indices, poses: Array, config: ConstellationConfig
+) -> Array:
     """Return for each pose ``(h,)`` how many of b's corners have one of a's that may be the same."""
     rows_a = rows_a[np.argsort(a.points[rows_a, 0], kind="stable")]
     there, theirs = (

@@ -18,7 +18,7 @@ from slam.geometry import compose, inverse
 from slam.teams.alignment import Alignment
 from slam.teams.frames import ends_into, points_into, pose_into, walls_into
 from slam.teams.joint import Frame, Joint, Link, SameConfig, joint_of
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["MergedMap", "fuse"]
 
@@ -39,7 +39,7 @@ class MergedMap:
     point_covs: Array  # (m, 2, 2) [m²]
     kinds: NDArray[np.int8]  # (m,)
     directions: Array  # (m,) [rad], nan where not known
-    times_seen: NDArray[np.int64]  # (m,) by all together
+    times_seen: Indices  # (m,) by all together
     seen_by: tuple[tuple[int, ...], ...]  # (m,) robots that have the corner in their maps
     walls: Array  # (k, 2) α [rad], r [m], as accounts have them
     wall_ends: Array  # (k, 4) [m] as far as they were seen by all together

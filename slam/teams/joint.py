@@ -18,14 +18,13 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
 
 from slam.accounts.account import Account
 from slam.geometry import wrap
 from slam.settings import Config, Within
 from slam.teams.frames import points_into, walls_into
-from slam.types import Array
+from slam.types import Array, Indices
 
 __all__ = ["Frame", "Joint", "Link", "SameConfig", "joint_of", "own_cov"]
 
@@ -61,7 +60,7 @@ class Joint:
     x: Array  # (s,)
     frames: Array  # (N, 3) poses of the accounts' frames in the common one
     cov: Array  # (s + 3N,) squared: of x, then of the frames
-    starts: NDArray[np.int64]  # (N,) where an account's state begins in x
+    starts: Indices  # (N,) where an account's state begins in x
     chi_square: float  # of the links, χ² with dof degrees of freedom where all of them are true
     dof: int
     outlying: Array  # (links,) how far each link is from what all others say, χ² with 2 degrees of freedom
@@ -152,7 +151,7 @@ def joint_of(
 
 
 def _linearised(
-    accounts: Sequence[Account], starts: NDArray[np.int64], links: Sequence[Link], y: Array
+    accounts: Sequence[Account], starts: Indices, links: Sequence[Link], y: Array
 ) -> tuple[Array, Array]:
     """Return h ``(2 links,)`` and its Jacobian by x and all frames ``(2 links, s + 3N)``."""
     count = len(accounts)

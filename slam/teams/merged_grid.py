@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slam.geometry import rotation, transform_points
 from slam.grids.occupancy import CLASS_OF, OccupancyGrid
 from slam.grids.scan_drawing import ENTROPY_BIT, MAX_LOG_ODDS, MIN_LOG_ODDS, PROBABILITY_BYTE, WORD
-from slam.types import Array
+from slam.types import Array, Bytes
 
 __all__ = ["Chart", "MergedGrid"]
 
@@ -166,8 +166,8 @@ def _differing(plane: NDArray[np.int16], other: NDArray[np.int16]) -> tuple[int,
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sum(
-    own: NDArray[np.int8], own_visited: NDArray[np.uint8], down: int, ahead: int, given: NDArray[np.int16],
-    before: NDArray[np.int16], taken: NDArray[np.int8], cells: NDArray[np.int8], visited: NDArray[np.uint8],
+    own: NDArray[np.int8], own_visited: Bytes, down: int, ahead: int, given: NDArray[np.int16],
+    before: NDArray[np.int16], taken: NDArray[np.int8], cells: NDArray[np.int8], visited: Bytes,
     row0: int, col0: int, row1: int, col1: int, overview: NDArray[np.int32], shift: int,
 ) -> tuple[int, float]:  # fmt: skip
     """Write own + given cells of a box; return by how much the known cells and the entropy went up.

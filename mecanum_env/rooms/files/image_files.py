@@ -7,12 +7,12 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from mecanum_env.rooms.floor_plan import FloorPlanError
 from slam.files import read_bytes as read_file
 from slam.files import shown_path
+from slam.types import Floats
 
 __all__ = ["IMAGE_SUFFIXES", "read_bytes", "read_grey"]
 
@@ -49,7 +49,7 @@ def _reason(error: Exception) -> str:
     return getattr(error, "strerror", None) or str(error)
 
 
-def read_grey(path: Path) -> NDArray[np.float32]:
+def read_grey(path: Path) -> Floats:
     """Return an image as grey values ``(rows, cols)`` in 0 to 255, row 0 at the top; transparent is NaN.
 
     Colours are averaged, as ROS's map_server does.
@@ -79,7 +79,7 @@ def read_grey(path: Path) -> NDArray[np.float32]:
         ) from error
 
 
-def _grey(image: Image.Image) -> NDArray[np.float32]:
+def _grey(image: Image.Image) -> Floats:
     if image.mode.startswith("I"):  # 16 bits, which Pillow scales to 65535
         return np.asarray(image, np.float32) * np.float32(255.0 / 65535.0)
     pixels = np.asarray(image.convert("RGBA"))

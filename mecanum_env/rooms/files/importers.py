@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.rooms.files.image_files import IMAGE_SUFFIXES, read_bytes, read_grey
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
@@ -20,15 +19,15 @@ from mecanum_env.rooms.layout.assembly import DRIVE_RADIUS_M, generator
 from mecanum_env.rooms.outlines.distance import largest_part
 from mecanum_env.rooms.outlines.outline import outline_segments
 from slam.files import parse_yaml, quoted, shown_path
+from slam.types import Flags
 
 __all__ = ["MAP_SUFFIXES", "from_raster", "image_of", "load"]
 
 MAP_SUFFIXES = (".yaml", ".yml")
 """Suffixes of ROS maps."""
 
-Mask = NDArray[np.bool_]
 Pose = Sequence[float]
-Raster = tuple[Mask, float, tuple[float, float]]  # free cells, their side [m], the lower-left corner [m]
+Raster = tuple[Flags, float, tuple[float, float]]  # free cells, their side [m], the lower-left corner [m]
 
 _START_CLEARANCE_M = 0.6
 _RADII_M = (DRIVE_RADIUS_M, 0.35, 0.3, 0.2, 0.1, 0.0)
@@ -139,7 +138,7 @@ def _beside(path: Path, image: str, what: str) -> Path:
 
 
 def from_raster(
-    free: Mask,
+    free: Flags,
     *,
     name: str,
     resolution: float,
@@ -183,7 +182,7 @@ def from_raster(
 
 
 def _start(
-    free: Mask, resolution: float, origin: tuple[float, float], rng: np.random.Generator
+    free: Flags, resolution: float, origin: tuple[float, float], rng: np.random.Generator
 ) -> tuple[float, float, float]:
     clearance = clearance_of(free, resolution)
     # Of a free cell's centre at the least, so that some radius fits.

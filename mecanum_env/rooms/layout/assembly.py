@@ -7,17 +7,15 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.rooms.floor_plan import FloorPlan, FloorPlanError, clearance_of
 from mecanum_env.rooms.layout.furniture import CELL_M, Box, Piece
 from mecanum_env.rooms.outlines.distance import distance_to_zero, largest_part
 from mecanum_env.rooms.outlines.rectilinear import raster, surfaces
 from slam.files import quoted
+from slam.types import Flags, Floats
 
 __all__ = ["DRIVE_RADIUS_M", "START_M", "assemble", "choose_start", "generator", "unreached"]
-
-Mask = NDArray[np.bool_]
 
 DRIVE_RADIUS_M = 0.40
 """Disc that can be driven everywhere in a generated plan [m]: a youBot, 0.347 m, with 5 cm to spare."""
@@ -84,7 +82,7 @@ def assemble(
     )
 
 
-def unreached(free: Mask, clearance: NDArray[np.float32]) -> tuple[Mask, Mask | None]:
+def unreached(free: Flags, clearance: Floats) -> tuple[Flags, Flags | None]:
     """Return the largest area that the disc's centre can move in, and the largest patch it leaves unswept.
 
     The patch is None if all is well: free space is in one piece, and no patch of it that the disc cannot sweep
@@ -105,9 +103,7 @@ def unreached(free: Mask, clearance: NDArray[np.float32]) -> tuple[Mask, Mask | 
     return reach, None
 
 
-def choose_start(
-    clearance: NDArray[np.float32], reach: Mask, rng: np.random.Generator
-) -> tuple[float, float, float]:
+def choose_start(clearance: Floats, reach: Flags, rng: np.random.Generator) -> tuple[float, float, float]:
     """Return a random pose x, y [m], θ [rad] at a cell's centre with much clearance, along one of the axes."""
     for needed in _START_CLEARANCES_M:
         rooms = np.flatnonzero(reach & (clearance >= needed))
@@ -121,7 +117,7 @@ def choose_start(
     return round((col + 0.5) * CELL_M, 6), round((row + 0.5) * CELL_M, 6), theta
 
 
-def _stamp(piece: Piece, size: tuple[int, int]) -> tuple[Box, Mask]:
+def _stamp(piece: Piece, size: tuple[int, int]) -> tuple[Box, Flags]:
     """Cells under a piece: those whose centre is within it."""
     x0, y0, x1, y1 = piece.box
     if not piece.radius and not piece.angle:
@@ -135,7 +131,7 @@ def _stamp(piece: Piece, size: tuple[int, int]) -> tuple[Box, Mask]:
     return piece.box, (along <= 0.5 * piece.size[0]) & (across <= 0.5 * piece.size[1])
 
 
-def _nearest_piece(pieces: Sequence[Piece], pocket: Mask) -> int:
+def _nearest_piece(pieces: Sequence[Piece], pocket: Flags) -> int:
     """Index of the piece nearest to the middle of a pocket."""
     rows, cols = np.nonzero(pocket)
     x, y = float(cols.mean()), float(rows.mean())

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from slam.types import CONCAVE, CONVEX, Array
+from slam.types import CONCAVE, CONVEX, Array, Flags, Indices
 
 __all__ = ["find_corners"]
 
@@ -25,7 +25,7 @@ _LEFT, _BOTH = 0, 1  # on which sides of a wall free space lies
 
 
 def find_corners(
-    walls: Array, polygons: tuple[Array, ...], is_free: Callable[[Array], NDArray[np.bool_]], resolution: float
+    walls: Array, polygons: tuple[Array, ...], is_free: Callable[[Array], Flags], resolution: float
 ) -> tuple[Array, NDArray[np.int8]]:
     """Return corner points ``(n, 2)`` [m] and their kinds ``(n,)``: CONVEX, CONCAVE, or 0 between thin walls.
 
@@ -49,14 +49,14 @@ def find_corners(
     return np.ascontiguousarray(points[keep]), kinds[keep].astype(np.int8)
 
 
-def _unique_within(points: Array) -> NDArray[np.int64]:
+def _unique_within(points: Array) -> Indices:
     """Return the indices of points no two of which are within the touching distance."""
     order = np.lexsort((points[:, 1], points[:, 0]))
     return np.sort(order[_first_of_cluster(np.ascontiguousarray(points[order]))])
 
 
 @njit(cache=True, nogil=True)
-def _first_of_cluster(points: Array) -> NDArray[np.bool_]:
+def _first_of_cluster(points: Array) -> Flags:
     """Mask of points, sorted by x, that no earlier kept point lies within the touching distance of."""
     keep = np.ones(points.shape[0], np.bool_)
     for i in range(points.shape[0]):
@@ -69,9 +69,7 @@ def _first_of_cluster(points: Array) -> NDArray[np.bool_]:
     return keep
 
 
-def _orient(
-    walls: Array, is_free: Callable[[Array], NDArray[np.bool_]], resolution: float
-) -> tuple[Array, NDArray[np.int64]]:
+def _orient(walls: Array, is_free: Callable[[Array], Flags], resolution: float) -> tuple[Array, Indices]:
     """Turn walls so that free space is on the left; say which have it on both sides."""
     along = walls[:, 2:] - walls[:, :2]
     length = np.maximum(np.hypot(along[:, 0], along[:, 1]), 1e-12)[:, None]
@@ -88,9 +86,7 @@ def _orient(
 
 
 @njit(cache=True, nogil=True)
-def _classify(
-    points: Array, walls: Array, sides: NDArray[np.int64], edges: Array, first: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def _classify(points: Array, walls: Array, sides: Indices, edges: Array, first: Indices) -> Indices:
     """Kind of each point, or -2 where it is no corner."""
     kinds = np.full(points.shape[0], -2, np.int64)
     solid = np.zeros(_DIRECTIONS, np.bool_)
@@ -107,9 +103,7 @@ def _classify(
 
 
 @njit(cache=True, nogil=True)
-def _sort_by_walls(
-    x: float, y: float, walls: Array, sides: NDArray[np.int64], solid: NDArray[np.bool_], nearest: Array
-) -> bool:
+def _sort_by_walls(x: float, y: float, walls: Array, sides: Indices, solid: Flags, nearest: Array) -> bool:
     """Mark the directions behind walls at (x, y): the angularly nearest surface decides.
 
     Returns whether thin walls, free on both sides, bend here.
@@ -147,7 +141,7 @@ def _sort_by_walls(
 
 
 @njit(cache=True, nogil=True)
-def _sort_by_polygon(x: float, y: float, edges: Array, solid: NDArray[np.bool_]) -> None:
+def _sort_by_polygon(x: float, y: float, edges: Array, solid: Flags) -> None:
     """Mark the directions that lead from (x, y) into a convex polygon that the point touches."""
     touches = False
     for e in range(edges.shape[0]):
@@ -175,7 +169,7 @@ def _sort_by_polygon(x: float, y: float, edges: Array, solid: NDArray[np.bool_])
 
 
 @njit(cache=True, nogil=True)
-def _kind(solid: NDArray[np.bool_], bent: bool) -> int:
+def _kind(solid: Flags, bent: bool) -> int:
     """Kind of corner from its free directions, -2 for none."""
     count, runs = 0, 0
     for k in range(_DIRECTIONS):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from slam.types import Bytes, Flags, Floats
 
 __all__ = ["distance_to_zero", "largest_part"]
 
 
-def distance_to_zero(mask: NDArray[np.bool_] | NDArray[np.uint8]) -> NDArray[np.float32]:
+def distance_to_zero(mask: Flags | Bytes) -> Floats:
     """Return each cell's distance [cells] ``(rows, cols)`` to the nearest one that is 0, centre to centre.
 
     The last bits of OpenCV's square root depend on how many threads it has and on where an array lies in memory.
@@ -20,7 +21,7 @@ def distance_to_zero(mask: NDArray[np.bool_] | NDArray[np.uint8]) -> NDArray[np.
     return np.sqrt(squared).astype(np.float32)
 
 
-def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+def largest_part(mask: Flags) -> Flags | None:
     """Return the largest 4-connected part of a mask ``(rows, cols)``, None if it is empty."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     if count < 2:

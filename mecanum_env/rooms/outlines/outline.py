@@ -13,13 +13,10 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["outline_segments", "trace"]
-
-Mask = NDArray[np.bool_]
 
 _TOLERANCE = 0.5 + 1e-9  # [cells]: the flat top of an arc is cut by exactly half a cell
 _PLACES = 5  # where along a jog pieces may meet; odd, so that its middle is one
@@ -30,7 +27,7 @@ _DX = np.array([1, 0, -1, 0], np.int64)
 _DY = np.array([0, 1, 0, -1], np.int64)
 
 
-def outline_segments(free: Mask, *, simplify: bool = True) -> Array:
+def outline_segments(free: Flags, *, simplify: bool = True) -> Array:
     """Return the surfaces ``(n, 4)`` around free space, in cells, free space on the left of each.
 
     A point (x, y) is x cells right of and y cells above the lower-left corner of cell (0, 0). What lies outside
@@ -48,7 +45,7 @@ def outline_segments(free: Mask, *, simplify: bool = True) -> Array:
     return np.hstack([corners, corners[following]])
 
 
-def trace(free: Mask) -> tuple[Array, NDArray[np.int64]]:
+def trace(free: Flags) -> tuple[Array, Indices]:
     """Return the corners ``(n, 2)`` of the exact outline [cells], and where each closed loop of them begins.
 
     Loop i has the corners ``first[i]`` to ``first[i + 1]``; it has free space on its left.
@@ -60,7 +57,7 @@ def trace(free: Mask) -> tuple[Array, NDArray[np.int64]]:
 
 
 @njit(cache=True, nogil=True)
-def _walk(free: Mask) -> tuple[Array, NDArray[np.int64]]:
+def _walk(free: Flags) -> tuple[Array, Indices]:
     """Walk every loop of the outline of a raster whose border is solid, in lattice coordinates."""
     rows, cols = free.shape
     corners, first = np.empty((1024, 2), np.float64), np.empty(256, np.int64)
@@ -97,7 +94,7 @@ def _walk(free: Mask) -> tuple[Array, NDArray[np.int64]]:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _next_heading(free: Mask, x: int, y: int, heading: int) -> int:
+def _next_heading(free: Flags, x: int, y: int, heading: int) -> int:
     """Heading after lattice point (x, y), free space staying on the left and solid on the right."""
     # The cells before the point, left and right of the heading.
     if heading == 0:
@@ -114,7 +111,7 @@ def _next_heading(free: Mask, x: int, y: int, heading: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _straighten(corners: Array, first: NDArray[np.int64]) -> tuple[Array, NDArray[np.int64]]:
+def _straighten(corners: Array, first: Indices) -> tuple[Array, Indices]:
     """Replace the stairs of loops of corners by straight pieces."""
     out = np.empty_like(corners)
     out_first = np.empty_like(first)
@@ -133,9 +130,7 @@ def _straighten(corners: Array, first: NDArray[np.int64]) -> tuple[Array, NDArra
 
 
 @njit(cache=True, nogil=True)
-def _straighten_loop(
-    loop: Array, out: Array, n: int, path: Array, role: NDArray[np.int64], stair: NDArray[np.bool_]
-) -> int:
+def _straighten_loop(loop: Array, out: Array, n: int, path: Array, role: Indices, stair: Flags) -> int:
     """Append the straightened loop to ``out`` from row ``n`` on; return the row after it."""
     size = loop.shape[0]
     for i in range(size):
@@ -167,7 +162,7 @@ def _straighten_loop(
 
 
 @njit(cache=True, nogil=True)
-def _stations(loop: Array, stair: NDArray[np.bool_], path: Array, role: NDArray[np.int64]) -> int:
+def _stations(loop: Array, stair: Flags, path: Array, role: Indices) -> int:
     """List the loop's corners and the middles of its stairs' jogs, in order, each with its role.
 
     Roles: 0 a stair's corner, which pieces must pass near; 1 the middle of a jog, where they may meet; 2 any
@@ -188,9 +183,7 @@ def _stations(loop: Array, stair: NDArray[np.bool_], path: Array, role: NDArray[
 
 
 @njit(cache=True, nogil=True)
-def _straighten_stair(
-    path: Array, role: NDArray[np.int64], count: int, at: int, stop: int, out: Array, n: int
-) -> int:
+def _straighten_stair(path: Array, role: Indices, count: int, at: int, stop: int, out: Array, n: int) -> int:
     """Append the fewest straight pieces from station ``at`` to ``stop``, both met exactly; return the row after.
 
     Dynamic programming over the jogs and over places along each; of as few pieces, those with the least error.
@@ -236,9 +229,8 @@ def _straighten_stair(
 
 @njit(cache=True, nogil=True)
 def _relax(
-    path: Array, role: NDArray[np.int64], count: int, station: NDArray[np.int64], i: int, j: int, cost: Array,
-    previous: NDArray[np.int64],
-) -> bool:  # fmt: skip
+    path: Array, role: Indices, count: int, station: Indices, i: int, j: int, cost: Array, previous: Indices
+) -> bool:
     """Offer every piece from station i to station j; return whether one is within the bound."""
     spanned = False
     middle, last = _PLACES // 2, station.shape[0] - 1
@@ -276,7 +268,7 @@ def _place(path: Array, count: int, station: int, place: int) -> tuple[float, fl
 
 @njit(cache=True, nogil=True)
 def _deviation(
-    path: Array, role: NDArray[np.int64], count: int, at: int, end: int, ax: float, ay: float, bx: float, by: float
+    path: Array, role: Indices, count: int, at: int, end: int, ax: float, ay: float, bx: float, by: float
 ) -> float:
     """Return the largest distance of a corner between two stations from the straight piece, 2 if out of bounds."""
     ux, uy = bx - ax, by - ay

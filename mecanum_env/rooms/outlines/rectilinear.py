@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["raster", "surfaces"]
 
 
-def raster(rectangles: ArrayLike, size: tuple[int, int]) -> NDArray[np.bool_]:
+def raster(rectangles: ArrayLike, size: tuple[int, int]) -> Flags:
     """Return which cells of a raster of ``size`` columns and rows lie in a rectangle ``(n, 4)`` [cells]."""
     free = np.zeros(size[::-1], np.bool_)
     for x0, y0, x1, y1 in np.asarray(rectangles):
@@ -50,7 +50,7 @@ def surfaces(rectangles: ArrayLike) -> Array:
 
 def _runs(
     steps: NDArray[np.int8],
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int8]]:
+) -> tuple[Indices, Indices, Indices, NDArray[np.int8]]:
     """Return line, first and last lattice index, and sign of each run of equal non-zero steps along rows."""
     padded = np.zeros((steps.shape[0], steps.shape[1] + 2), np.int8)
     padded[:, 1:-1] = steps

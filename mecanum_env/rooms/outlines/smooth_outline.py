@@ -10,10 +10,9 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mecanum_env.rooms.outlines.outline import trace
-from slam.types import Array
+from slam.types import Array, Flags, Indices
 
 __all__ = ["MOST_TURN_DEG", "bends_deg", "facets", "level_loops", "rasterise", "signed_area"]
 
@@ -97,7 +96,7 @@ def bends_deg(vertices: Array) -> Array:
     return np.asarray(np.abs((heading - np.roll(heading, 1) + 180.0) % 360.0 - 180.0))
 
 
-def _cut(points: Array) -> NDArray[np.int64]:
+def _cut(points: Array) -> Indices:
     """Return where to cut a closed line so that no piece turns much, nor lies far from its chord."""
     ahead = np.roll(points, -1, axis=0) - points
     headings = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0])).tolist()
@@ -121,7 +120,7 @@ def signed_area(line: Array) -> float:
     return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
-def rasterise(walls: Array, size: tuple[int, int], cell_m: float) -> NDArray[np.bool_]:
+def rasterise(walls: Array, size: tuple[int, int], cell_m: float) -> Flags:
     """Return which cells' centres ``(rows, cols)`` closed walls ``(n, 4)`` [m] have within them.
 
     Parameters
