@@ -106,8 +106,7 @@ class ExploreAndReturn(NearestFrontier):
             return None
         path, cost = self._way_home(belief)
         if self._target is None:
-            self._deadline = self._time + 10.0 + cost / patience.slowest_m_s
-            self._arrived_for = 0.0
+            self._allow_time(cost)
         self._target = _HOME[:2].copy()
         self._status = "returning"
         return Goal(pose=np.array([*path[-1], _HOME[2]]), path=path)

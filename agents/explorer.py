@@ -102,8 +102,7 @@ class Explorer(Driver):
                 away = math.hypot(*(self._target - belief.pose[:2]).tolist())
                 trouble.afar += away > self._watch_kept().range_m and trouble.afar < self.config.patience.attempts
             self._detours = 0
-            self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
-            self._arrived_for = 0.0
+            self._allow_time(cost)
         elif cost > self._cost + self.config.patience.detour_m:
             self._detours += 1
             if self._detours > self.config.patience.doubts:

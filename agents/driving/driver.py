@@ -170,6 +170,11 @@ class Driver(Agent):
         news_m2 = (belief.grid.known_cells - self._chosen_on) * belief.grid.resolution**2
         return away > self.config.patience.far_m and abs(news_m2) < self.config.patience.news_m2
 
+    def _allow_time(self, cost: float) -> None:
+        """Give a new target as long as a way of so much [weighted m] may take."""
+        self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
+        self._arrived_for = 0.0
+
     def _watch(self, belief: Belief) -> None:
         """Count looks taken, and notice when nothing moves or a goal takes too long."""
         patience, now = self.config.patience, self._time

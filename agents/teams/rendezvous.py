@@ -97,8 +97,7 @@ class Rendezvous(TeamTour):
 
     def _set_off(self, goal: Goal, cost: float) -> Goal:
         if not self._meeting:
-            self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
-            self._arrived_for = 0.0
+            self._allow_time(cost)
         self._target, self._meeting, self._status = self._place, True, "driving"
         return goal
 
