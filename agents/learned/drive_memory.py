@@ -8,7 +8,8 @@ over all of it, so that what was left behind in a large building is not forgotte
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,7 +23,6 @@ from slam.grids.occupancy import PROBABILITY_BYTE, OccupancyGrid
 from slam.types import Array, Bytes, Flags, Floats
 
 __all__ = ["CELL_M", "CHANNELS", "LOG_PRICES", "MARGIN", "MapMemory", "Plan", "PlanSettings", "draw_memory"]
-
 
 CELL_M = 0.1
 """Side of a pixel of the memory [m], or the next power of two of the grid's cells below it."""
@@ -66,28 +66,21 @@ class Plan(NamedTuple):
     length: float  # of the path [m]
 
 
-class Reader(Protocol):
-    """Convolutions: what they make of a map ``(CHANNELS, n, m)``, log prices and goals' log odds ``(2, n, m)``."""
-
-    def of_map(self, maps: Bytes) -> Floats:
-        """Return both."""
-
-
 class MapMemory:
     """The map as the network reads it, and the ways over it.
 
     Parameters
     ----------
-    reader : Reader
-        The network.
+    read : callable
+        The network's convolutions: of a map ``(CHANNELS, n, m)`` log prices and goals' log odds ``(2, n, m)``.
     settings : PlanSettings
         Of the planning layer.
     step_s : float
         Time between two calls of :meth:`way` [s].
     """
 
-    def __init__(self, reader: Reader, settings: PlanSettings, *, step_s: float = 0.1) -> None:
-        self._reader, self._settings, self._step_s = reader, settings, step_s
+    def __init__(self, read: Callable[[Bytes], Floats], settings: PlanSettings, *, step_s: float = 0.1) -> None:
+        self._read_map, self._settings, self._step_s = read, settings, step_s
         self._every = max(round(_REFRESH_S / step_s), 1)
         self._calls, self._drawing = 0, -1
         self._grid: OccupancyGrid | None = None
@@ -157,7 +150,7 @@ class MapMemory:
         r1, c1 = min(max(r1, rows.stop) + MARGIN, shape[0]), min(max(c1, cols.stop) + MARGIN, shape[1])
         # The convolutions look around what they answer for.
         top, left = max(r0 - MARGIN, 0), max(c0 - MARGIN, 0)
-        said = self._reader.of_map(maps[:, top : r1 + MARGIN, left : c1 + MARGIN])
+        said = self._read_map(maps[:, top : r1 + MARGIN, left : c1 + MARGIN])
         said = said[:, r0 - top : r1 - top, c0 - left : c1 - left]
         self._log_price[r0:r1, c0:c1] = np.clip(said[0], *LOG_PRICES)
         self._goal_m[r0:r1, c0:c1] = np.float32(self._settings.goal_m) * np.logaddexp(np.float32(0.0), -said[1])

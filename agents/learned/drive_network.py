@@ -18,7 +18,6 @@ from slam.types import Bytes, Floats
 
 __all__ = ["BEAMS", "NUMBERS", "RANGE_M", "SECTORS", "DriveNetwork", "Inputs", "sectors"]
 
-
 BEAMS, RANGE_M = 360, 8.0
 """The lidar that scans are taken with [beams, m]; the first beam looks backwards."""
 SECTORS = 72
@@ -63,7 +62,7 @@ class DriveNetwork(Layers):
 
     def memory(self, *, step_s: float = 0.1) -> MapMemory:
         """Return a memory of this network's, as it is at the start of an episode."""
-        return MapMemory(self, self._settings, step_s=step_s)
+        return MapMemory(self.of_map, self._settings, step_s=step_s)
 
     def of_map(self, maps: Bytes) -> Floats:
         """Return log prices and goals' log odds ``(2, n, m)`` of a map ``(CHANNELS, n, m)``."""

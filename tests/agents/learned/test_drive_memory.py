@@ -74,27 +74,27 @@ def test_what_was_kept_is_what_would_be_made_anew():
 
 def test_it_goes_to_what_is_nearest_and_back_over_all_of_the_building():
     seen = belief(corridor(40.0), 12.0, 1.0)
-    way = MapMemory(Plainly(), PlanSettings()).way(seen)
+    way = MapMemory(Plainly().of_map, PlanSettings()).way(seen)
     assert way.likely and way.path[-1][0] < -11.5
     assert way.length == pytest.approx(12.0, abs=0.5) and way.cost == pytest.approx(12.0, abs=1.0)
-    turned = MapMemory(Plainly(), PlanSettings()).way(belief(corridor(40.0), 12.0, 1.0, np.pi / 2))
+    turned = MapMemory(Plainly().of_map, PlanSettings()).way(belief(corridor(40.0), 12.0, 1.0, np.pi / 2))
     assert turned.path[-1][1] > 11.5  # the same place lies to the left of it
     np.testing.assert_allclose(np.hypot(*turned.points[4]), 1.0, atol=0.05)
     closed = corridor(40.0)
     closed[:, :2] = OCCUPIED
-    assert MapMemory(Plainly(), PlanSettings()).way(belief(closed, 12.0, 1.0)).length > 27.0
+    assert MapMemory(Plainly().of_map, PlanSettings()).way(belief(closed, 12.0, 1.0)).length > 27.0
     closed[:, -2:] = OCCUPIED
-    assert not MapMemory(Plainly(), PlanSettings()).way(belief(closed, 12.0, 1.0)).likely
+    assert not MapMemory(Plainly().of_map, PlanSettings()).way(belief(closed, 12.0, 1.0)).likely
 
 
 def test_it_keeps_to_its_goal_until_another_is_much_nearer():
-    memory = MapMemory(Plainly(), PlanSettings(keep_m=1.5, stall_m=0.0), step_s=0.5)
+    memory = MapMemory(Plainly().of_map, PlanSettings(keep_m=1.5, stall_m=0.0), step_s=0.5)
     classes = corridor(20.0)
     ends = [memory.way(belief(classes, x, 1.0)).path[-1][0] for x in (9.7, 10.5, 11.5)]
     assert ends[0] < 0.0 and ends[1] < 0.0 and ends[2] > 0.0
 
 
 def test_a_goal_that_does_not_yield_is_left():
-    memory = MapMemory(Plainly(), PlanSettings(stall_m=4.0), step_s=0.5)
+    memory = MapMemory(Plainly().of_map, PlanSettings(stall_m=4.0), step_s=0.5)
     ends = [memory.way(belief(corridor(8.0), 0.5, 1.0)).path[-1][0] for _ in range(12)]
     assert ends[0] < 0.0 and ends[-1] > 7.0
