@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-import os
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,16 +54,19 @@ def suggestion(name: str, valid: Iterable[str]) -> str:
 
 
 def check_writable(folder: Path, files: Iterable[str] = ()) -> None:
-    """Raise :class:`BadInput` unless a folder, and files in it, can be written to or made; none is made here."""
+    """Raise :class:`BadInput` unless a folder, and files in it, can be written to or made; none is left here."""
     remedy = "choose another --out"
     for name in files:
         if (folder / name).is_dir():
             raise BadInput(f"cannot write {folder / name}: it is a folder; {remedy}")
     for place in (folder, *folder.absolute().parents):
         if place.is_dir():
-            if not os.access(place, os.W_OK | os.X_OK):
-                raise BadInput(f"cannot write to {folder}: no permission to write in {place}; {remedy}")
-            return
+            try:
+                with tempfile.TemporaryFile(dir=place):  # what permissions say is not so for root, nor in /proc
+                    return
+            except OSError as error:
+                why = one_line(error.strerror or error)
+                raise BadInput(f"cannot write to {folder}: {why} in {place}; {remedy}") from error
         if place.exists() or place.is_symlink():
             raise BadInput(f"cannot write to {folder}: {place} is not a folder; {remedy}")
     raise BadInput(f"cannot write to {folder}: no such place; {remedy}")

@@ -180,6 +180,14 @@ def test_an_out_that_cannot_be_written_to(
     assert in_the_way.read_text() == "mine"
 
 
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc")
+def test_a_place_that_takes_no_files_is_found_before_anything_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+    """Root may write anywhere by what permissions say."""
+    assert main(["rooms", "--out", "/proc/there"]) == 2
+    line = capsys.readouterr().err
+    assert "cannot write to /proc/there: " in line and "choose another --out" in line
+
+
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
