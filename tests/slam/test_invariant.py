@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import slam
 from slam import Odometry
-from slam.gaussian.stacked_update import stacked_update, work_space
+from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.geometry import compose, exp, wrap
 from slam.invariant import invariant_update
 from slam.metrics.measures import nees_band
@@ -58,7 +58,7 @@ def run(update, x: np.ndarray, p: np.ndarray, z: np.ndarray) -> tuple[np.ndarray
     work = work_space(len(z), n)
     if update is invariant_update:
         work = (np.zeros(((n - 3) // 2, 8)), *work, np.zeros(n))
-    _, nis = update(x, p, n, z, match, OFFSET, *work)
+    _, nis = update(x, p, n, z, match, OFFSET, *work, NO_LIMITS)
     return x, np.triu(p) + np.triu(p, 1).T, nis
 
 
@@ -97,7 +97,7 @@ def test_turning_the_whole_map_keeps_its_shape() -> None:
         work = work_space(1, 9)
         if kernel is invariant_update:
             work = (np.zeros((3, 8)), *work, np.zeros(9))
-        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work)
+        kernel(state, cov, 9, z, np.array([2]), OFFSET, *work, NO_LIMITS)
         return state
 
     turned = update(invariant_update)
