@@ -51,7 +51,10 @@ def read_policy(
     described = _described(path)
     weights = _weights(path)
     if described.get("format") != wanted:
-        raise ValueError(f"policy {path.with_suffix('.json')}: format is not {wanted!r}")
+        found = quoted(str(described.get("format")), 60)
+        raise ValueError(
+            f"policy {path.with_suffix('.json')}: format is not {wanted!r} but {found}; give another policy"
+        )
     try:
         return make(weights, described), described
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:

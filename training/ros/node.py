@@ -19,7 +19,7 @@ __all__ = ["Topics", "check_ros", "run"]
 _MAP_EVERY_S = 2.0
 _FAREWELLS = 3  # twists of zero at the end: the first may be lost
 _REMEDY = (
-    "mecanum ros needs ROS 2 and its Python packages; source /opt/ros/DISTRO/setup.bash, with mecanum-slam "
+    "it needs ROS 2 and its Python packages; source /opt/ros/DISTRO/setup.bash, with mecanum-slam "
     "installed for ROS's own Python (python3 -m venv --system-site-packages)"
 )
 

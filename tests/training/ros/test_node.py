@@ -28,7 +28,7 @@ def test_without_ros_it_says_so_in_one_line(
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert main(["ros"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("mecanum ros: mecanum ros needs ROS 2") and "setup.bash" in line
+    assert line.startswith("mecanum ros: it needs ROS 2") and "setup.bash" in line
 
 
 class RobotNode:
