@@ -256,7 +256,7 @@ def test_random_driving_never_leaves_the_room(seed: int) -> None:
 
 
 def test_a_start_in_a_wall_is_refused() -> None:
-    with pytest.raises(FloorPlanError, match="0.58 m by 0.38 m, touch something"):
+    with pytest.raises(FloorPlanError, match=r"0\.58 m by 0\.38 m, touch something"):
         world(room(start=(0.2, 3.0, 0.0)))
     world(room(start=(0.2, 3.0, 0.5 * math.pi)))  # across, it fits
 
