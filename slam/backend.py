@@ -67,7 +67,7 @@ class Backend(abc.ABC):
         self.recovery = Recovery(config.health, config.relocalisation, config.lidar_offset_m)
         self._doubtful = False  # whether the scan at hand spoke against the predicted pose
         self._recovers = self.relocalises and config.health.recover
-        self._lidar = (0, 0.0)  # beams and range_max of the last scan
+        self._checked: tuple[object, ...] = ()  # what was a scan at last, but for the ranges themselves
 
     def reset(
         self, pose: Array | tuple[float, float, float] = (0.0, 0.0, 0.0), *,
@@ -110,9 +110,11 @@ class Backend(abc.ABC):
 
         Raises ``ValueError`` where it is no scan; nothing has changed then.
         """
-        if (len(scan.ranges), scan.range_max) != self._lidar:  # or only now has become one
+        ranges = scan.ranges
+        form = getattr(ranges, "shape", None), getattr(ranges, "dtype", None), *scan[1:]
+        if form != self._checked:
             scan.check()
-            self._lidar = len(scan.ranges), scan.range_max
+            self._checked = form
         recovery = self.recovery
         if recovery.lost:
             place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())

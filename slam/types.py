@@ -76,6 +76,8 @@ class Scan(NamedTuple):
             raise ValueError(
                 f"ranges of a scan are numbers (beams,), one at least, got {ranges.dtype} {ranges.shape}"
             )
+        if not ranges.dtype.isnative or (ranges.dtype.kind == "f" and ranges.dtype.itemsize not in (4, 8)):
+            raise ValueError(f"no kernel reads ranges of type {ranges.dtype.str}; give them as float64")
         if not (math.isfinite(self.angle_min + self.angle_increment) and 0.0 < self.range_max < math.inf):
             raise ValueError(
                 "a scan's angles are finite, and its range_max is what its lidar sees [m]; got angle_min "

@@ -327,9 +327,9 @@ def _look_through(
     margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
     c, s = math.cos(x[2]), math.sin(x[2])
     sx, sy = x[0] + offset * c, x[1] + offset * s
-    beams = ranges.shape[0]
+    beams, increment = ranges.shape[0], max(increment, 1e-9)  # that of one beam may be 0
     circle = round(2.0 * math.pi / increment)
-    full = beams >= circle
+    full = beams >= circle >= 3  # a beam or two do not look all round, whatever they are said to be apart
     doubtful = False
     for i in range(marks.shape[0]):
         doubtful |= marks[i, DOUBT] > limits[10]

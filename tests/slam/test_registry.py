@@ -46,6 +46,8 @@ def test_no_backend_minds_what_a_broken_lidar_says(name: str) -> None:
         ({"angle_increment": math.nan}, "angle_increment nan"),
         ({"angle_increment": -2.0 * math.pi / 360}, "counter-clockwise"),
         ({"angle_increment": 0.0}, "counter-clockwise"),
+        ({"ranges": np.full(360, 2.0, ">f8")}, "give them as float64"),
+        ({"ranges": np.full(360, 2.0, np.float16)}, "give them as float64"),
     ],
 )
 def test_what_is_no_scan_is_refused_in_a_sentence(name: str, wrong: dict[str, Any], what: str) -> None:
@@ -55,6 +57,8 @@ def test_what_is_no_scan_is_refused_in_a_sentence(name: str, wrong: dict[str, An
         backend.update(scan._replace(**wrong))
     backend.update(scan)
     assert backend.grid.known_cells > 0
+    with pytest.raises(ValueError, match=what):  # as it is after a scan of as many beams that was one
+        backend.update(scan._replace(**wrong))
 
 
 @pytest.mark.parametrize("name", [name for name in slam.names() if name != "truth"])  # which is told the pose

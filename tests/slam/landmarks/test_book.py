@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from slam import LINE, Scan
 from slam.landmarks.association import IGNORED, UNMATCHED
@@ -123,6 +124,17 @@ def test_a_landmark_that_beams_pass_through_is_dropped_and_one_on_a_wall_is_not(
     assert book.row(0) == -1
     book.add(0.0, 0.0, None)
     assert book.ids.tolist() == [1, 2]  # ids are never used twice
+
+
+@pytest.mark.parametrize("beams, increment", [(1, 0.0), (1, 5.0), (2, 3.0)])
+def test_a_beam_or_two_do_not_look_all_round(beams: int, increment: float) -> None:
+    """Of one beam the increment says nothing; it passed for three on every landmark near by."""
+    book = LandmarkBook(LandmarkPolicy(drop_after=3))
+    book.add(1.0, 0.0, None)
+    x = np.array([0.0, 0.0, 0.0, -2.0, 0.5])  # the beam looks the other way
+    scan = Scan(np.full(beams, 7.0), 0.0, increment, 8.0)
+    for _ in range(9):
+        assert book.review(x, 0.0, np.zeros((0, 12)), np.zeros(0, np.int64), scan) == ([], [])
 
 
 def test_the_landmarks_just_seen_are_those_of_the_last_update() -> None:
