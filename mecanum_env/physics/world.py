@@ -185,8 +185,8 @@ class World:
         if not self._touches_nothing():
             at, robot = ", ".join(f"{v:.2f}" for v in self.plan.start), self.robot
             raise FloorPlanError(
-                f"the start ({at}) in {self.plan.name!r} has the robot, {robot.length_m:g} m by {robot.width_m:g} m,"
-                " touch something; choose another, or see whether the plan's resolution is right"
+                f"the start ({at}) in {self.plan.name!r} has the robot, {robot.length_m:g} m by {robot.width_m:g} "
+                "m, touch something; choose another, or see whether the plan's resolution is right"
             )
 
     def step(self, wheel_targets: ArrayLike, step_s: float, physics_step_s: float) -> None:
