@@ -191,25 +191,30 @@ class CompressedEkfSlam(EkfSlam):
         x = self._map_x.copy()
         if len(self._v):
             end = int(state_rows(self._far, robot=True).max()) + 1
-            add_combination(x, end, self._beside.mean[self._beside.own :], self._v)
+            add_combination(x, end, self._beside.mean[self._of_far], self._v)
         return x
+
+    @property
+    def _of_far(self) -> slice:
+        """Which of the states beside the map stand for what is far."""
+        return slice(self._beside.own, self._beside.own + len(self._v))
 
     def _change(self) -> Change:
         """Return what the region's corrections make of the rest's covariance."""
-        y, v, k = self._beside, self._v, self._beside.own
+        y, v, k, far = self._beside, self._v, self._beside.own, self._of_far
         end = int(state_rows(self._far, robot=True).max()) + 1
         size = max(end, int(state_rows(self._near, robot=True).max()) + 1)
         own, loss = np.zeros((k, max(size, len(self._map_x)))), aligned_zeros(0, size)
         if len(v):
-            root = root_of_loss(y.cov[k:, k:], self._weights, self.config.rank_tolerance)
+            root = root_of_loss(y.cov[far, far], self._weights, self.config.rank_tolerance)
             loss = aligned_zeros(len(root), size)
             loss[:, :end] = product(root, v, end)[:, :end]
-            own[:, :end] = product(y.cov[:k, k:], v, end)[:, :end]
+            own[:, :end] = product(y.cov[:k, far], v, end)[:, :end]
         return Change(loss, -loss, own)
 
     def _cross(self, rows: int) -> Array:
         """Return the covariance ``(rows, n)`` of the region's first states with what is far; 0 with the others."""
-        return product(self._beside.cross[self._beside.own :, :rows].T, self._v, self._v.shape[1])
+        return product(self._beside.cross[self._of_far, :rows].T, self._v, self._v.shape[1])
 
     def _write(self, p: Array, change: Change) -> None:
         """Write what region and rest have become into the map's covariance."""

@@ -25,7 +25,7 @@ from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
 from slam.settings import Within
-from slam.types import LINE, Array, Indices, Odometry, Scan
+from slam.types import LINE, Array, Indices, Odometry
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -61,7 +61,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
-        self._turned = 0.0  # [rad] the heading's corrections since the region was entered
+        self._entered = self._x[:3].copy()  # the pose, on entering the region
 
     def _companions(self) -> Companions:
         noise = self.config.odometry
@@ -94,13 +94,6 @@ class InvariantEkfSlam(CompressedEkfSlam):
 
     def _turn_beside(self) -> None:
         _turn_columns(self._beside.cross, self._n, self._delta)
-        self._turned += float(self._delta[2])
-
-    def _fit(self, z: Array, match: Indices, scan: Scan) -> float:
-        turned = self._turned
-        value = super()._fit(z, match, scan)
-        self._turned = turned
-        return value
 
     def _enlarge(self) -> None:
         super()._enlarge()
@@ -110,7 +103,12 @@ class InvariantEkfSlam(CompressedEkfSlam):
 
     def _enter(self) -> None:
         super()._enter()
-        self._turned = 0.0
+        self._entered = self._x[:3].copy()
+        if len(self._far):
+            # What is far turns with the robot as it entered. Since then odometry's errors are put right, too.
+            cross, own = self._p[:3, : self._n].copy(), self._beside.cross[: self._beside.own, :3].copy()
+            cross[:, :3] = self.pose_cov
+            self._beside.join(cross, own)
 
     def _rest(self) -> Array:
         return self._retracted()[0] if len(self._far) else super()._rest()
@@ -118,10 +116,9 @@ class InvariantEkfSlam(CompressedEkfSlam):
     def _retracted(self) -> tuple[Array, Array]:
         """Return the map's state ``(n,)``, what is far retracted, and the columns of its reset ``(3, n)``."""
         x, delta = self._map_x.copy(), super()._rest() - self._map_x
-        columns = np.zeros((3, len(x)))
-        x[:3], delta[:3] = self._x[:3], (0.0, 0.0, self._turned)
+        columns, end = np.zeros((3, len(x))), int(state_rows(self._far, robot=False).max()) + 1
+        x[:3], delta[:3] = self._entered, self._beside.mean[-3:]
         # Walls far away were settled long ago.
-        end = int(state_rows(self._far, robot=False).max()) + 1
         _retract(x, end, delta, self._map_marks, columns, math.inf)
         return x, columns
 

@@ -11,9 +11,10 @@ import pytest
 
 import slam
 import slam.compressed as compressed_
-from slam import Observations
+from slam import Observations, Odometry
 from slam.backend import Backend
 from slam.compressed import CompressedEkfSlam
+from slam.geometry import compose, exp
 from slam.landmarks.book import KIND
 from slam.types import VIRTUAL
 from tests.slam.simulated import drive, observe_landmarks, room_scan
@@ -193,6 +194,39 @@ def test_the_invariant_filter_is_the_same_in_regions(wheels: dict[str, Any]) -> 
         (mean, cov), (same_mean, same_cov) = whole.wheel_errors, regional.wheel_errors
         np.testing.assert_allclose(same_mean, mean, atol=0.01 * np.sqrt(np.diag(cov)).min())
         np.testing.assert_allclose(same_cov, cov, rtol=0.01, atol=1e-8)
+
+
+@pytest.mark.parametrize("bias", [-0.03, 0.03])
+def test_what_is_far_turns_by_its_own_turn(bias: float) -> None:
+    """Heading lost on the way out, odometry that turns too far in every step, and a loop closed after 50 m.
+
+    The robot's heading is put right for its odometry's sake all the time; the far map turns once, with the loop.
+    """
+    odometry = {"speed_share": 0.05, "turn_share_rad_m": 0.1}
+    whole, regional = (slam.make("invariant-ekf", config={"odometry": odometry, **c}) for c in (WHOLE, REGIONS))
+    landmarks, rng, pose, before = grove(7), np.random.default_rng(7), np.zeros(3), whole.belief
+    for k in range(240):
+        lost = 10 < k < 45
+        twist = np.array([0.0, 0.0, math.pi / 0.9]) if 118 < k < 122 else np.array([0.8, 0.0, 0.0])
+        pose = compose(pose, exp(0.3 * twist))
+        seen = observe_landmarks(pose, landmarks, OFFSET, NOISE, rng, reach=4.0)
+        for backend in (whole, regional):
+            if k == 12:
+                backend._x[2] += 0.05
+                backend._p[2, 2] += 0.035**2
+            backend.predict(Odometry(twist + np.array([0.0, 0.0, 0.0 if lost else bias]), 0.3))
+            if not lost:
+                backend.observe(seen)
+        if k == 180:
+            before = whole.belief
+            before.settle()
+    one, two = whole.belief, regional.belief
+    assert len(regional._far) > 50
+    ids = np.intersect1d(before.landmark_ids, one.landmark_ids)
+    shift = one.landmarks[np.isin(one.landmark_ids, ids)] - before.landmarks[np.isin(before.landmark_ids, ids)]
+    assert np.hypot(*shift.T).max() > 0.5
+    order = np.argsort(two.landmark_ids)
+    np.testing.assert_allclose(two.landmarks[order], one.landmarks[np.argsort(one.landmark_ids)], atol=0.03)
 
 
 @pytest.mark.parametrize("lines", [False, True])
