@@ -117,7 +117,7 @@ class Backend(abc.ABC):
             self._checked = form
         recovery = self.recovery
         if recovery.lost:
-            place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy())
+            place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy(), self.pose_cov)
             if place is not None:
                 self._relocate(place.pose, place.cov, scan)
             elif not recovery.lost:
@@ -149,6 +149,7 @@ class Backend(abc.ABC):
         else:
             if recovery.kept is None:
                 recovery.kept, recovery.waited = self._copy(), 0
+                recovery.unsure = self._end_variance() > recovery.config.blur_m**2
             self._update(scan)
             if recovery.kept is not None and recovery.gone(self.grid, self.pose, scan):
                 self._put_back(recovery.kept)

@@ -12,7 +12,7 @@ from slam.gaussian.stacked_update import NO_LIMITS
 from slam.graph.places import Places
 from slam.health.relocalisation import Place, Relocaliser
 from slam.landmarks.joint_compatibility import JOINT_LIMITS
-from slam.landmarks.seen_from import seen_from
+from slam.landmarks.seen_from import seen_from, sightings
 from slam.types import Array, Indices, Scan
 
 __all__ = ["HeldByMap"]
@@ -67,10 +67,14 @@ class HeldByMap(GaussianBackend):
         """Correct by a place on the drawn map, which is one among the landmarks; they are not counted as seen.
 
         It is one among those seen within so many scans: what is drawn since others were has drifted with the pose.
+        Where there are none, what is drawn hangs on the place that the robot is at.
         """
-        offset, cov = self.config.lidar_offset_m, place.cov + found_cov()
-        told = seen_from(self._x, self._book.marks, offset, place.pose, cov, since=self._book.now - within)
-        self._correct_aside(*told, limits)
+        x, marks, offset, cov = self._x, self._book.marks, self.config.lidar_offset_m, place.cov + found_cov()
+        z, match = seen_from(x, marks, offset, place.pose, cov, since=self._book.now - within)
+        if not len(match):
+            match = self._places_beside()
+            z = sightings(x, marks, match, offset, place.pose, cov)
+        self._correct_aside(z, match, limits)
 
     def _correct_aside(self, z: Array, match: Indices, limits: Array) -> bool:
         """Correct by what no feature of the scan shows, nor counts to its NIS; tell whether it stands."""

@@ -39,6 +39,7 @@ class _Trail:
     scans: int = 1
 
 
+_WITHIN = 5.0  # σ of where the wheels have it, for a robot that was unsure of its pose before it was lost
 _ANOTHER_VIEW = (0.3, 0.3)  # [m, rad] from which on a place looks otherwise
 
 
@@ -65,6 +66,7 @@ class Recovery:
         self.times_lost = self.relocalisations = self.scans_lost = 0
         self.waited = 0  # scans for which it would have been given up, but for a place right beside
         self.kept: Any = None  # what the backend was before the first doubtful scan of a row
+        self.unsure = False  # whether its pose was then known worse than its map is drawn
         self._relocaliser: Relocaliser | None = None
         self._trail: _Trail | None = None
 
@@ -119,12 +121,13 @@ class Recovery:
         self._searched = self._unopposed = self._silent = 0
         self._searched_from: Array | None = None  # where the wheels had it when all of the map was last searched
 
-    def search(self, grid: OccupancyGrid, scan: Scan, believed: Array) -> Place | None:
+    def search(self, grid: OccupancyGrid, scan: Scan, believed: Array, cov: Array) -> Place | None:
         """Look for the place of a scan; return it once several scans agree on it, else None.
 
-        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost. Where scans
-        have not spoken against that for long enough, or could say nothing of any place for longer, nothing is
-        returned, and the belief is no longer lost.
+        ``believed`` ``(3,)`` is the pose that the wheels have carried on since the belief was lost, with its
+        covariance ``(3, 3)``. A robot that was unsure of its pose before has hardly been carried away as well: its
+        place is looked for within that. Where scans have not spoken against where the wheels have it for long
+        enough, or could say nothing of any place for longer, nothing is returned, and it is no longer lost.
         """
         self.scans_lost += 1
         if self._relocaliser is None:
@@ -146,7 +149,7 @@ class Recovery:
             else:
                 self._trail = None
         else:
-            place = self._first(relocaliser, scan, believed)
+            place = self._first(relocaliser, scan, believed, cov)
             self._trail = None if place is None else _Trail(place, believed)
         if self._trail is None or self._trail.scans < self._relocalisation.confirm:
             return None
@@ -160,7 +163,7 @@ class Recovery:
         self._relocaliser = None
         self.monitor.restart(self.config.found)
 
-    def _first(self, relocaliser: Relocaliser, scan: Scan, believed: Array) -> Place | None:
+    def _first(self, relocaliser: Relocaliser, scan: Scan, believed: Array, cov: Array) -> Place | None:
         """Search the radius that is due, where it is."""
         config, count = self._relocalisation, self._searched
         self._searched += 1
@@ -171,6 +174,8 @@ class Recovery:
             count -= scans
             stage += 1
         radius, every = config.radii_m[stage], config.every[stage]
+        if self.unsure:
+            radius = min(radius, config.apart_m + _WITHIN * math.sqrt(max(cov[0, 0], cov[1, 1])))
         if math.isinf(radius):
             if self._unopposed:
                 return None
@@ -182,7 +187,13 @@ class Recovery:
         if math.isinf(radius):
             self._searched_from = believed.copy()
         place = relocaliser.find(scan, believed, radius)
-        if place is None or math.isfinite(radius):
+        if place is None:
+            return None
+        if self.unsure:
+            away = place.pose - believed
+            away[2] = wrap_scalar(float(away[2]))
+            return place if away @ np.linalg.solve(cov + place.cov, away) < _WITHIN**2 else None
+        if math.isfinite(radius):
             return place
         return place if place.quality >= relocaliser.check(scan, believed).quality + config.far_margin else None
 

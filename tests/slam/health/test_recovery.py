@@ -140,6 +140,25 @@ def test_the_drawn_map_says_nothing_where_landmarks_were_seen_long_ago(*, lately
     assert (math.sqrt(backend.pose_cov[2, 2]) < 0.3 * sigma) == corrected
 
 
+@pytest.mark.parametrize("needed", [True, False])
+def test_where_landmarks_are_few_the_drawn_map_hangs_on_the_place_that_the_robot_is_at(*, needed: bool) -> None:
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    assert isinstance(backend, EkfSlam)
+    places, book = backend._places, backend._book
+    for z in places.make(book.next_id, places.ends(env.scan, backend.extractor)):
+        backend._add(z, None)
+    backend._x[:3] = compose(backend._x[:3], np.array([0.03, 0.02, 0.09]))
+    backend._p[[0, 1, 2], [0, 1, 2]] += np.square([0.03, 0.03, 0.08])
+    book.marks[:, LAST_SEEN] -= 100.0
+    places._few, backend._doubtful = 10 * needed, True
+    sigma = math.sqrt(backend.pose_cov[2, 2])
+    backend._hold_by_map(env.scan)
+    assert (math.sqrt(backend.pose_cov[2, 2]) < 0.3 * sigma) == needed
+    off = backend.pose - env.truth.pose
+    assert (np.hypot(*off[:2]) < 0.03 and abs(off[2]) < 0.02) == needed
+
+
 def test_a_scan_that_fits_right_beside_the_belief_does_not_give_it_up() -> None:
     env = driven("invariant-ekf", 60)
     recovery, grid, pose = env.backend.recovery, env.backend.grid, env.backend.pose
@@ -172,6 +191,25 @@ def test_the_landmarks_decide_where_a_found_robot_is() -> None:
     assert np.sqrt(after.pose_cov[0, 0]) < 0.02
     # What the pose was said to be known to, beforehand, has made no landmark surer than it can be.
     assert np.diag(after.whole_cov)[3:].min() > 0.2 * np.diag(before.whole_cov)[3:].min()
+
+
+@pytest.mark.parametrize(
+    ("unsure", "sigma", "found"), [(True, 0.3, True), (True, 0.02, False), (False, 0.02, True)]
+)
+def test_one_that_was_unsure_before_is_looked_for_where_it_may_be(
+    *, unsure: bool, sigma: float, found: bool
+) -> None:
+    """Columns and rooms are alike; it has hardly been carried away, on top of that."""
+    env = driven("invariant-ekf", 60)
+    backend = env.backend
+    assert isinstance(backend, EkfSlam)
+    backend._place(compose(backend.pose, np.array([0.5, 0.3, 0.2])), np.diag(np.square([sigma, sigma, 0.1])))
+    backend.recovery.give_up()
+    backend.recovery.unsure = unsure
+    for _ in range(8):
+        env.step(np.zeros(3, np.float32))
+    assert (backend.recovery.relocalisations == 1) == found
+    assert (np.hypot(*(backend.pose - env.truth.pose)[:2]) < 0.05) == found
 
 
 def test_where_nothing_is_known_a_lost_robot_goes_on_from_where_the_wheels_have_it() -> None:
@@ -244,7 +282,7 @@ def test_a_large_map_is_searched_more_rarely_and_so_is_one_from_where_nothing_is
         recovery.give_up()
         for k in range(60):
             believed = env.backend.pose + np.array([0.0, 0.0, k * turn])
-            assert recovery.search(env.backend.grid, nowhere, believed) is None
+            assert recovery.search(env.backend.grid, nowhere, believed, np.eye(3)) is None
         searched.append(count[0])
     places = Relocaliser(config, env.backend.grid, 0.2).places
     assert searched == [30, math.ceil(60 / (2 * (1 + places // 200))), math.ceil(60 / (2 * config.standing))]
