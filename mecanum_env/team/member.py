@@ -35,7 +35,7 @@ def member_observation_space(single: spaces.Dict, robots: int) -> spaces.Dict:
     """Return the space of a member's observations: a single robot's, and ``teammates`` where there are others.
 
     Rows of ``teammates`` ``(robots - 1, 6)``, the others by rising number: 1 where it is known, x, y [m] in this
-    robot's frame, cosine and sine of its heading there, and how old that is [s].
+    robot's body frame, cosine and sine of its heading there, and how old that is [s].
     """
     if robots == 1:
         return single

@@ -29,7 +29,7 @@ Communication = Annotated[
     typer.Option(help="Who hears whom: unlimited, range, line-of-sight, walls or none.  [default: unlimited]"),
 ]
 ConfigFile = Annotated[
-    Path | None, typer.Option(metavar="FILE.toml", help="Configuration; the options above go before it.")
+    Path | None, typer.Option(metavar="FILE.toml", help="Configuration; options that are given override it.")
 ]
 FloorPlanFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="A real plan instead of --rooms: ROS map or image.")
