@@ -110,6 +110,7 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         self.single_observation_space, self.single_action_space = observation, action
         self.observation_space = batch_space(observation, num_envs)
         self.action_space = batch_space(action, num_envs)
+        like.close()
         processes = multiprocessing.get_context(context)
         make = partial(_limited, make, limit)
         shares = min(workers, num_envs)
@@ -119,10 +120,13 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         self._board = board = Board(processes, num_envs, observation, action, shares - 1)
         # With arrays of its own on that memory: who holds the board's is counted.
         self._own: Share | None = Share(make, shallow_copy(board), 0, len(self._rows[0]), mode)
-        self._workers = [
-            Worker(processes, number, make, board, rows[0], len(rows), mode)
-            for number, rows in enumerate(self._rows[1:])
-        ]
+        self._workers: list[Worker] = []
+        try:
+            for number, rows in enumerate(self._rows[1:]):
+                self._workers.append(Worker(processes, number, make, board, rows[0], len(rows), mode))
+        except BaseException:  # those that were started would wait for orders
+            self.close_extras()
+            raise
 
     # ---- Gymnasium -----------------------------------------------------------------------------------------
 

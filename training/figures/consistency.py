@@ -31,11 +31,15 @@ def step_averages(profiles: Sequence[ArrayLike]) -> tuple[Array, Array, Array]:
 
 
 def consistency_figures(profiles: Sequence[ArrayLike]) -> dict[str, Any]:
-    """Return how the average NEES / 3 of runs, each a profile ``(steps,)``, lies in the band of that many runs."""
+    """Return the mean NEES / 3 over all steps of runs, each a profile ``(steps,)``, and how it lies in its band.
+
+    The band is that of the average over so many runs, step by step (:func:`step_averages`).
+    """
     averages, lows, highs = step_averages(profiles)
     inside = np.count_nonzero((averages >= lows) & (averages <= highs))
+    steps = np.concatenate([np.asarray(profile, np.float64) for profile in profiles])
     return {
-        "nees_over_3_mean": float(averages.mean()) if len(averages) else None,
+        "nees_over_3_mean": float(np.nanmean(steps)) / 3 if np.isfinite(steps).any() else None,
         "nees_band_95": list(nees_band(3, len(profiles))),
         "fraction_in_band": float(inside / max(len(averages), 1)),
     }

@@ -93,7 +93,7 @@ def resampled_indices(strata: Sequence[Hashable]) -> Indices:
     return _indices(tuple(codes[name] for name in strata))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=8)  # 16 MB each, of a thousand episodes
 def _indices(codes: tuple[int, ...]) -> Indices:
     rng = np.random.default_rng(_SEED)
     stratum, out = np.array(codes, np.intp), np.empty((RESAMPLES, len(codes)), np.intp)

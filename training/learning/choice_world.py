@@ -34,7 +34,8 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self._world = world
         self._rng = np.random.default_rng(0)
-        self._room, self._episodes = ("", -1), 0  # the room drawn last, and how many episodes there were in it
+        self._drawn, self._episodes = ("", -1), 0  # the room drawn last, and how many episodes there were in all
+        self._room = self._drawn  # the one whose plan is at hand
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -45,14 +46,13 @@ class Families(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._episodes % self._world.repeats == 0:
             low, high = self._world.seeds
             name = str(self._rng.choice(list(self._world.rooms)))
-            room_seed = int(self._rng.integers(low, high + 1))
-        else:
-            name, room_seed = self._room
+            self._drawn = name, int(self._rng.integers(low, high + 1))
+        name, room_seed = self._drawn
         self._episodes += 1
         episode_seed = int(self._rng.integers(2**31))
         passed_on = dict(options or {})
         if passed_on:
-            name, room_seed = passed_on.pop("rooms"), passed_on.pop("room_seed")
+            name, room_seed = passed_on.pop("rooms", name), passed_on.pop("room_seed", room_seed)
             episode_seed = room_seed  # as the benchmark has it
         if self._room != (name, room_seed):
             self._plan = room_registry.make(name, seed=room_seed)

@@ -69,6 +69,7 @@ class ExploreVecEnv(VecEnv):
         last = infos.pop("final_obs", None)
         each, done = self._of_each(infos), terminated | truncated
         for k in np.flatnonzero(done).tolist():
+            self.reset_infos[k] = each[k]
             each[k] = final[k] | {"terminal_observation": last[k]}
             if "episode_metrics" in each[k]:  # what one did not reach is NaN in an array of those that others did
                 metrics = each[k]["episode_metrics"]
@@ -100,15 +101,19 @@ class ExploreVecEnv(VecEnv):
         self.envs.close()
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of some environments."""
-        values = self.envs.get_attr(attr_name)
+        """Return an attribute of some environments, and call nothing."""
+        values = self.envs.call("get_wrapper_attr", attr_name)
         return [values[k] for k in self._get_indices(indices)]
 
+    def has_attr(self, attr_name: str) -> bool:
+        """Tell whether every environment has an attribute, and call nothing."""
+        return all(self.envs.call("has_wrapper_attr", attr_name))
+
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of every environment."""
+        """Set an attribute of every environment to the same value."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("ExploreVecEnv: set_attr sets an attribute of every environment: leave out indices")
-        self.envs.set_attr(attr_name, value)
+        self.envs.set_attr(attr_name, [value] * self.num_envs)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any

@@ -164,7 +164,7 @@ def _results(
     with worker_pool(workers) as pool:
         futures = {pool.submit(work, job): job for job in jobs}
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            yield futures.pop(future), future.result()  # what is kept is held here no longer
 
 
 def worker_pool(workers: Workers) -> AbstractContextManager[Pool]:

@@ -56,7 +56,14 @@ def resume(
             file.write(f"{told[:-1]}, {zlib.crc32(told.encode())}]\n")
             file.flush()
 
-        run_all([job for job in jobs if job not in rows], work, workers=workers, keep=keep, what=what, apart=apart)
+        run_all(
+            [job for job in dict.fromkeys(jobs) if job not in rows],
+            work,
+            workers=workers,
+            keep=keep,
+            what=what,
+            apart=apart,
+        )
     return {job: rows[job] for job in jobs}
 
 

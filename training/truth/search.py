@@ -36,6 +36,8 @@ def annealed(board: Board, *, share: float, tries: int, rng: np.random.Generator
 def moved(board: Board, order: Cells, n: int, rng: np.random.Generator, new: Cells) -> tuple[int, int]:
     """Write a change of n stops to ``new``; return how many there are now, and the first that is another."""
     new[:] = order
+    if len(board.stops) < 2:  # there is nowhere to go
+        return n, n
     kind = rng.random()
     if n < 2 or (kind < 0.2 and n < len(order)):  # one more: near another, or anywhere
         k = 1 + int(rng.random() * n)

@@ -115,6 +115,8 @@ class Saver:
         episode.end = "running"
         try:
             self._write()
+        except OSError:  # a full disk, for a moment: it is tried again, and the writing at the end tells of it
+            pass
         finally:
             episode.end = end
         took = time.monotonic() - began

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -284,6 +285,21 @@ def test_closing_ends_the_processes_and_so_does_a_dead_one() -> None:
         for _ in range(3):
             envs.step(np.zeros((3, 3), np.float32))
     assert not any(process.is_alive() for process in processes)
+
+
+def test_where_a_process_cannot_be_started_none_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    started, start = [], multiprocessing.process.BaseProcess.start
+
+    def once(self: multiprocessing.process.BaseProcess) -> None:
+        if started:
+            raise OSError("no more processes")
+        start(self)
+        started.append(self)
+
+    monkeypatch.setattr(multiprocessing.process.BaseProcess, "start", once)
+    with pytest.raises(OSError, match="no more processes"):
+        batch(workers=3)
+    assert len(started) == 1 and not started[0].is_alive()
 
 
 def test_a_program_that_closes_nothing_ends() -> None:

@@ -60,6 +60,19 @@ def test_an_agent_without_goals_explores_until_time_is_up(tmp_path: Path) -> Non
     assert "the step limit was reached first" in (tmp_path / "report.html").read_text()
 
 
+def test_a_writing_that_fails_on_the_way_ends_no_episode(tmp_path: Path) -> None:
+    episode, recorder = explore.prepare(out=tmp_path, rooms="rectangular", seed=5, max_steps=20), Recorder()
+    ends: list[str | None] = []
+
+    def write() -> None:
+        ends.append(episode.end)
+        if len(ends) < 5:
+            raise OSError(28, "No space left on device")
+
+    explore.run(episode, lambda **_: None, [recorder, Saver(episode, write, every_s=0.0)])
+    assert episode.end == "time" and len(ends) >= 5 and set(ends) == {"running"}
+
+
 def test_what_is_written_on_the_way_changes_nothing_of_the_end(tmp_path: Path) -> None:
     pages = []
     for every_s in (math.inf, 0.0):

@@ -58,6 +58,12 @@ def double(job: tuple[str, int]) -> list[int]:
     return [2 * job[1]]
 
 
+def test_a_job_that_is_asked_for_twice_is_done_once(tmp_path: Path) -> None:
+    store, done = tmp_path / "rows.jsonl", []
+    rows = resume(store, [("a", 1), ("a", 1)], lambda job: done.append(job) or double(job), workers=1)
+    assert rows == {("a", 1): [2]} and done == [("a", 1)] and len(store.read_text().splitlines()) == 1
+
+
 def test_rows_are_resumed_and_a_line_cut_off_is_done_again(tmp_path: Path) -> None:
     store = tmp_path / "new" / "rows.jsonl"
     assert resume(store, [("a", 1), ("a", 2)], double, workers=1) == {("a", 1): [2], ("a", 2): [4]}
@@ -70,9 +76,15 @@ def test_rows_are_resumed_and_a_line_cut_off_is_done_again(tmp_path: Path) -> No
     assert resume(store, [("a", 2), ("a", 1)], pytest.fail, workers=1) == {("a", 2): [4], ("a", 1): [2]}
 
 
+def test_what_befalls_the_longest_run_is_in_the_mean() -> None:
+    found = consistency_figures([[3.0] * 10, [3.0] * 10, [3.0] * 10 + [300.0] * 10])
+    assert found["nees_over_3_mean"] == pytest.approx((30 * 1 + 10 * 100) / 40)
+    assert found["fraction_in_band"] == 1.0  # of the seconds that at least half of the runs reach
+
+
 def test_runs_that_end_early_leave_the_average_to_the_others() -> None:
     found = consistency_figures([[3.0, 3.0, 300.0], [3.0, 3.0, 300.0], [3.0]])
-    assert found["nees_over_3_mean"] == pytest.approx((1 + 1 + 100) / 3)
+    assert found["nees_over_3_mean"] == pytest.approx((5 * 1 + 2 * 100) / 7)
     assert found["fraction_in_band"] == pytest.approx(2 / 3)
     assert consistency_figures([[]])["nees_over_3_mean"] is None
     # So does a robot that ended while its team went on: the band is that of those that are left.

@@ -151,3 +151,16 @@ def test_half_of_the_episodes_are_seen_in_a_mirror_and_those_asked_for_are_not()
     assert 6 < sum(seen) < 24
     world.reset(options={"rooms": "rectangular", "room_seed": 1000})
     assert not world._mirrored
+
+
+def test_rooms_that_are_asked_for_in_between_are_not_those_that_are_repeated():
+    config = WorldConfig(rooms=("rectangular", "cave"), repeats=3)
+    drawn, disturbed = (make_rehearsal(config, RehearsalConfig()) for _ in range(2))
+    for k in range(4):
+        drawn.reset()
+        if k != 1:
+            disturbed.reset()
+            assert disturbed._room == drawn._room
+        else:
+            disturbed.reset(options={"rooms": "rectangular", "room_seed": 1000})
+            assert disturbed._room == ("rectangular", 1000)

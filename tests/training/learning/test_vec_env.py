@@ -51,6 +51,8 @@ def test_every_bit_is_that_of_stable_baselines_own() -> None:
                 last, their_last = info["terminal_observation"], other["terminal_observation"]
                 assert all(np.array_equal(last[key], their_last[key]) for key in their_last)
                 assert info["episode_metrics"] == other["episode_metrics"]
+        for info, other in zip(ours.reset_infos, theirs.reset_infos, strict=True):
+            assert info.keys() == other.keys() and info["coverage"] == other["coverage"]
     assert ended >= 6
     ours.close()
     theirs.close()
@@ -96,8 +98,12 @@ def test_what_stable_baselines_asks_of_it() -> None:
     assert [config.rooms for config in envs.get_attr("config", [1])] == ["rectangular"]
     assert envs.env_method("episode_metrics", indices=0)[0]["steps"] == 0
     assert envs.env_is_wrapped(object) == [False, False]
-    envs.set_attr("mark", 3)
-    assert envs.get_attr("mark") == [3, 3]
+    for mark in (3, (4, 5)):
+        envs.set_attr("mark", mark)
+        assert envs.get_attr("mark") == [mark, mark]
+    envs.step(np.zeros((2, 3), np.float32))
+    assert envs.has_attr("reset") and envs.has_attr("step") and not envs.has_attr("action_masks")
+    assert callable(envs.get_attr("reset")[0]) and envs.get_attr("_elapsed_steps") == [1, 1]  # nothing was called
     with pytest.raises(ValueError, match="leave out indices"):
         envs.set_attr("mark", 3, indices=[0])
     envs.set_options([{"room_seed": 1}, {"room_seed": 2}])

@@ -13,6 +13,7 @@ from agents.brisk_tour import BRISK
 from agents.driving.control import PathFollower
 from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
+from mecanum_env.rooms.floor_plan import FloorPlan
 from training.truth.rehearsal import Rehearsal
 from training.truth.search import MOST_STOPS, annealed, moved
 from training.truth.sights import Eye, Sights, look
@@ -30,6 +31,25 @@ def room() -> ExploreEnv:
 @cache
 def sights() -> Sights:
     return Sights(room().truth.ground, robot=ROBOT, lidar=LIDAR)
+
+
+def test_where_there_is_nowhere_to_go_it_stays() -> None:
+    low, high, free = 0.1, 0.9, np.zeros((20, 20), bool)
+    free[2:-2, 2:-2] = True
+    ends = np.array([[low, low], [high, low], [high, high], [low, high]])
+    walls = np.hstack([ends, np.roll(ends, -1, axis=0)])
+    closet = FloorPlan(name="closet", walls=walls, free=free, resolution=0.05, start=(0.5, 0.5, 0.0))
+    env = ExploreEnv()
+    env.reset(seed=0, options={"floor_plan": closet})
+    board = Sights(env.truth.ground, robot=ROBOT, lidar=LIDAR).board
+    assert board.near.shape == (1, 0)
+    order, new, rng = (
+        np.zeros(MOST_STOPS, dtype=np.int64),
+        np.ones(MOST_STOPS, dtype=np.int64),
+        np.random.default_rng(0),
+    )
+    assert moved(board, order, 1, rng, new) == (1, 1) and not new.any()
+    np.testing.assert_array_equal(annealed(board, share=1.0, tries=50, rng=rng), [0])
 
 
 @given(st.lists(st.integers(0, 2**64 - 1), min_size=2, max_size=4), st.integers(0, 2**64 - 1))
