@@ -68,6 +68,7 @@ class Backend(abc.ABC):
         self._doubtful = False  # whether the scan at hand spoke against the predicted pose
         self._recovers = self.relocalises and config.health.recover
         self._checked: tuple[object, ...] = ()  # what was a scan at last, but for the ranges themselves
+        self._first: tuple[Array, Array] | None = None  # pose and covariance at the first scan
 
     def reset(
         self, pose: Array | tuple[float, float, float] = (0.0, 0.0, 0.0), *,
@@ -94,7 +95,7 @@ class Backend(abc.ABC):
         self.grid = OccupancyGrid(self.config.grid_resolution_m)
         self.key_scans = KeyScans(self.config.key_scans)
         self.recovery.reset()
-        self._doubtful = False
+        self._doubtful, self._first = False, None
         self._start(start, cov, seed)
 
     @abc.abstractmethod
@@ -115,6 +116,8 @@ class Backend(abc.ABC):
         if form != self._checked:
             scan.check()
             self._checked = form
+        if self._first is None:
+            self._first = self.pose, self._drawing_cov()
         recovery = self.recovery
         if recovery.lost:
             place = recovery.search(self.grid, scan, self._foreseen(scan)[:3].copy(), self.pose_cov)
@@ -239,9 +242,21 @@ class Backend(abc.ABC):
         return self.recovery.health
 
     def _end_variance(self) -> float:
-        """Return the variance [m²] of a beam's end three metres off, by the covariance of the pose."""
-        cov = self.pose_cov
-        return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
+        """Return the variance [m²] of a beam's end three metres off, by what the pose has become unsure of.
+
+        What it was unsure of at the first scan is in all that was drawn since, and has no scan disagree with that.
+        """
+        cov, (x, y, _) = self._drawing_cov(), self.pose.tolist()
+        first, at_first = self._first or ((x, y, 0.0), np.zeros((3, 3)))
+        dx, dy = x - float(first[0]), y - float(first[1])
+        along = cov[0, 0] - (at_first[0, 0] - 2.0 * dy * at_first[0, 2] + dy * dy * at_first[2, 2])
+        across = cov[1, 1] - (at_first[1, 1] + 2.0 * dx * at_first[1, 2] + dx * dx * at_first[2, 2])
+        turned = cov[2, 2] - at_first[2, 2]
+        return float(max(along, 0.0) + max(across, 0.0) + 9.0 * max(turned, 0.0))
+
+    def _drawing_cov(self) -> Array:
+        """Return the covariance ``(3, 3)`` of the pose in the frame in which it draws."""
+        return self.pose_cov
 
     def _drawing_gives_way(self, x: float, y: float, scan: Scan) -> bool:
         """Tell whether the map around a pose at (x, y) is old, and it or the pose so unsure that both must differ.

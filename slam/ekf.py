@@ -161,14 +161,16 @@ class EkfSlam(HeldByMap):
 
     def observe(self, observations: Observations) -> None:
         """Correct by observations without a scan; known ids are believed up to ``known_gate``, new ones added."""
-        z = observation_rows(observations)
+        z, nis, dof = observation_rows(observations), 0.0, 0
         for begin in range(0, len(z), MAX_OBSERVATIONS):
             part = z[begin : begin + MAX_OBSERVATIONS]
             if observations.ids is None:
                 self._take(part, None)
             else:
                 self._take_known(part, [int(i) for i in observations.ids[begin : begin + MAX_OBSERVATIONS]])
-        self.recovery.monitor.take_innovations(self.nis, self.nis_dof)
+            if self.nis_dof:
+                nis, dof = nis + self.nis, dof + self.nis_dof
+        self.recovery.monitor.take_innovations(nis, dof)
 
     def _take_known(self, z: Array, ids: list[int]) -> None:
         """Correct by observations of these landmarks, but those that cannot be theirs, and add new ones."""

@@ -6,6 +6,7 @@ the robot has moved on, it becomes a key scan and stays in the graph. See ``docs
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
@@ -16,6 +17,7 @@ from slam.backend import SurfaceBackend
 from slam.geometry import about_z, compose, relative, symmetric, wrap
 from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, lasting, links
+from slam.graph.pose_graph import PoseGraph
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
@@ -254,7 +256,7 @@ class GraphSlam(SurfaceBackend):
     def _redraw_if_moved(self) -> bool:
         if not self._drawn:
             return False
-        path = np.array([self.sensor_pose(body) for body in self._poses_of(self._drawn_at)])
+        path = np.array([self.sensor_pose(body) for body in self._poses_of(self._drawn_at, self.atlas.graph)])
         shift = largest_shift(path, np.array(self._shown), self.config.key_scans.lever_m)
         if shift <= 0.5 * self.grid.resolution:
             return False
@@ -276,13 +278,14 @@ class GraphSlam(SurfaceBackend):
 
     @property
     def scan_poses(self) -> Array:
-        """The poses at every update ``(updates, 3)`` as they are known by now; the graph is solved for it."""
-        self.atlas.graph.solve()
-        return self._poses_of(range(len(self._at)))
+        """The poses at every update ``(updates, 3)`` as they are known by now; a copy of the graph is solved."""
+        graph = copy.deepcopy(self.atlas.graph)  # the window is of the graph as it was solved last
+        graph.solve()
+        return self._poses_of(range(len(self._at)), graph)
 
-    def _poses_of(self, updates: Sequence[int]) -> Array:
+    def _poses_of(self, updates: Sequence[int], graph: PoseGraph) -> Array:
         """Return the poses at some of the updates ``(k, 3)``."""
-        keys = self.atlas.graph.poses[[self._at[k] for k in updates]]
+        keys = graph.poses[[self._at[k] for k in updates]]
         seen = np.array([self._from[k] for k in updates]).reshape(-1, 3)
         c, s = np.cos(keys[:, 2]), np.sin(keys[:, 2])
         x = keys[:, 0] + c * seen[:, 0] - s * seen[:, 1]

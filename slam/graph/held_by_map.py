@@ -49,14 +49,14 @@ class HeldByMap(GaussianBackend):
         """Correct by the nearest place, if the scan fits it; where none is near, remember this one."""
         x, book, places = self._x[: self._n], self._book, self._places
         ends = places.ends(scan, self.extractor)
-        seen, away = places.seen(x, book.marks, ends)
+        seen, away = places.seen(x, book.marks, book.ids, ends)
         fits = seen is not None and self._correct_aside(*seen, JOINT_LIMITS)
         if places.wanted(away, fits=fits):
             for z in places.make(book.next_id, ends):
                 self._add(z, None)
 
     def _places_beside(self) -> Indices:
-        return self._places.beside(self._x[: self._n], self._book.marks)
+        return self._places.beside(self._x[: self._n], self._book.marks, self._book.ids)
 
     def _place_beside(self, scan: Scan) -> Place:
         """Return where beside the believed pose a scan fits the drawn map best."""

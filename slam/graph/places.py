@@ -103,13 +103,16 @@ class Places:
             scan, extractor, offset_m=self._offset_m, reach_m=_REACH_M, sigma_m=self._sigma_m, rough_m=_ROUGH_M
         )
 
-    def seen(self, x: Array, marks: Array, ends: BeamEnds) -> tuple[tuple[Array, Indices] | None, float]:
+    def seen(
+        self, x: Array, marks: Array, ids: Indices, ends: BeamEnds
+    ) -> tuple[tuple[Array, Indices] | None, float]:
         """Return what a scan says of the nearest place, and how far that is away [m]: infinity without one.
 
         What it says is observation rows ``(2, 12)`` of the place's points, and which landmarks they are; None
-        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 14)`` the landmarks' marks.
+        where it does not fit. ``x`` ``(3 + 2n,)`` is the state, ``marks`` ``(n, 14)`` and ``ids`` ``(n,)`` are the
+        landmarks'.
         """
-        match, away = self._near(x, marks)
+        match, away = self._near(x, marks, ids)
         if away >= _NEAR_M:
             return None, away
         number = int(marks[match[0], FROM_MARK])
@@ -144,9 +147,9 @@ class Places:
         self._places[number] = _with_patches(None, patches, np.zeros(3))
         return _rows_of(cov, number, self._offset_m)
 
-    def beside(self, x: Array, marks: Array) -> Indices:
+    def beside(self, x: Array, marks: Array, ids: Indices) -> Indices:
         """Return the rows of the points of the place that the robot is at, if landmarks do not hold it."""
-        match, away = self._near(x, marks) if self.needed else (np.zeros(0, np.int64), math.inf)
+        match, away = self._near(x, marks, ids) if self.needed else (np.zeros(0, np.int64), math.inf)
         return match if away < _NEAR_M else match[:0]
 
     def _lasting(self, pose: Array) -> float:
@@ -155,10 +158,10 @@ class Places:
         self._last = pose.copy()
         return lasting(math.hypot(dx, dy), wrap_scalar(turn), key_m=_LASTS_M, key_rad=_LASTS_RAD, most=_STILL)
 
-    def _near(self, x: Array, marks: Array) -> tuple[Indices, float]:
+    def _near(self, x: Array, marks: Array, ids: Indices) -> tuple[Indices, float]:
         """Return the rows of the nearest place's points, ahead and behind, and how far it is [m]."""
         rows = np.flatnonzero(marks[:, 0] == VIRTUAL)
-        rows = rows[np.argsort(marks[rows, FROM_MARK], kind="stable")]
+        rows = rows[np.argsort(ids[rows])]  # the point ahead has the lower one; rows may be in any order
         numbers = marks[rows, FROM_MARK]
         first = np.flatnonzero(numbers[1:] == numbers[:-1])  # of those whose two points are both in the region
         first = first[np.isin(numbers[first], list(self._places))]

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from slam.geometry import relative
+from slam.geometry import relative, wrap
 from slam.logs.laser import check_jumps, message_of, scan_of
 from slam.logs.scans import ScanLog, chain, moved_by, rising, scan_log
 from slam.logs.tables import read_lines
@@ -50,11 +50,21 @@ def read(path: Path) -> ScanLog:
     robot = poses[:, 3:6]  # FLASER's odometry
     travelled = chain(odometry[0], relative(robot[:-1], odometry[1:]))
     mount = relative(robot, poses[:, :3])
-    offset = np.median(mount, axis=0)
-    if np.abs(mount - offset).max() < _MOUNT_VARIES and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M:
+    offset = mount[0] + np.median(_turned_less(mount, mount[0]), axis=0)
+    if (
+        np.abs(_turned_less(mount, offset)).max() < _MOUNT_VARIES
+        and math.hypot(offset[0], offset[1]) < _MOUNT_REACHES_M
+    ):
         travelled = moved_by(travelled, offset)
     note = "no reference; give one with --reference"
     return scan_log(path, ranges, travelled, times=rising(stamps), stamps=stamps, note=note)
+
+
+def _turned_less(poses: Array, pose: Array) -> Array:
+    """Return by how much poses ``(n, 3)`` differ from one ``(3,)``, in headings the short way round."""
+    less = poses - pose
+    less[:, 2] = wrap(less[:, 2])
+    return less
 
 
 def read_poses(path: Path) -> tuple[Array, Array]:

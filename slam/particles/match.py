@@ -137,8 +137,8 @@ def wanted_cells(
                     continue
                 for y in range(top, top + _BLOCK):
                     for x in range(left, left + _BLOCK):
-                        plane[y, x] = _UNKNOWN
                         if 0 <= y + row < rows and 0 <= x + col < cols:
+                            plane[y, x] = _UNKNOWN
                             cells[n, 0], cells[n, 1] = y + row, x + col
                             n += 1
     return n

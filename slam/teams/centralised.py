@@ -212,10 +212,10 @@ class JointMember(EkfSlam):
 
     def predict(self, odometry: Odometry) -> None:
         """Move this robot on by what its wheels measured."""
-        if self._apart is not None:
-            self._apart.keep(odometry)
         self._team._turn(self.index)
         super().predict(odometry)
+        if self._apart is not None:
+            self._apart.keep(odometry)
 
     def update(self, scan: Scan) -> None:
         """Correct all robots and the map by a scan of this one's."""
@@ -296,9 +296,8 @@ class JointMember(EkfSlam):
         none = np.zeros((0, 2))
         return own if self._apart is None else own + self._apart.in_all(self._x[:3], none, none)
 
-    def _end_variance(self) -> float:
-        cov = super().pose_cov  # in the frame in which it draws
-        return float(cov[0, 0] + cov[1, 1] + 9.0 * cov[2, 2])
+    def _drawing_cov(self) -> Array:
+        return super().pose_cov
 
     def _covariance(self, landmarks: Indices) -> Array:
         cov: Array = super()._covariance(landmarks)

@@ -94,6 +94,9 @@ class MergedGrid(OccupancyGrid):
         moved[r : r + plane.shape[0], c : c + plane.shape[1]] = plane
         return moved
 
+    def _move_near(self, row0: int, col0: int, row1: int, col1: int) -> None:
+        """Stay: what others tell may lie anywhere, and nothing of it is drawn yet."""
+
     def _grow(self, row0: int, col0: int, row1: int, col1: int) -> None:
         before = self.shape, self.lattice_origin
         super()._grow(row0, col0, row1, col1)

@@ -275,6 +275,18 @@ def test_a_hard_start_adds_to_the_noise_and_a_gentle_one_does_not() -> None:
     assert hard[1] - calm[1] == pytest.approx(0.4**2 + along**2)
 
 
+def test_innovations_are_taken_once_and_all_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, taken = np.random.default_rng(0), []
+    landmarks = rng.uniform(-20, 20, (100, 2))
+    backend = slam.make("ekf")
+    monkeypatch.setattr(backend.recovery.monitor, "take_innovations", lambda nis, dof: taken.append((nis, dof)))
+    for _ in range(2):
+        backend.observe(observe_landmarks(backend.pose, landmarks, OFFSET, np.diag([1e-4, 1e-5]), rng))
+    backend.observe(Observations(np.zeros((0, 2)), np.zeros((0, 2, 2))))
+    assert [dof for _, dof in taken] == [0, 200, 0]
+    assert taken[1][0] / 200 == pytest.approx(1.0, abs=0.5)
+
+
 @pytest.mark.parametrize("name", [n for n in slam.names() if slam.make(n).observes_landmarks])
 def test_every_backend_takes_observations_grows_and_starts_over(name: str) -> None:
     rng = np.random.default_rng(0)

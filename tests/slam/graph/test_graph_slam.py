@@ -97,6 +97,23 @@ def test_a_loop_closes_and_the_covariance_holds() -> None:
     assert path.shape == (len(true), 3) and np.abs((path - np.array(true))[:, :2]).max() < 0.06
 
 
+class Watched(GraphSlam):
+    """One whose path somebody looks at after every scan."""
+
+    def update(self, scan: Scan) -> None:
+        super().update(scan)
+        assert len(self.scan_poses) > 0
+
+
+def test_looking_at_the_path_changes_nothing() -> None:
+    alone, watched = GraphSlam(config()), Watched(config())
+    for backend in (alone, watched):
+        drive(backend, ring(), LOOP, 0)
+    assert alone.atlas.closings >= 1
+    np.testing.assert_array_equal(watched.pose, alone.pose)
+    np.testing.assert_array_equal(watched.pose_cov, alone.pose_cov)
+
+
 def test_the_same_input_gives_the_same_belief() -> None:
     beliefs = []
     for _ in range(2):

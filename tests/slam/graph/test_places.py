@@ -41,6 +41,9 @@ def scan_from(body: Array, rng: np.random.Generator, *, beams: int = BEAMS, view
     return Scan(np.where(out > REACH, np.inf, out), first, increment, REACH)
 
 
+IDS = np.array([4, 5])  # of the two points of a place
+
+
 def one_place(scan: Scan, x: Array) -> tuple[Places, Array, Array, Array]:
     """Return places with one at the robot's pose, the rows of its points, the state with them and their marks."""
     extractor, places = FeatureExtractor(FeatureConfig()), Places(OFFSET, SIGMA)
@@ -97,7 +100,7 @@ def test_a_scan_tells_where_the_place_is_as_surely_as_it_says() -> None:
         state[:3] = believed
         scan, extractor = scan_from(there, rng), FeatureExtractor(FeatureConfig())
         extractor.extract(scan)
-        seen, away = places.seen(state, marks, places.ends(scan, extractor))
+        seen, away = places.seen(state, marks, IDS, places.ends(scan, extractor))
         assert seen is not None and away < 1.0
         (rows, match), h = seen, np.zeros((2, 5))
         assert match.tolist() == [0, 1]
@@ -119,7 +122,7 @@ def test_the_points_say_no_more_than_the_scan() -> None:
     places, _, state, marks = one_place(scan_from(here, rng), here)
     extractor, scan = FeatureExtractor(FeatureConfig()), scan_from(here, rng)
     extractor.extract(scan)
-    seen, _ = places.seen(state, marks, places.ends(scan, extractor))
+    seen, _ = places.seen(state, marks, IDS, places.ends(scan, extractor))
     assert seen is not None
     for part in (seen[0][:1], seen[0][1:]):
         assert np.linalg.matrix_rank(information(part, state), tol=1e-6) == 2
@@ -132,7 +135,7 @@ def test_a_scan_of_elsewhere_does_not_fit() -> None:
     places, _, state, marks = one_place(scan_from(np.array([2.0, 0.0, 0.0]), rng), np.zeros(3))
     scan, extractor = scan_from(np.array([-2.5, 0.5, 2.0]), rng), FeatureExtractor(FeatureConfig())
     extractor.extract(scan)
-    seen, away = places.seen(state, marks, places.ends(scan, extractor))
+    seen, away = places.seen(state, marks, IDS, places.ends(scan, extractor))
     assert seen is None and away == pytest.approx(0.0, abs=1e-9)
 
 
@@ -154,9 +157,9 @@ def test_one_that_looks_ahead_only_is_far_from_a_place_it_has_its_back_to() -> N
     extractor.extract(scan)
     places.due(0, scan)
     ends = places.ends(scan, extractor)
-    assert places.seen(state, marks, ends)[0] is not None
+    assert places.seen(state, marks, IDS, ends)[0] is not None
     state[2] = wrap(pose[2] + 3.0)
-    seen, away = places.seen(state, marks, ends)
+    seen, away = places.seen(state, marks, IDS, ends)
     assert seen is None and away == pytest.approx(2.0, abs=0.01)
 
 
@@ -165,10 +168,25 @@ def test_a_place_of_which_one_point_is_in_another_region_serves_nobody() -> None
     places, _, state, marks = one_place(scan_from(pose, rng), pose)
     extractor, scan = FeatureExtractor(FeatureConfig()), scan_from(pose, rng)
     extractor.extract(scan)
-    assert places.seen(state[:5], marks[:1], places.ends(scan, extractor)) == (None, math.inf)
+    assert places.seen(state[:5], marks[:1], IDS[:1], places.ends(scan, extractor)) == (None, math.inf)
     for _ in range(5):
         places.due(0, scan)
-    assert len(places.beside(state[:5], marks[:1])) == 0 and places.beside(state, marks).tolist() == [0, 1]
+    assert len(places.beside(state[:5], marks[:1], IDS[:1])) == 0
+    assert places.beside(state, marks, IDS).tolist() == [0, 1]
+
+
+def test_the_point_ahead_is_that_with_the_lower_id_whatever_their_rows() -> None:
+    """A region's rows are in the order of places that landmarks have left, and so may the two points be."""
+    rng, pose = np.random.default_rng(7), np.array([0.3, 0.2, 0.1])
+    places, _, state, marks = one_place(scan_from(pose, rng), pose)
+    extractor, scan = FeatureExtractor(FeatureConfig()), scan_from(pose, rng)
+    extractor.extract(scan)
+    ends = places.ends(scan, extractor)
+    (seen, match), _ = places.seen(state, marks, IDS, ends)
+    swapped = np.concatenate([state[:3], state[5:7], state[3:5]])
+    (seen_too, match_too), _ = places.seen(swapped, marks, IDS[::-1], ends)
+    assert match.tolist() == [0, 1] and match_too.tolist() == [1, 0]
+    np.testing.assert_allclose(seen_too, seen, rtol=1e-2, atol=1e-3)
 
 
 # ---- in a filter -----------------------------------------------------------------------------------------------

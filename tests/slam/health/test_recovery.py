@@ -54,6 +54,20 @@ def test_carried_off_and_found(name: str) -> None:
     assert metrics["map_precision"] > walls - 0.02  # no wall stands twice
 
 
+@pytest.mark.parametrize("sigma_rad", [0.05, 0.15])
+@pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "graph-slam"])
+def test_who_is_unsure_of_the_start_is_found_as_well(name: str, sigma_rad: float) -> None:
+    """What the start was off by is in all that was drawn: it explains no scan that contradicts the map."""
+    env = driven(name, 60, settings={"start_sigma_rad": sigma_rad})
+    backend = env.backend
+    assert 9.0 * backend.pose_cov[2, 2] > backend.recovery.config.blur_m**2
+    assert FAULTS["teleport"]().begin(env, np.random.default_rng(0))
+    for _ in range(60):
+        env.step(np.zeros(3, np.float32))
+    assert backend.recovery.times_lost == backend.recovery.relocalisations == 1
+    assert np.hypot(*(backend.pose - env.truth.pose)[:2]) < 0.1
+
+
 @pytest.mark.parametrize("redraws", [True, False])
 def test_a_closed_loop_is_no_reason_to_be_lost(redraws: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """All that is believed moves at once, long before the drawing is looked at again: it is brought up to date."""

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import slam
-from slam.geometry import compose, wrap
+from slam.geometry import compose, relative, wrap
 from slam.logs import ScanLog, open_log, with_reference
 from slam.logs.dpslam import NOMINAL_DT_S
 from slam.logs.scans import beam_angles, rising, without_returns
@@ -179,6 +179,22 @@ def test_codes_for_no_return():
     assert reach == 25.4 and math.isnan(ranges[0, 1]) and ranges[0, 2:].tolist() == [8.183, 25.38]
     ranges, reach = without_returns(np.array([[81.83, 0.0]]))
     assert np.isnan(ranges).all() and reach > 0
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4, math.pi])
+def test_a_laser_may_look_any_way(tmp_path, yaw):
+    """It looks backwards: its heading less the robot's is about π as often as about −π."""
+    _, reckoned = drive(60)
+    mount = np.array([-0.2, 0.1, yaw])
+    lines = []
+    for k, pose in enumerate(reckoned):
+        laser = compose(pose, mount)
+        lines.append(flaser(np.ones(180), np.array([*laser[:2], wrap(laser[2])]), pose, SECONDS * k))
+    log = scan_log(put_lines(tmp_path / "raw.log", lines))
+    found = relative(log.odometry_poses[:1], log.odometry_poses)
+    true = relative(compose(reckoned[0], mount)[None], np.array([compose(pose, mount) for pose in reckoned]))
+    np.testing.assert_allclose(found[:, :2], true[:, :2], atol=1e-6)
+    np.testing.assert_allclose(wrap(found[:, 2] - true[:, 2]), 0.0, atol=1e-6)
 
 
 # ---- reference ------------------------------------------------------------------------------------------------

@@ -163,3 +163,14 @@ def test_informations_of_parts_of_a_map_are_that_of_the_fit() -> None:
     assert distance2 < config.cell_m**2 / 3  # the very scan that was drawn
     _, farther = matcher.informations(grids, 0, 1.04 * points, pose, groups, 3)
     assert math.sqrt(farther - distance2) == pytest.approx(0.08, rel=0.3)
+
+
+def test_a_fit_that_looks_beyond_the_map_leaves_nothing_behind() -> None:
+    config, angle = MatchConfig(), np.linspace(-3, 3, 150)
+    points = 1.5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    grids = SharedGrid(1, config.cell_m)
+    grids.enclose(np.full(2, -1.0), np.full(2, 1.0))
+    matcher, (rows, cols) = ParticleMatcher(config), grids.lattice.shape
+    edge = config.cell_m * np.array([grids.lattice.col + cols, grids.lattice.row + rows])
+    matcher.fit(grids, 0, points, np.array([*edge, 0.0]), np.eye(3), unknown=0.3, free=0.1)
+    assert not matcher._plane.any() and not matcher._values.any()

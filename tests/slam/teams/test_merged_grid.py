@@ -78,6 +78,28 @@ def test_it_is_the_sum_of_what_each_saw_itself_once() -> None:
         _check_sums(merged)
 
 
+@pytest.mark.parametrize("own_at", [0.0, 70.0])
+@pytest.mark.parametrize("others_at", [(0.0,), (-80.0,), (70.0, -80.0)])
+@pytest.mark.parametrize("taken_first", [False, True])
+def test_maps_may_begin_far_from_each_other(
+    own_at: float, others_at: tuple[float, ...], taken_first: bool
+) -> None:
+    rng, own = np.random.default_rng(2), OccupancyGrid()
+    charts: dict[int, tuple[Chart, None]] = {}
+    for k, x in enumerate((own_at, *others_at)):
+        grid = own if k == 0 else OccupancyGrid()
+        grid.integrate((x, 5.0, 0.3), _scan(rng), body=(x, 5.0, 0.25))
+        if k:
+            charts[k] = Chart.of(grid), None
+    merged = MergedGrid(own)
+    for step in ("take", "follow") if taken_first else ("follow", "take"):
+        merged.take(charts) if step == "take" else merged.follow()
+    seen_twice = sum(x == own_at for x in others_at)
+    known = own.known_cells + sum(int(np.count_nonzero(chart.cells)) for chart, _ in charts.values())
+    assert merged.known_cells == known if not seen_twice else merged.known_cells < known
+    _check_sums(merged)
+
+
 def test_what_is_drawn_is_told() -> None:
     rng = np.random.default_rng(2)
     own, other = OccupancyGrid(), OccupancyGrid()
