@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,8 @@ from slam.teams.centralised import JointEkf
 from slam.teams.frames import points_into, pose_into, walls_into
 from slam.types import Observations, Odometry
 from tests.slam.numerics import numerical_jacobian, random_covariance
-from tests.slam.teams.test_centralised import CONFIG, MET, SEEN, rooms
+from tests.slam.simulated import observe_landmarks
+from tests.slam.teams.test_centralised import CONFIG, MET, OFFSET, SEEN, rooms
 
 BADLY = np.diag([0.1, 0.1, 0.06]) ** 2
 
@@ -117,3 +119,16 @@ def test_an_account_without_its_start_is_that_of_one_who_knew_it() -> None:
     scale = np.sqrt(np.diag(exact.cov))
     assert np.abs((found.cov - exact.cov) / np.outer(scale, scale)).max() < 0.15
     assert np.trace(rough.cov[3:, 3:]) > 5.0 * np.trace(found.cov[3:, 3:])
+
+
+def test_odometry_that_is_refused_is_nowhere_when_an_unsure_robot_joins() -> None:
+    team = JointEkf(2, CONFIG)
+    team.reset([[0, 0, 0], [1, 0, 0]], [1e-6 * np.eye(3), 0.04 * np.eye(3)])
+    member, rng = team.members[1], np.random.default_rng(1)
+    assert member.apart
+    with pytest.raises(ValueError, match="finite"):
+        member.predict(Odometry((math.nan, 0.0, 0.0), 0.1))
+    member.predict(Odometry((0.5, 0.0, 0.0), 1.0))
+    member.observe(observe_landmarks(np.array([1.5, 0.0, 0.0]), np.array([[3.0, 1.0]]), OFFSET, SEEN, rng))
+    assert not member.apart
+    np.testing.assert_allclose(member.pose, [1.5, 0.0, 0.0], atol=0.01)

@@ -384,19 +384,6 @@ def test_a_belief_is_of_when_it_was_given() -> None:
     np.testing.assert_array_equal(member.belief.joint_cov, want)
 
 
-def test_odometry_that_is_refused_is_nowhere_when_an_unsure_robot_joins() -> None:
-    team = JointEkf(2, CONFIG)
-    team.reset([[0, 0, 0], [1, 0, 0]], [1e-6 * np.eye(3), 0.04 * np.eye(3)])
-    member, rng = team.members[1], np.random.default_rng(1)
-    assert member.apart
-    with pytest.raises(ValueError, match="finite"):
-        member.predict(Odometry((math.nan, 0.0, 0.0), 0.1))
-    member.predict(Odometry((0.5, 0.0, 0.0), 1.0))
-    member.observe(observe_landmarks(np.array([1.5, 0.0, 0.0]), np.array([[3.0, 1.0]]), OFFSET, SEEN, rng))
-    assert not member.apart
-    np.testing.assert_allclose(member.pose, [1.5, 0.0, 0.0], atol=0.01)
-
-
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 1 robot"):
         JointEkf(0)
