@@ -78,7 +78,7 @@ def main(steps: int) -> None:
             if done.any():
                 last = info["final_info"]
                 ended += [(last["time_s"][i], last["is_success"][i]) for i in np.flatnonzero(done)]
-            for i in np.flatnonzero(truncated):  # out of time, not at an end: what would follow is estimated
+            for i in np.flatnonzero(truncated & ~terminated):  # out of time: what would follow is estimated
                 final = {key: np.stack([info["final_obs"][i][key]]) for key in KEYS}
                 with torch.no_grad():
                     rewards[t, i] += GAMMA ** last["duration_s"][i] * agent(tensors(final))[1][0]

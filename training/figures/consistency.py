@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from slam.metrics.measures import anees, nees_band
 from slam.types import Array
+from training.runs.running import plain
 
 __all__ = ["consistency_figures", "step_averages"]
 
@@ -39,7 +40,7 @@ def consistency_figures(profiles: Sequence[ArrayLike]) -> dict[str, Any]:
     inside = np.count_nonzero((averages >= lows) & (averages <= highs))
     steps = np.concatenate([np.asarray(profile, np.float64) for profile in profiles])
     return {
-        "nees_over_3_mean": float(np.nanmean(steps)) / 3 if np.isfinite(steps).any() else None,
+        "nees_over_3_mean": plain(float(np.nanmean(steps)) / 3) if not np.isnan(steps).all() else None,
         "nees_band_95": list(nees_band(3, len(profiles))),
         "fraction_in_band": float(inside / max(len(averages), 1)),
     }

@@ -107,7 +107,8 @@ def study(
     atomic_write(out, (json.dumps(found, indent=1) + "\n").encode())
     if before is not None:
         other = sorted(name for name in {*found, *before} if found.get(name) != before.get(name))
-        print("\n".join([f"{len(found) - len(other)} of {len(found)} episodes are the same", *other]))
+        same = sum(before.get(name) == told for name, told in found.items())
+        print("\n".join([f"{same} of {len(found)} episodes are the same", *other]))
         if other:
             raise typer.Exit(1)
 

@@ -135,6 +135,9 @@ class Film:
             self._open.close()
         except OSError as error:
             self.failure = self.failure or error
+        except ValueError:  # of a film that could not be begun, and has no frame
+            if self.failure is None:
+                raise
         return self._path if self.failure is None else None
 
 

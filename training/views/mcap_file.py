@@ -176,7 +176,8 @@ def _poses(recording: Recording) -> Iterator[tuple[int, str, Message]]:
 
 def _scan(recording: Recording, time_s: float, ranges: NDArray[np.generic]) -> Message:
     scan = recording.scan._replace(ranges=np.asarray(ranges, np.float64))
-    return scan_message(time_s, "laser", scan, scan_time_s=recording.step_s)
+    apart = int(recording.scans.steps[1]) if len(recording.scans.steps) > 1 else 1  # the first is the start's
+    return scan_message(time_s, "laser", scan, scan_time_s=apart * recording.step_s)
 
 
 def _plan(time_s: float, path: NDArray[np.generic]) -> Message:

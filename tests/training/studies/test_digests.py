@@ -44,6 +44,10 @@ def test_the_command_compares(
     before.write_text(json.dumps(found | {changed: "0"}))
     assert main(["study", "digests", "--out", str(tmp_path / "now.json"), "--against", str(before)]) == 1
     assert changed in capsys.readouterr().out
+    before.write_text(json.dumps(found | {"an agent that was there": "0"}))
+    assert main(["study", "digests", "--out", str(tmp_path / "now.json"), "--against", str(before)]) == 1
+    told = capsys.readouterr().out
+    assert "3 of 3 episodes are the same" in told and "an agent that was there" in told
 
 
 def test_what_cannot_be_used_is_told_before_any_episode(

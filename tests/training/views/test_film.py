@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 import mecanum_env  # noqa: F401 - registers the environments
 from mecanum_env.config import EnvConfig
+from mecanum_env.env import ExploreEnv
 from mecanum_env.views.render import FRAME_SHAPE, render_frame
 from slam.geometry import compose, exp, inverse, log
 from tests.training.recorded_episode import explore
 from training.cli import main
 from training.runs.errors import BadInput
-from training.views.film import Camera, check_video, film, film_episode
+from training.views.film import Camera, check_video, film, film_episode, filmed
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
@@ -159,6 +160,19 @@ def test_what_ffmpeg_cannot_write_is_said(tmp_path: Path) -> None:
         for frame in colours(400, (320, 480)):
             write(frame)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_film_that_cannot_begin_ends_no_episode(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: Any, **__: Any) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    env = ExploreEnv(rooms="rectangular", slam="odometry")
+    env.reset(seed=0)
+    monkeypatch.setattr("training.views.film.subprocess.Popen", refused)
+    with filmed(tmp_path, env.config) as made:
+        for _ in range(3):
+            made.take(env, None)
+        assert made.finish() is None and made.failure is not None
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends the signal of Ctrl-C")

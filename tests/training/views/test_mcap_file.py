@@ -202,6 +202,7 @@ def test_scans_are_those_recorded_and_end_on_the_map(
     ):
         assert time == round(recording.times[step] * 1e9) and message.header.frame_id == "laser"
         np.testing.assert_array_equal(np.array(message.ranges, np.float32), ranges)  # nan and inf among them
+        assert message.scan_time == pytest.approx(recording.times[recording.scans.steps[1]])
         assert message.intensities == [] and message.range_max == LIDAR.range_max_m
         assert message.angle_increment == pytest.approx(LIDAR.angle_increment)
         assert message.angle_max == pytest.approx(message.angle_min + (LIDAR.beams - 1) * LIDAR.angle_increment)

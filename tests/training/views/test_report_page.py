@@ -185,6 +185,8 @@ def test_the_page_needs_nothing_else_and_says_what_it_shows(episode: Recorded) -
     assert_strict(page)
     assert "apartment, seed 3: brisk-tour on invariant-ekf" in page and "time: the step limit" in page
     assert len(page) < 400_000
+    read_out = re.findall(r"<output[^>]*>", page)
+    assert len(read_out) >= 2 and all('aria-live="off"' in tag for tag in read_out), "they change at every frame"
 
 
 def test_names_from_outside_cannot_leave_their_place(tmp_path: Path) -> None:
@@ -269,6 +271,12 @@ def test_keys_and_buttons_drive_the_replay(browser: Any, episode: Recorded) -> N
     WebDriverWait(browser, 10).until(lambda b: b.execute_script(row) > 15)
     body.send_keys(Keys.SPACE)
     assert not browser.execute_script("return replay.playing")
+    # What scrolls takes the keys for itself.
+    browser.execute_script("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    at, config = browser.execute_script(row), browser.find_elements("tag name", "pre")[1]
+    browser.execute_script("arguments[0].tabIndex = 0; arguments[0].focus()", config)
+    config.send_keys(Keys.ARROW_RIGHT)
+    assert browser.execute_script(row) == at
     # A layer taken away changes the picture.
     picture = "return document.getElementById('belief').toDataURL()"
     before = browser.execute_script(picture)

@@ -189,6 +189,7 @@ def measure(*, steps: int, rooms: str, slam: str, beams: int, seed: int) -> dict
         "watched_step_us_median": 1e6 * statistics.median(timed),
         "landmarks_mean": float(np.mean(landmarks)),
         "steps": len(times),
+        "replays": len(replays),
         "rss_mb": rss_after,
         "rss_mb_before": rss_before,
         "machine": f"{platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}",
@@ -226,7 +227,8 @@ def run(*, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bo
     print(
         f"{result['steps_per_second']:,.0f} complete steps per second ({result['steps']:,} steps; median "
         f"{result['step_us_median']:.0f} µs, 99th percentile {result['step_us_p99']:.0f} µs; undisturbed, the "
-        f"fastest of {REPEATS} replays of each step, {result['steps_per_second_undisturbed']:,.0f} a second; "
+        f"fastest of {result['replays']} replays of each step, "
+        f"{result['steps_per_second_undisturbed']:,.0f} a second; "
         f"{result['landmarks_mean']:.0f} landmarks on average; {result['rss_mb_before']:.0f} MB before, "
         f"{result['rss_mb']:.0f} MB after)"
     )

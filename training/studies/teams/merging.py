@@ -140,7 +140,10 @@ def _judged(found: Alignment, a: _Told, b: _Told, true: Array, prior: tuple[Arra
 
 
 def _merged(merged: MergedMap, a: _Told, b: _Told, true: Array) -> Row:
-    """Return NEES of the merged corners, of those that both have seen, and of both robots' poses."""
+    """Return NEES of the merged corners, of those that both have seen, and of both robots' poses.
+
+    Of corners far from every true one there is no NEES: how many there are is ``corners_nowhere``.
+    """
     apart = merged.points[:, None] - a.corners[None]
     nearest = np.linalg.norm(apart, axis=2).argmin(axis=1)
     errors = apart[np.arange(len(nearest)), nearest]
@@ -150,7 +153,7 @@ def _merged(merged: MergedMap, a: _Told, b: _Told, true: Array) -> Row:
     true_poses = a.pose, compose(true, b.pose)
     return {
         "corner_nees": nees[known].tolist(), "shared_corner_nees": nees[known & both].tolist(),
-        "corner_m": np.linalg.norm(errors, axis=1)[known].tolist(),
+        "corner_m": np.linalg.norm(errors, axis=1)[known].tolist(), "corners_nowhere": np.count_nonzero(~known),
         "pose_nees": [
             float(nees_pose(merged.poses[k], merged.pose_covs[k], pose)) for k, pose in enumerate(true_poses)
         ],
@@ -175,13 +178,14 @@ def summarise(rows: Mapping[Job, Row]) -> dict[str, Row]:
 
         corners = [c for t in right for c in zip(t.get("corner_m", []), t.get("corner_nees", []), strict=True)]
         true = [nees for off, nees in corners if off < _FALSE_M]
+        nowhere = sum(t.get("corners_nowhere", 0) for t in right)
         out[name] = {
             **{outcome: sum(t["outcome"] == outcome for t in told) for outcome in ("right", "none", "wrong")},
             "off_m": mean("off_m", 1), "off_deg": None if not right else math.degrees(mean("off_rad", 1) or 0.0),
             "off_m_max": max((t["off_m"] for t in right), default=None),
             "nees": mean("nees", 3), "corner_nees": mean("corner_nees", 2),
             "true_corner_nees": statistics.fmean(true) / 2 if true else None,
-            "corners": len(corners), "false_corners": len(corners) - len(true),
+            "corners": len(corners) + nowhere, "false_corners": len(corners) - len(true) + nowhere,
             "shared_corner_nees": mean("shared_corner_nees", 2), "corner_m": mean("corner_m", 1),
             "pose_nees": mean("pose_nees", 3),
             "overlap": statistics.fmean(row["overlap"] for row in rows.values()),

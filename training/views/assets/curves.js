@@ -5,7 +5,7 @@ function openCurves(header, curves, pick) {
   const n = header.rows, step = header.step_s;
   for (const curve of curves) {
     const figure = document.createElement("figure");
-    figure.innerHTML = `<figcaption><span>${curve.name}${curve.unit ? ` [${curve.unit}]` : ""}</span><output></output></figcaption><canvas></canvas>`;
+    figure.innerHTML = `<figcaption><span>${curve.name}${curve.unit ? ` [${curve.unit}]` : ""}</span><output aria-live="off"></output></figcaption><canvas></canvas>`;
     document.getElementById("curves").append(figure);
     curve.canvas = figure.querySelector("canvas");
     curve.canvas.setAttribute("role", "img");

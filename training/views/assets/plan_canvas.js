@@ -171,7 +171,7 @@ async function openCanvases(header, redraw) {
     canvas.addEventListener("wheel", (event) => {
       if (!event.ctrlKey && !meant && view.zoom === 1) return; // the page scrolls on
       event.preventDefault();
-      const factor = Math.exp(-0.0016 * event.deltaY);
+      const factor = Math.min(Math.max(Math.exp(-0.0016 * event.deltaY), 1 / view.zoom), 40 / view.zoom);
       const dx = (event.offsetX - canvas.clientWidth / 2) / canvas.scale;
       const dy = (canvas.clientHeight / 2 - event.offsetY) / canvas.scale;
       if (!layers.follow) { view.x += dx * (1 - 1 / factor); view.y += dy * (1 - 1 / factor); }

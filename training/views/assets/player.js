@@ -60,7 +60,7 @@
   }
   function tick(now) {
     if (!playing) return;
-    const passed = last === undefined ? 0 : Math.max(now - last, 0);
+    const passed = last === undefined ? 0 : Math.min(Math.max(now - last, 0), 250); // no frames come while it is hidden
     exact = Math.min(exact + (passed / 1e3 / step) * Number(speed.value), n - 1);
     last = now;
     if (Math.floor(exact) !== k) { k = Math.floor(exact); draw(); }
@@ -78,7 +78,7 @@
       Home: () => { pause(); seek(0); },
       End: () => { pause(); seek(n - 1); },
     }[event.key];
-    if (!does || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select, summary")) return;
+    if (!does || event.ctrlKey || event.metaKey || event.altKey || event.target.matches("select, summary, pre, .wide")) return;
     // The button does so itself, and so does a box that was reached by keys.
     if (event.key === " " && event.target.matches("#play, input[type=checkbox]:focus-visible")) return;
     event.preventDefault();

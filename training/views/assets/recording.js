@@ -108,11 +108,12 @@ function recordingOf(header, data, shades = [{ 0: 0xffe4e1de, 1: 0xffffffff, 101
     function frontiers() {
       if (edge) return edge;
       const path = edge = new Path2D();
-      for (let row = 1; row < rows - 1; row++) {
-        for (let i = row * cols + 1; i < (row + 1) * cols - 1; i++) {
+      for (let row = 0; row < rows; row++) {
+        for (let col = 0, i = row * cols; col < cols; col++, i++) {
           if (classes[i] !== 1) continue;
-          if (classes[i - 1] && classes[i + 1] && classes[i - cols] && classes[i + cols]) continue;
-          path.rect(i - row * cols, rows - 1 - row, 1, 1);
+          const inside = col > 0 && col < cols - 1 && row > 0 && row < rows - 1; // what lies outside is unknown
+          if (inside && classes[i - 1] && classes[i + 1] && classes[i - cols] && classes[i + cols]) continue;
+          path.rect(col, rows - 1 - row, 1, 1);
         }
       }
       return path;

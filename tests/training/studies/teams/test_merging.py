@@ -13,6 +13,11 @@ def test_two_robots_and_what_is_said_of_them() -> None:
     row = run_job(job)
     assert 0.0 < row["overlap"] <= 1.0 and min(row["coverages"]) >= 0.7
     assert row["known"]["outcome"] == "right" and row["known"]["off_m"] < RIGHT_M
+    # Corners that are nowhere near a true one are the falsest.
+    odd = {**row, "known": {**row["known"], "corners_nowhere": 2}}
+    said, more = (summarise({job: one})["known"] for one in (row, odd))
+    assert row["known"]["corners_nowhere"] == 0
+    assert more["false_corners"] == said["false_corners"] + 2 and more["corners"] == said["corners"] + 2
     none = {**row, "unknown": {"outcome": "none"}}
     summary = summarise({job: row, ("apartment", 4, 0.7, 60.0): none})
     assert summary["unknown"]["none"] == 1 and summary["known"]["right"] == 2
