@@ -290,8 +290,12 @@ class Backend(abc.ABC):
         pose, pose_cov = self.pose, self.pose_cov
         poses = kept.pop("key_scan_poses")
         self.__dict__.update(kept)
-        self._place(pose, pose_cov)
+        self._carry_on(pose, pose_cov)
         self._redraw_kept(poses)
+
+    def _carry_on(self, pose: Array, pose_cov: Array) -> None:
+        """Go on from what was copied at the pose ``(3,)`` that the wheels have reached by now."""
+        self._place(pose, pose_cov)
 
     def _redraw_kept(self, poses: Array) -> None:
         """Redraw the map from the key scans that there were when their poses ``(n, 3)`` were kept."""
@@ -302,9 +306,9 @@ class Backend(abc.ABC):
         return False
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
-        """Set the robot's pose ``(3,)`` with a covariance ``(3, 3)`` that is correlated with nothing.
+        """Set the robot's pose ``(3,)``, unsure by a covariance ``(3, 3)`` that is correlated with nothing.
 
-        To be overridden where ``relocalises``.
+        To be overridden where ``relocalises``. In the EKF family it stays off by what the whole map is off by.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot be placed elsewhere")
 

@@ -106,10 +106,9 @@ class CompressedEkfSlam(EkfSlam):
                 self._choose_region(ids)
         super().observe(observations)
 
-    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
-        self._place(pose, cov)
+    def _find(self, pose: Array, pose_cov: Array) -> None:
+        super()._find(pose, pose_cov)
         self._choose_region(np.zeros(0, np.int64))
-        super()._relocate(pose, cov, scan)
 
     def _add(self, z: Array, known_id: int | None) -> None:
         super()._add(z, known_id)
@@ -124,7 +123,7 @@ class CompressedEkfSlam(EkfSlam):
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
         if len(self._far):
-            self._leave()  # what is far learns of the pose before it is forgotten
+            self._leave()  # what is far learns of the pose before it is another one
             self._enter()
         super()._place(pose, pose_cov)
 

@@ -70,6 +70,7 @@ class EkfSlam(HeldByMap):
         self._match = np.zeros(MAX_OBSERVATIONS, np.int64)
         self._distance = np.zeros(MAX_OBSERVATIONS)
         self._beside = self._companions()
+        self._held = None
         self._places = Places(self.config.lidar_offset_m, self.config.features.range_sigma_m)
         self._lasting = np.zeros(2)  # see slam.landmarks.wall_evidence
         self._recall = (0, 0)  # see slam.landmarks.book.count_recent
@@ -374,12 +375,12 @@ class EkfSlam(HeldByMap):
 
     def _place(self, pose: Array, pose_cov: Array) -> None:
         self._settle_beliefs()
+        self._beside.jump(joint.jump_jacobian(self._x, pose))
         joint.place(self._x, self._p, self._n, pose, pose_cov)
-        self._beside.forget_pose()
 
     def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
         """Go on from a pose ``(3,)`` of a scan: the landmarks it shows say where it is, and how surely."""
-        self._place(pose, cov + found_cov())
+        self._find(pose, cov + found_cov())
         z = self._features(scan)
         match = self._associate(z).copy()
         self._place(pose, np.diag(np.square(_WIDE)))

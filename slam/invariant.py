@@ -61,7 +61,8 @@ class InvariantEkfSlam(CompressedEkfSlam):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         super()._start(pose, pose_cov, seed)
         self._delta = np.zeros(len(self._x))
-        self._entered = self._x[:3].copy()  # the pose, on entering the region
+        self._entered = self._x[:3].copy()  # the pose on entering the region, …
+        self._entered_cov, self._entered_far = pose_cov, np.zeros((3, 0))  # … its covariance, and with what is far
 
     def _companions(self) -> Companions:
         noise = self.config.odometry
@@ -105,6 +106,7 @@ class InvariantEkfSlam(CompressedEkfSlam):
         super()._enter()
         self._entered = self._x[:3].copy()
         if len(self._far):
+            self._entered_cov, self._entered_far = self.pose_cov, self._cross(3)
             # What is far turns with the robot as it entered. Since then odometry's errors are put right, too.
             cross, own = self._p[:3, : self._n].copy(), self._beside.cross[: self._beside.own, :3].copy()
             cross[:, :3] = self.pose_cov
@@ -130,15 +132,15 @@ class InvariantEkfSlam(CompressedEkfSlam):
         far, size, columns = state_rows(self._far, robot=False), change.left.shape[1], self._retracted()[1]
         a, robot = np.zeros((3, size)), [2, 0, 1]
         a[:, far] = columns[:, far]
-        # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update.
-        u, cross = np.zeros((3, size)), self._cross(3)
-        u[:, far] = cross[:, far]
-        region, pose_cov = self._p[:3, : self._n].copy(), self.pose_cov
-        region[:, :3] = pose_cov  # of which there was but the upper triangle
-        u[:, state_rows(self._near, robot=True)] = region
+        # P += A Uᵀ + U Aᵀ with U = P_:r + ½ A P_rr, as in invariant_update; r is the robot as it entered, too.
+        y, v, own = self._beside, self._v, change.own.copy()
+        change_cov = np.triu(y.cov[-3:, -3:])  # of joined states there is but the upper triangle
+        pose_cov = self._entered_cov + change_cov + np.triu(change_cov, 1).T
+        u = np.zeros((3, size))
+        u[:, far] = (self._entered_far + product(y.cov[self._of_far, -3:].T, v, v.shape[1]))[:, far]
+        u[:, state_rows(self._near, robot=True)] = y.cross[-3:, : self._n]
         u = u[robot] + product(0.5 * pose_cov[np.ix_(robot, robot)], a, size)
-        own = change.own.copy()
-        own[:, :size] += product(self._beside.cross[: len(own), robot], a, size)[:, : own.shape[1]]
+        own[:, :size] += product(y.cov[: len(own), -3:][:, robot], a, size)[:, : own.shape[1]]
         return Change(np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)
 
     @property

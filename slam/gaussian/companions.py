@@ -123,9 +123,9 @@ class Companions:
         """Leave out the two states of the map from ``i`` on."""
         self.cross[:, i : n - 2] = self.cross[:, i + 2 : n].copy()
 
-    def forget_pose(self) -> None:
-        """Have these states say nothing of the robot's pose, as when it is forgotten."""
-        self.cross[:, :3] = 0.0
+    def jump(self, jacobian: Array) -> None:
+        """Follow the robot to another pose (:func:`slam.gaussian.joint_gaussian.place`)."""
+        self.cross[:, :3] = self.cross[:, :3] @ jacobian.T
 
     def enlarge(self, size: int) -> None:
         """Make room for a larger map."""

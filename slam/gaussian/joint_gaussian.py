@@ -22,6 +22,7 @@ __all__ = [
     "OBSERVED_LIMIT",
     "add_landmark",
     "enlarged",
+    "jump_jacobian",
     "landmark_by_pose",
     "leave_out",
     "line_ends",
@@ -104,13 +105,22 @@ def leave_out(x: Array, p: Array, n: int, i: int) -> None:
 
 
 def place(x: Array, p: Array, n: int, pose: Array, cov: Array) -> None:
-    """Put the robot at a pose ``(3,)`` of covariance ``(3, 3)`` that has nothing to do with any landmark.
+    """Have the robot jump to a pose ``(3,)``, unsure by ``cov`` ``(3, 3)`` beside what it shares with the map.
 
-    With :data:`ANYWHERE_COV` the next update finds it by the landmarks alone, linearised at ``pose``.
+    That it shares: cut off from it, a pose of any covariance would tell the map where it lies in the world. With
+    :data:`ANYWHERE_COV` the next update finds it by the landmarks alone, linearised at ``pose``.
     """
+    jump = jump_jacobian(x, pose)
+    p[:3, 3:n] = jump @ p[:3, 3:n]
+    own = np.triu(p[:3, :3])
+    p[:3, :3] = np.triu(jump @ (own + np.triu(own, 1).T) @ jump.T + cov)
     x[:3] = pose
-    p[:3, :n] = 0.0
-    p[:3, :3] = np.triu(cov)
+
+
+def jump_jacobian(before: Array, after: Array) -> Array:
+    """Return the Jacobian ``(3, 3)`` of one pose by another ``(≥ 3,)`` in what all of the map is off by."""
+    dx, dy = float(after[0] - before[0]), float(after[1] - before[1])
+    return np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
 
 
 def landmark_by_pose(pose: Array, z: Array, offset: float) -> Array:

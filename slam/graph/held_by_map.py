@@ -1,12 +1,16 @@
-"""Gaussian filters held by the drawn map: where the pose is in doubt, and at places without landmarks."""
+"""Gaussian filters held by the drawn map: pose in doubt, places without landmarks, and lost and found again."""
 
 from __future__ import annotations
 
 import abc
 import math
 
+import numpy as np
+
 from slam.backend import found_cov
+from slam.gaussian import joint_gaussian as joint
 from slam.gaussian.beliefs import GaussianBackend
+from slam.gaussian.companions import Companions
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS
 from slam.graph.places import Places
@@ -27,6 +31,9 @@ class HeldByMap(GaussianBackend):
     nis: float
     nis_dof: int
     _places: Places
+    _beside: Companions
+    _held: tuple[Array, Array, Array] | None
+    """Of a robot that was given up, when scans agreed last: pose, covariance, and that with the states beside."""
 
     @abc.abstractmethod
     def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None: ...
@@ -54,6 +61,25 @@ class HeldByMap(GaussianBackend):
         if places.wanted(away, fits=fits):
             for z in places.make(book.next_id, ends):
                 self._add(z, None)
+
+    def _carry_on(self, pose: Array, pose_cov: Array) -> None:
+        """Go on from what was copied, at the pose ``(3,)`` that the wheels have reached by now."""
+        self._held = self.pose, self.pose_cov, self._beside.cross[:, :3].copy()
+        jump = joint.jump_jacobian(self._x, pose)
+        grown, axes = np.linalg.eigh(pose_cov - jump @ self.pose_cov @ jump.T)
+        self._place(pose, (axes * np.maximum(grown, 1e-8)) @ axes.T)
+
+    def _find(self, pose: Array, pose_cov: Array) -> None:
+        """Go on from a pose ``(3,)`` on the map, as though it were carried there from where it was lost.
+
+        So what it shares with the map is that of then, and what the wheels have claimed since is forgotten.
+        """
+        if self._held is not None:
+            before, cov, cross = self._held
+            jump = joint.jump_jacobian(before, self._x)
+            self._p[:3, :3] = np.triu(jump @ cov @ jump.T)
+            self._beside.cross[:, :3] = cross @ jump.T
+        self._place(pose, pose_cov)
 
     def _places_beside(self) -> Indices:
         return self._places.beside(self._x[: self._n], self._book.marks, self._book.ids)

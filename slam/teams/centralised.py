@@ -276,6 +276,9 @@ class JointMember(EkfSlam):
             self._w, self._s, np.zeros((3, len(beside.mean))),
         ))  # fmt: skip
 
+    def _find(self, pose: Array, pose_cov: Array) -> None:
+        self._place(pose, pose_cov)  # what it shared with the map when it was lost, others have corrected since
+
     def _redraw_if_moved(self) -> bool:
         others = [m.key_scans for m in self._team.members if m is not self and not (m.apart or self.apart)]
         return self.key_scans.redraw_if_moved(self.grid, *self._map_points(), others)

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import agents
 import slam
 import slam.compressed as compressed_
+from mecanum_env.env import ExploreEnv
 from slam import Observations, Odometry
 from slam.backend import Backend
 from slam.compressed import CompressedEkfSlam
@@ -254,6 +256,27 @@ def test_scans_of_rooms_give_the_full_filter_s_map(lines: bool) -> None:
     np.testing.assert_allclose(two.landmarks[order], one.landmarks[np.argsort(one.landmark_ids)], atol=1e-9)
     assert len(two.lines) == len(one.lines)
     np.testing.assert_array_equal(two.grid.log_odds, one.grid.log_odds)
+
+
+def test_walls_far_away_turn_as_the_whole_filter_turns_them_however_unsure_the_start() -> None:
+    """What is off with the pose on entering a region is in all of the rest, and moves walls about their feet."""
+    slams = [
+        {"name": "invariant-ekf", "start_sigma_m": 0.1, "start_sigma_rad": 0.1, **c} for c in (WHOLE, REGIONS)
+    ]
+    whole, regional = (ExploreEnv(slam=each, config={"lidar": {"range_max_m": 3.0}}) for each in slams)
+    observation, _ = whole.reset(seed=2)
+    regional.reset(seed=2)
+    agent, far = agents.make("brisk-tour"), 0
+    agent.reset(whole.belief, 0)
+    for _ in range(600):
+        action = agent.act(observation, whole.belief)
+        observation, *_ = whole.step(action)
+        regional.step(action)
+        one, two = whole.backend, regional.backend
+        far = max(far, len(two._far))
+        off = (two.pose - one.pose) / np.sqrt(np.diag(one.pose_cov))
+        assert np.abs(off).max() < 1e-3
+    assert far > 40
 
 
 @pytest.mark.parametrize("name", ["compressed-ekf", "invariant-ekf"])

@@ -22,8 +22,10 @@ from training.studies.recovery.faults import FAULTS
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
 
 
-def driven(name: str, steps: int, *, seed: int = 3, settings: dict[str, object] | None = None) -> ExploreEnv:
-    env = ExploreEnv(rooms="apartment", slam={"name": name, **(settings or {})})
+def driven(
+    name: str, steps: int, *, seed: int = 3, rooms: str = "apartment", settings: dict[str, object] | None = None
+) -> ExploreEnv:
+    env = ExploreEnv(rooms=rooms, slam={"name": name, **(settings or {})})
     env.reset(seed=seed)
     for k in range(steps):
         env.step(np.array([0.4 * math.cos(k / 15), 0.3 * math.sin(k / 9), 0.3], np.float32))
@@ -66,6 +68,23 @@ def test_who_is_unsure_of_the_start_is_found_as_well(name: str, sigma_rad: float
         env.step(np.zeros(3, np.float32))
     assert backend.recovery.times_lost == backend.recovery.relocalisations == 1
     assert np.hypot(*(backend.pose - env.truth.pose)[:2]) < 0.1
+
+
+@pytest.mark.parametrize("rooms", ["apartment", "maze"])
+def test_being_found_tells_nothing_of_where_the_map_lies(rooms: str) -> None:
+    """Twice carried off, with a start that is known and with one that is not: the same but for the covariance."""
+    poses, covs = [], []
+    for sigma in (1e-4, 0.1):
+        env = driven("invariant-ekf", 60, rooms=rooms, settings={"start_sigma_m": sigma, "start_sigma_rad": sigma})
+        for _ in range(2):
+            assert FAULTS["teleport"]().begin(env, np.random.default_rng(0))
+            for _ in range(40):
+                env.step(np.zeros(3, np.float32))
+        assert env.backend.recovery.relocalisations == 2
+        poses.append(env.backend.pose)
+        covs.append(env.backend.pose_cov)
+    np.testing.assert_allclose(poses[1], poses[0], atol=1e-3)
+    assert 0.0999**2 < covs[1][2, 2] < 0.11**2 and covs[0][2, 2] < 0.02**2
 
 
 @pytest.mark.parametrize("redraws", [True, False])

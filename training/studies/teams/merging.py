@@ -153,7 +153,8 @@ def _merged(merged: MergedMap, a: _Told, b: _Told, true: Array) -> Row:
     true_poses = a.pose, compose(true, b.pose)
     return {
         "corner_nees": nees[known].tolist(), "shared_corner_nees": nees[known & both].tolist(),
-        "corner_m": np.linalg.norm(errors, axis=1)[known].tolist(), "corners_nowhere": np.count_nonzero(~known),
+        "corner_m": np.linalg.norm(errors, axis=1)[known].tolist(),
+        "corners_nowhere": int(np.count_nonzero(~known)),
         "pose_nees": [
             float(nees_pose(merged.poses[k], merged.pose_covs[k], pose)) for k, pose in enumerate(true_poses)
         ],

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ def test_two_robots_and_what_is_said_of_them() -> None:
     assert 0.0 < row["overlap"] <= 1.0 and min(row["coverages"]) >= 0.7
     assert row["known"]["outcome"] == "right" and row["known"]["off_m"] < RIGHT_M
     # Corners that are nowhere near a true one are the falsest.
+    json.dumps(row)
     odd = {**row, "known": {**row["known"], "corners_nowhere": 2}}
     said, more = (summarise({job: one})["known"] for one in (row, odd))
     assert row["known"]["corners_nowhere"] == 0
