@@ -225,6 +225,7 @@ class CompressedEkfSlam(EkfSlam):
 
     def _enter(self) -> None:
         """Begin to filter the region, a few numbers standing for what is far."""
+        self._held = None  # other states beside the map
         a, b = state_rows(self._near, robot=True), state_rows(self._far, robot=False)
         while len(a) + 2 > len(self._x):
             self._enlarge()

@@ -64,10 +64,11 @@ class HeldByMap(GaussianBackend):
 
     def _carry_on(self, pose: Array, pose_cov: Array) -> None:
         """Go on from what was copied, at the pose ``(3,)`` that the wheels have reached by now."""
-        self._held = self.pose, self.pose_cov, self._beside.cross[:, :3].copy()
-        jump = joint.jump_jacobian(self._x, pose)
-        grown, axes = np.linalg.eigh(pose_cov - jump @ self.pose_cov @ jump.T)
+        before, cov = self.pose, self.pose_cov
+        jump, back = joint.jump_jacobian(before, pose), joint.jump_jacobian(pose, before)
+        grown, axes = np.linalg.eigh(pose_cov - jump @ cov @ jump.T)
         self._place(pose, (axes * np.maximum(grown, 1e-8)) @ axes.T)
+        self._held = before, cov, self._beside.cross[:, :3] @ back.T
 
     def _find(self, pose: Array, pose_cov: Array) -> None:
         """Go on from a pose ``(3,)`` on the map, as though it were carried there from where it was lost.
