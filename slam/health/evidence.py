@@ -20,6 +20,9 @@ from slam.types import Array, Scan
 __all__ = ["Agreement", "agreement", "agrees", "through_walls"]
 
 
+_BESIDE_M = 0.05
+
+
 class Agreement(NamedTuple):
     """Beams of a scan that say something about a pose on a map."""
 
@@ -62,11 +65,11 @@ def agreement(grid: OccupancyGrid, sensor_pose: tuple[float, float, float], scan
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _around(log_odds: NDArray[np.int8], row: int, col: int) -> tuple[int, bool]:
-    """Return the highest value of a cell and its neighbours, and whether all of them were ever observed."""
+def _around(log_odds: NDArray[np.int8], row: int, col: int, near: int) -> tuple[int, bool]:
+    """Return the highest value of a cell and those near it, and whether all of them were ever observed."""
     highest, known = -128, True
-    for i in range(row - 1, row + 2):
-        for j in range(col - 1, col + 2):
+    for i in range(row - near, row + near + 1):
+        for j in range(col - near, col + near + 1):
             value = log_odds[i, j]
             highest = max(highest, value)
             known &= value != 0
@@ -80,6 +83,9 @@ def _count_beams(
 ) -> tuple[int, int, int, int]:  # fmt: skip
     rows, cols = log_odds.shape
     on_walls, sharp, blurred, in_the_open = 0, 0, 0, 0
+    # Beside a cell is 5 cm away, and within it half of that, however fine cells are: beliefs are no finer for it.
+    near = max(1, round(_BESIDE_M / resolution))
+    within = (near - 1) // 2
     # Directions of the beams one after the other, each turned on from the one before it.
     c, s = math.cos(theta + angle_min), math.sin(theta + angle_min)
     turn_c, turn_s = math.cos(stride * increment), math.sin(stride * increment)
@@ -89,17 +95,20 @@ def _count_beams(
         if r <= range_max:  # neither lost nor without return
             reach = r / resolution + 0.25  # what stopped the beam lies behind where it returned from
             col, row = int(u0 + c * reach), int(v0 + s * reach)
-            if 0 < row < rows - 1 and 0 < col < cols - 1:
+            if near <= row < rows - near and near <= col < cols - near:
                 value = log_odds[row, col]
                 if value >= OCCUPIED_FROM:  # as most are
                     on_walls += 1
                     sharp += 1
                 else:
-                    highest, known = _around(log_odds, row, col)
+                    highest, known = _around(log_odds, row, col, near)
                     if highest >= OCCUPIED_FROM:
                         on_walls += 1
-                        before = log_odds[int(v0 + s * (reach - 1.0)), int(u0 + c * (reach - 1.0))]
-                        blurred += value < FREE_UP_TO or before >= OCCUPIED_FROM
+                        if within > 0 and _around(log_odds, row, col, within)[0] >= OCCUPIED_FROM:
+                            sharp += 1
+                        else:
+                            before = log_odds[int(v0 + s * (reach - near)), int(u0 + c * (reach - near))]
+                            blurred += value < FREE_UP_TO or before >= OCCUPIED_FROM
                     in_the_open += highest < FREE_UP_TO and known
         c, s = c * turn_c - s * turn_s, s * turn_c + c * turn_s
     return on_walls, sharp, blurred, in_the_open

@@ -18,8 +18,8 @@ poses = st.tuples(st.floats(0.5, 5.5), st.floats(0.5, 4.5), st.floats(-3.1, 3.1)
 TAKEN_AT = (np.array([2.0, 2.0, 0.3]), np.array([4.0, 3.0, -1.0]), np.array([3.0, 1.0, 2.0]))
 
 
-def room_grid() -> OccupancyGrid:
-    grid = OccupancyGrid(0.05)
+def room_grid(resolution: float = 0.05) -> OccupancyGrid:
+    grid = OccupancyGrid(resolution)
     for pose in TAKEN_AT:
         for _ in range(3):
             grid.integrate(pose, room_scan(pose))
@@ -27,8 +27,12 @@ def room_grid() -> OccupancyGrid:
 
 
 def simply(grid: OccupancyGrid, pose: tuple[float, float, float], scan: Scan, stride: int) -> Agreement:
-    """The same, cell by cell."""
-    classes = grid.classes()
+    """The same, cell by cell: beside a wall is 5 cm from it, or one cell."""
+    classes, beside = grid.classes(), max(1, round(0.05 / grid.resolution))
+
+    def around(cells: int) -> tuple[slice, slice]:
+        return slice(row - cells, row + cells + 1), slice(col - cells, col + cells + 1)
+
     on_walls = sharp = blurred = in_the_open = 0
     for k in range(0, len(scan.ranges), stride):
         r = scan.ranges[k]
@@ -37,31 +41,37 @@ def simply(grid: OccupancyGrid, pose: tuple[float, float, float], scan: Scan, st
         angle, reach = pose[2] + scan.angle_min + k * scan.angle_increment, r + 0.25 * grid.resolution
         end = np.array([[pose[0] + reach * math.cos(angle), pose[1] + reach * math.sin(angle)]])
         row, col = grid.to_cells(end)[0]
-        if not (0 < row < grid.shape[0] - 1 and 0 < col < grid.shape[1] - 1):
+        if min(row, col) < beside or row >= grid.shape[0] - beside or col >= grid.shape[1] - beside:
             continue
-        around = (slice(row - 1, row + 2), slice(col - 1, col + 2))
-        if (classes[around] == OCCUPIED).any():
+        if (classes[around(beside)] == OCCUPIED).any():
             on_walls += 1
-            sharp += classes[row, col] == OCCUPIED
-            last = np.array(
-                [[pose[0] + (reach - 0.05) * math.cos(angle), pose[1] + (reach - 0.05) * math.sin(angle)]]
-            )
+            hit = bool((classes[around((beside - 1) // 2)] == OCCUPIED).any())
+            back = reach - beside * grid.resolution
+            last = np.array([[pose[0] + back * math.cos(angle), pose[1] + back * math.sin(angle)]])
             before = classes[tuple(grid.to_cells(last)[0])]
-            blurred += classes[row, col] != OCCUPIED and (classes[row, col] == FREE or before == OCCUPIED)
-        elif (classes[around] == FREE).all() and (grid.log_odds[around] != 0).all():
+            sharp += hit
+            blurred += not hit and (classes[row, col] == FREE or before == OCCUPIED)
+        elif (classes[around(beside)] == FREE).all() and (grid.log_odds[around(beside)] != 0).all():
             in_the_open += 1
     return Agreement(on_walls, int(sharp), int(blurred), in_the_open)
 
 
 @settings(max_examples=30)
-@given(poses, poses)
+@given(poses, poses, st.sampled_from([0.01, 0.02, 0.05, 0.1]))
 def test_against_the_simple_version(
-    true: tuple[float, float, float], believed: tuple[float, float, float]
+    true: tuple[float, float, float], believed: tuple[float, float, float], resolution: float
 ) -> None:
-    grid, scan = room_grid(), room_scan(np.array(true), np.random.default_rng(0))
+    grid, scan = room_grid(resolution), room_scan(np.array(true), np.random.default_rng(0))
     scan.ranges[::7], scan.ranges[1::7] = np.nan, np.inf
     seen, simple = agreement(grid, believed, scan, 90), simply(grid, believed, scan, 4)
     assert np.abs(np.array(seen) - np.array(simple)).max() <= 1  # a beam's end on the very edge of a cell
+
+
+@pytest.mark.parametrize("resolution", [0.01, 0.02, 0.05])
+def test_two_centimetres_are_as_little_in_fine_cells(resolution: float) -> None:
+    true = np.array([3.0, 2.5, 0.4])
+    seen = agreement(room_grid(resolution), (3.015, 2.515, 0.4), room_scan(true, np.random.default_rng(1)), 90)
+    assert seen.against < 0.03 and seen.sharpness > 0.6
 
 
 @given(poses)
