@@ -10,17 +10,17 @@ import dataclasses
 
 import numpy as np
 
-from slam.backend import Backend
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.stacked_update import NO_LIMITS
+from slam.metrics.measures import nees_pose_invariant
 from slam.types import Array, Indices, Odometry, Scan
 
 __all__ = ["OdometrySlam", "TruthSlam"]
 
 
 class OdometrySlam(EkfSlam):
-    """Dead reckoning: the pose is what the wheels say, with the covariance that follows from V."""
+    """Dead reckoning: the pose is what the wheels say, with the covariance that follows from their noise."""
 
     relocalises = False  # the pose is not for the scan to doubt
 
@@ -44,9 +44,10 @@ class OdometrySlam(EkfSlam):
     def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None:
         # Without limits: what is believed to be known of the pose is untrue, and scans will say so.
         self._pin()
-        pose = self._x[:3].copy()
+        pose, kept = self._x[:3].copy(), self._beside.snapshot()
         super()._correct(z, match)
         self._x[:3] = pose
+        self._beside.restore(kept)
 
     def _may_spin(self, scan: Scan, match: Indices, recent: int, still: int) -> bool:
         return False  # the pose is not for the scan to doubt
@@ -57,8 +58,8 @@ class OdometrySlam(EkfSlam):
         return self._robot_cov.copy()
 
     def pose_nees(self, true_pose: Array) -> float:
-        """Return the NEES of the pose against the truth ``(3,)``."""
-        return Backend.pose_nees(self, true_pose)  # not of the state's covariance, which is pinned
+        """Return the pose's NEES in the invariant error: a heading that drifts bends the ellipse in x and y."""
+        return float(nees_pose_invariant(self._x, self._robot_cov, np.asarray(true_pose, dtype=np.float64)))
 
     @property
     def belief(self) -> Belief:

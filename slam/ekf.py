@@ -18,6 +18,7 @@ from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, whiten_difference, work_space
 from slam.gaussian.tiles import add_combination, downdate
+from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.graph.held_by_map import HeldByMap
 from slam.graph.places import Places
@@ -34,7 +35,6 @@ from slam.landmarks.right_angles import find_square
 from slam.landmarks.spinning_wheels import FEWEST_BACK, seen_again, walls_cross
 from slam.landmarks.wall_evidence import take_back, take_evidence
 from slam.metrics.chi_square import chi2_quantile
-from slam.motion import Twist
 from slam.types import LINE, Array, Indices, Observations, Odometry, Scan
 
 __all__ = ["EkfSlam"]
@@ -43,7 +43,10 @@ _WIDE = (0.5, 0.5, 0.2)  # [m, m, rad] 1σ of a pose that landmarks shall decide
 
 
 class EkfSlam(HeldByMap):
-    """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``."""
+    """The standard EKF-SLAM backend, ``ekf``; with ``lines`` ``ekf-lines``.
+
+    What lasts of the wheels' errors, if the odometry's noise tells, is states (:mod:`slam.gaussian.wheel_errors`).
+    """
 
     config: EkfConfig
 
@@ -77,21 +80,28 @@ class EkfSlam(HeldByMap):
         self.nis, self.nis_dof = 0.0, 0
 
     def _companions(self) -> Companions:
-        """Return the states beside the map."""
-        return Companions(len(self._match), len(self._x), direction=self._squares)
+        """Return the states beside the map, and leave the noise that they do not stand for."""
+        noise, sizes = self.config.odometry, (len(self._match), len(self._x))
+        if noise.lasting is None or not self.config.wheel_states:
+            return Companions(*sizes, direction=self._squares)
+        self._noise = noise.white()
+        return WheelErrors(noise.lasting, noise.lever_m, *sizes, direction=self._squares)
+
+    @property
+    def wheel_errors(self) -> tuple[Array, Array] | None:
+        """Relative errors of the four radii and the lever ``(5,)`` and their covariance; ``None`` if no states."""
+        return self._beside.errors if isinstance(self._beside, WheelErrors) else None
 
     @property
     def _squares(self) -> bool:
         return self.config.lines and self.config.right_angle_sigma_rad > 0.0
 
     def predict(self, odometry: Odometry) -> None:
-        """Move on by what the wheels measured (docs/reference/ekf.md, Predict)."""
+        """Move on by what the wheels measured, less what they are known to be off by (docs/reference/ekf.md)."""
         self._settle_beliefs()
-        self._move(odometry.dt, *self._measured(odometry, self._noise))
-
-    def _move(self, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
-        """Predict by a twist of the body."""
-        self._beside.predict(self._x, self._p, self._n, dt, twist, var_v, var_w)
+        if isinstance(self._beside, WheelErrors):
+            odometry = Odometry(self._beside.corrected(odometry.numbers), odometry.dt, odometry.slip)
+        self._beside.predict(self._x, self._p, self._n, odometry.dt, *self._measured(odometry, self._noise))
 
     def _update(self, scan: Scan) -> None:
         """Correct by the corners of a scan, keep the book of landmarks, draw the scan."""

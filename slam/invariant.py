@@ -16,16 +16,14 @@ import numpy as np
 from numba import njit
 
 from slam.compressed import Change, CompressedEkfConfig, CompressedEkfSlam
-from slam.gaussian.companions import Companions
 from slam.gaussian.joint_gaussian import state_rows
 from slam.gaussian.settings import EkfLinesConfig
 from slam.gaussian.stacked_update import NO_LIMITS, whiten
 from slam.gaussian.tiles import add_combination, downdate, product
-from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap_scalar
 from slam.metrics.measures import nees_pose_invariant
 from slam.settings import Within
-from slam.types import LINE, Array, Indices, Odometry
+from slam.types import LINE, Array, Indices
 
 __all__ = ["InvariantEkfConfig", "InvariantEkfSlam"]
 
@@ -42,15 +40,11 @@ class InvariantEkfConfig(EkfLinesConfig, CompressedEkfConfig):
     whole_up_to: Annotated[int, Within("[0, 1000000000]")] = 300
     rank_tolerance: Annotated[float, Within("(0, 1)")] = 1e-8
 
-    wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
-
 
 class InvariantEkfSlam(CompressedEkfSlam):
     """The right-invariant EKF-SLAM backend, ``invariant-ekf``.
 
-    Where the odometry's noise says what of it lasts, the wheels' errors are states, too
-    (slam.gaussian.wheel_errors). What is far is moved, and its covariance reset, once a region: by the sum of what
-    was corrected meanwhile.
+    What is far is moved, and its covariance reset, once a region: by the sum of what was corrected meanwhile.
     """
 
     config: InvariantEkfConfig
@@ -63,20 +57,6 @@ class InvariantEkfSlam(CompressedEkfSlam):
         self._delta = np.zeros(len(self._x))
         self._entered = self._x[:3].copy()  # the pose on entering the region, …
         self._entered_cov, self._entered_far = pose_cov, np.zeros((3, 0))  # … its covariance, and with what is far
-
-    def _companions(self) -> Companions:
-        noise = self.config.odometry
-        if noise.lasting is None or not self.config.wheel_states:
-            return super()._companions()
-        self._noise = noise.white()
-        size = len(self._x)
-        return WheelErrors(noise.lasting, noise.lever_m, len(self._match), size, direction=self._squares)
-
-    def predict(self, odometry: Odometry) -> None:
-        """Move on by what the wheels measured, less what they are known to be off by."""
-        if isinstance(self._beside, WheelErrors):
-            odometry = Odometry(self._beside.corrected(odometry.numbers), odometry.dt, odometry.slip)
-        super().predict(odometry)
 
     def _correct(self, z: Array, match: Indices, limits: Array = NO_LIMITS) -> None:
         n, w = self._n, self._w
@@ -142,11 +122,6 @@ class InvariantEkfSlam(CompressedEkfSlam):
         u = u[robot] + product(0.5 * pose_cov[np.ix_(robot, robot)], a, size)
         own[:, :size] += product(y.cov[: len(own), -3:][:, robot], a, size)[:, : own.shape[1]]
         return Change(np.vstack([change.left, a, u]), np.vstack([change.right, u, a]), own)
-
-    @property
-    def wheel_errors(self) -> tuple[Array, Array] | None:
-        """Relative errors of the four radii and the lever ``(5,)`` and their covariance; ``None`` if no states."""
-        return self._beside.errors if isinstance(self._beside, WheelErrors) else None
 
     def pose_nees(self, true_pose: Array) -> float:
         """Return the pose's NEES in the invariant error, which is the one this filter's covariance speaks of."""

@@ -55,7 +55,7 @@ class OdometryNoise(Config):
     # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: graph-slam
     # learns it (slam.odometry.mount). 0: that is where it sits.
     mount_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0
-    lasting: LastingErrors | None = None  # what invariant-ekf takes for states: see slam.gaussian.wheel_errors
+    lasting: LastingErrors | None = None  # what filters take for states: see slam.gaussian.wheel_errors
 
     def variances(
         self, vx: float, vy: float, omega: float, *, slip: tuple[float, float] = NO_SLIP

@@ -31,6 +31,7 @@ class EkfConfig(BackendConfig):
     # Old landmarks expected no better than to this count only together.
     loop_sigma_m: Annotated[float, Within("(0, inf]")] = math.inf
     lines: bool = False  # take straight walls for landmarks, too
+    wheel_states: bool = True  # estimate what lasts of the odometry's errors, where ``lasting`` tells of it
     # 1σ of walls about the building's direction, if most stand square: slam.landmarks.right_angles; 0: left alone.
     right_angle_sigma_rad: Annotated[float, Within("[0, 0.003]")] = 0.001
     landmarks: LandmarkPolicy = field(default_factory=LandmarkPolicy)

@@ -45,7 +45,7 @@ _ODOMETRY = {
     "lever_m": 0.13, "speed_floor_m_s": 0.01, "speed_share": 1.2, "turn_floor_rad_s": 0.01,
     "turn_share_rad_m": 4.5, "slip_share": 0.0,
 }  # fmt: skip
-# A robot's wheels are not quite alike, which turns it by as much a metre all along: states of invariant-ekf.
+# A robot's wheels are not quite alike, which turns it by as much a metre all along: states of the filters.
 _LASTING = {"difference_sigma": 0.015, "lever_sigma": 0.04, "white_turn_share_rad_m": 2.8}
 SETTINGS = {
     "lidar_offset_m": 0.0,

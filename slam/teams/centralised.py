@@ -204,6 +204,9 @@ class JointMember(EkfSlam):
         super()._start(pose, pose_cov, seed)
         self._start_cov = pose_cov
 
+    def _companions(self) -> Companions:
+        return Companions(len(self._match), len(self._x), direction=self._squares)  # no errors of any wheels
+
     def _begin(self, policy: LandmarkPolicy) -> None:
         super()._begin(policy)
         self._book = self._team_book = _TeamBook(policy)

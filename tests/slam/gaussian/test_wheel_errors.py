@@ -12,11 +12,13 @@ import slam
 from mecanum_env.config import RobotConfig
 from mecanum_env.physics.robot import forward_matrix
 from slam import Observations, Odometry
+from slam.ekf import EkfSlam
 from slam.gaussian.joint_gaussian import add_landmark, landmark_by_pose
 from slam.gaussian.stacked_update import NO_LIMITS, stacked_update, work_space
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import wrap
-from slam.invariant import InvariantEkfSlam, _turn_columns, invariant_update
+from slam.invariant import _turn_columns, invariant_update
+from slam.metrics.measures import nees_band
 from slam.motion import LastingErrors, OdometryNoise, jacobians, move
 from slam.settings import from_mapping
 from slam.types import LINE
@@ -36,8 +38,8 @@ OFFSET = 0.2
 R = np.diag([0.02**2, 0.01**2])
 
 
-def backend(noise: OdometryNoise = NOISE) -> InvariantEkfSlam:
-    return slam.make("invariant-ekf", config={"odometry": noise, "lidar_offset_m": OFFSET})
+def backend(noise: OdometryNoise = NOISE, name: str = "invariant-ekf") -> EkfSlam:
+    return slam.make(name, config={"odometry": noise, "lidar_offset_m": OFFSET})
 
 
 def drives(rng: np.random.Generator, steps: int) -> np.ndarray:
@@ -158,13 +160,14 @@ def test_equals_one_dense_filter_of_everything() -> None:
     assert np.sqrt(np.diag(p)[3:8]).max() < 0.02  # and something was learnt
 
 
-def test_errors_are_found_and_their_covariance_is_right() -> None:
+@pytest.mark.parametrize("name", ["ekf", "ekf-lines", "compressed-ekf", "invariant-ekf"])
+def test_errors_are_found_and_their_covariance_is_right(name: str) -> None:
     nees, learnt = [], []
     for seed in range(120):
         rng = np.random.default_rng(seed)
         errors = rng.normal(0, [0.02] * 4 + [0.03])
         points = rng.uniform(-6, 6, (12, 2))
-        filter_ = backend()
+        filter_ = backend(name=name)
         filter_.reset((0.0, 0.0, 0.0))
         wheels = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8)
         wheels.mean[:] = errors
@@ -181,6 +184,39 @@ def test_errors_are_found_and_their_covariance_is_right() -> None:
         learnt.append(np.sqrt(np.diag(cov)))
     assert np.mean(learnt, axis=0).max() < 0.008
     assert np.mean(nees) == pytest.approx(1.0, abs=3 * math.sqrt(2 / 5 / 120))
+
+
+def test_dead_reckoning_is_as_sure_as_errors_that_last_let_it() -> None:
+    """Over a minute the heading is off by 0.3 rad: the band is that of an exactly consistent filter."""
+    nees, rng = [], np.random.default_rng(0)
+    for _ in range(300):
+        robot = slam.make("odometry", config={"odometry": NOISE})
+        robot.reset((3.0, 2.0, 0.3))
+        wheels, truth, white = WheelErrors(NOISE.lasting, NOISE.lever_m, 4, 8), robot.pose, NOISE.white()
+        wheels.mean[:] = rng.normal(0, [0.02] * 4 + [0.03])
+        for twist in drives(rng, 600):
+            true = np.array(wheels.corrected(tuple(twist)))
+            v, w = white.variances(*true)
+            truth = move(truth, true + rng.normal(0, np.sqrt([v, v, w])), 0.1)
+            robot.predict(Odometry(twist, 0.1, (0.0, 0.0)))  # nothing slipped
+        nees.append(robot.pose_nees(truth))
+    low, high = nees_band(3, 300, confidence=0.99)
+    assert low < np.mean(nees) / 3 < high
+
+
+def test_what_a_scan_shows_corrects_no_wheels_of_dead_reckoning() -> None:
+    robot = slam.make("odometry", config={"odometry": NOISE, "lidar_offset_m": OFFSET})
+    alone = slam.make("odometry", config={"odometry": NOISE, "lidar_offset_m": OFFSET})
+    for filter_ in (robot, alone):
+        filter_.reset((2.0, 2.0, 0.3))
+    for k in range(20):
+        for filter_ in (robot, alone):
+            filter_.predict(Odometry((0.3, 0.1, 0.2), 0.1))
+        robot.update(room_scan(np.array([2.0 + 0.02 * k, 2.0, 0.3 + 0.02 * k])))
+    assert robot.landmark_count > 0
+    np.testing.assert_array_equal(robot.pose, alone.pose)
+    np.testing.assert_allclose(robot.pose_cov, alone.pose_cov, rtol=1e-12)
+    np.testing.assert_array_equal(robot.wheel_errors[0], np.zeros(5))
 
 
 def test_update_and_reset_with_walls_are_those_of_one_large_state() -> None:
@@ -219,7 +255,7 @@ def test_a_landmark_s_jacobian_by_the_pose(kind: float) -> None:
     np.testing.assert_allclose(landmark_by_pose(pose, z, OFFSET), want, atol=1e-8)
 
 
-def in_a_room(steps: int) -> tuple[InvariantEkfSlam, slam.Scan]:
+def in_a_room(steps: int) -> tuple[EkfSlam, slam.Scan]:
     """A filter that has driven about a room and has learnt something, and its last scan."""
     filter_, rng = backend(), np.random.default_rng(1)
     truth = np.array([2.0, 2.0, 0.3])
