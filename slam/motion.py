@@ -53,9 +53,9 @@ class OdometryNoise(Config):
     slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may slip where nobody tells
     slide_m_s2: Positive = 1.5  # by which the floor lets the body follow wheels that slip
     # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: graph-slam
-    # learns it (slam.odometry.mount). 0: that is where it sits.
+    # learns it (slam.odometry.lasting). 0: that is where it sits.
     mount_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0
-    lasting: LastingErrors | None = None  # what filters take for states: see slam.gaussian.wheel_errors
+    lasting: LastingErrors | None = None  # what filters take for states: slam.gaussian.wheel_errors, …
 
     def variances(
         self, vx: float, vy: float, omega: float, *, slip: tuple[float, float] = NO_SLIP

@@ -55,6 +55,11 @@ class WheelErrors(Companions):
         vx, vy, omega = twist
         return _corrected(vx, vy, omega, self._lever_m, self.mean, self._b)
 
+    def corrected_by(self, twist: Twist, errors: Array) -> tuple[Twist, Array]:
+        """Return what :meth:`corrected` does with other errors ``(5,)``, and the Jacobian ``(3, 5)`` by them."""
+        b = np.zeros((3, _STATES))
+        return _corrected(*twist, self._lever_m, errors, b), b
+
     def predict(self, x: Array, p: Array, n: int, dt: float, twist: Twist, var_v: float, var_w: float) -> None:
         """Do :func:`slam.motion.predict_robot` with a twist that was :meth:`corrected` last, errors included."""
         _predict(x, p, n, self.cross, self.cov, self._b, *twist, dt, var_v, var_w)

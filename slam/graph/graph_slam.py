@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slam.backend import SurfaceBackend
-from slam.geometry import about_z, compose, relative, symmetric, wrap
+from slam.geometry import about_z, compose, relative, wrap
 from slam.graph.atlas import Atlas
 from slam.graph.matching import Alignment, Links, align, lasting, links
 from slam.graph.pose_graph import PoseGraph
@@ -22,8 +22,7 @@ from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
-from slam.motion import predict_robot
-from slam.odometry.mount import Mount
+from slam.odometry.lasting import LastingStates, Motion
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["GraphSlam"]
@@ -49,10 +48,11 @@ class GraphSlam(SurfaceBackend):
     def _start(self, pose: Array, pose_cov: Array, seed: int) -> None:
         del seed
         self.atlas = Atlas(self.config, pose, pose_cov)
-        self.mount = Mount(self.config.odometry.mount_sigma_m)
+        self.calibration = LastingStates(self.config.odometry)
+        self._noise = self.config.odometry.white()
         self._begun = False
-        self._motion, self._upper = np.zeros(3), np.zeros((3, 3))  # since the key scan, in its frame
-        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))  # since the last scan, in its frame
+        self._motion = Motion()  # since the key scan
+        self._step = Motion()  # since the last scan
         self._claimed = (0.0, 0.0)  # [m, rad] by the wheels since the key scan
         self._blind = (0.0, 0.0)  # [m, rad] up to the key scan that nothing but the wheels told all about
         self._body = (0.0, 0.0, 0.0)  # twist that the floor has passed on
@@ -68,14 +68,14 @@ class GraphSlam(SurfaceBackend):
 
     def predict(self, odometry: Odometry) -> None:
         """Move on by what the wheels measured."""
-        (vx, vy, omega), var_v, var_w, self._body = self.config.odometry.of_step(odometry, self._body)
-        vx, vy = self.mount.velocity(vx, vy, omega)
-        dt = odometry.dt
-        predict_robot(self._motion, self._upper, 3, vx, vy, omega, dt, var_v, var_w)
-        predict_robot(self._step, self._step_upper, 3, vx, vy, omega, dt, var_v, var_w)
+        claimed, var_v, var_w, self._body = self._noise.of_step(odometry, self._body)
+        twist, by = self.calibration.twist(claimed)
+        (vx, vy, omega), dt = twist, odometry.dt
+        self._motion.add(twist, by, dt, var_v, var_w)
+        self._step.add(twist, by, dt, var_v, var_w)
         way, turn = self._claimed
         self._claimed = (way + math.hypot(vx, vy) * dt, turn + abs(omega) * dt)
-        self._mean, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
+        self._mean, rows = self.atlas.window.ahead(self._motion.mean, self._motion_cov())
         self._cov = rows[:, :3]
 
     def _update(self, scan: Scan) -> None:
@@ -91,7 +91,7 @@ class GraphSlam(SurfaceBackend):
             self._follow(ends, min(scan.range_max, config.reach_m))
         else:
             atlas = self._begin(ends)
-        self._step, self._step_upper = np.zeros(3), np.zeros((3, 3))
+        self._step = Motion()
         self._at.append(atlas.key)
         self._from.append(relative(atlas.window.pose[None], self._mean[None])[0])
         if atlas.solutions > solutions:
@@ -100,10 +100,10 @@ class GraphSlam(SurfaceBackend):
 
     def _begin(self, ends: BeamEnds) -> Atlas:
         """Make the first scan the first key scan, where the wheels have led the robot by then."""
-        if self._motion.any() or self._upper.any():
-            pose, rows = self.atlas.window.ahead(self._motion, self._motion_cov())
+        if self._motion.mean.any() or self._motion.white.any():
+            pose, rows = self.atlas.window.ahead(self._motion.mean, self._motion_cov())
             self.atlas = Atlas(self.config, pose, 0.5 * (rows[:, :3] + rows[:, :3].T))
-            self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
+            self._motion, self._claimed = Motion(), (0.0, 0.0)
             self._last, self._mean, self._cov = pose.copy(), pose.copy(), self.atlas.window.cov[:3, :3].copy()
         self.atlas.begin(ends)
         self._begun = True
@@ -115,15 +115,15 @@ class GraphSlam(SurfaceBackend):
         window = self.atlas.window
         seen = links(self.atlas.surfaces, ends, found, window.frames, self._lasting() * self.atlas.common_var)
         self._correct(found, seen)
-        if self.mount.unknown:
-            self._learn_mount(found, self._information(found, seen))
+        if self.calibration.unknown:
+            self._learn(found, self._information(found, seen))
         if self._moved_on(found.share):
             motion_cov = self._motion_cov()
             way, turn = self._claimed
             blind = self._is_blind(motion_cov, self._information(found, seen))
-            self.atlas.add_key(self._motion, motion_cov, ends, found, seen, reach_m)
+            self.atlas.add_key(self._motion.mean, motion_cov, ends, found, seen, reach_m)
             self._blind = (self._blind[0] + way, self._blind[1] + turn) if blind else (0.0, 0.0)
-            self._motion, self._upper, self._claimed = np.zeros(3), np.zeros((3, 3)), (0.0, 0.0)
+            self._motion, self._claimed = Motion(), (0.0, 0.0)
             self._last = window.pose.copy()
             self._mean, self._cov = window.pose.copy(), window.cov[:3, :3].copy()
         else:
@@ -132,7 +132,7 @@ class GraphSlam(SurfaceBackend):
     def _aligned(self, ends: BeamEnds, reach_m: float) -> Alignment:
         """Return where the scan fits the patches in reach: near to where the wheels say, unless they spun."""
         config, surfaces = self.config, self.atlas.surfaces
-        guess = compose(self._last, self._step)
+        guess = compose(self._last, self._step.mean)
         turn = about_z(float(self._last[2]))
         cov = turn @ self._step_cov() @ turn.T + _ALIGNED
         near = np.hypot(*(surfaces.points - guess[:2]).T) < reach_m
@@ -154,7 +154,7 @@ class GraphSlam(SurfaceBackend):
 
     def _step_cov(self) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the last scan, in the frame of then."""
-        return symmetric(self._step_upper) + self.mount.motion_cov(float(self._step[2]))
+        return self._step.white + self.calibration.motion_cov(self._step)
 
     def _spun(self) -> Array:
         """Return what wheels that may have spun add to a motion's covariance ``(3, 3)``: all that they claim."""
@@ -165,30 +165,24 @@ class GraphSlam(SurfaceBackend):
         """Set the belief to that of the window and this scan; wheels that contradict it are not believed."""
         window = self.atlas.window
         for _ in range(2):
-            pose, rows = window.ahead(self._motion, self._motion_cov())
+            pose, rows = window.ahead(self._motion.mean, self._motion_cov())
             self._mean, self._cov = window.corrected(found.pose, seen, pose, rows)
             change = self._mean - pose
             change[2] = float(wrap(change[2]))
             if float(change @ np.linalg.solve(rows[:, :3] - self._cov + _EXACT * np.eye(3), change)) <= _SPUN:
                 break
-            self._upper += self._spun()
+            self._motion.doubt(self._spun())
 
     def _motion_cov(self) -> Array:
         """Return the covariance ``(3, 3)`` of the motion since the key scan, in its frame.
 
         Where nothing but the wheels has told the motion for a way L, their lasting errors add up along all of it:
-        after d more, (L + d)² - L² = 2 L d + d² times their variance. The noise that is taken for white has d².
+        after d more, (L + d)² - L² = (1 + 2 L / d) d² times their variance.
         """
-        cov = symmetric(self._upper) + _EXACT * np.eye(3) + self.mount.motion_cov(float(self._motion[2]))
-        lasting, lever = self.config.odometry.lasting, self.config.odometry.lever_m
-        if lasting is not None:
-            (before, turned), (way, turn) = self._blind, self._claimed
-            share = (0.5 * lasting.radius_sigma) ** 2  # four wheels average
-            rolled = 2.0 * math.hypot(before, lever * turned) * math.hypot(way, lever * turn)
-            linear = share * rolled
-            angular = linear / lever**2 + lasting.lever_sigma**2 * 2.0 * turned * turn
-            cov += np.diag([linear, linear, angular])
-        return cov
+        lever = self.config.odometry.lever_m
+        before, rolled = (math.hypot(way, lever * turn) for way, turn in (self._blind, self._claimed))
+        share = 1.0 + 2.0 * before / rolled if rolled > 0.0 else 1.0
+        return self._motion.white + _EXACT * np.eye(3) + share * self.calibration.motion_cov(self._motion)
 
     def _information(self, found: Alignment, seen: Links) -> Array:
         """Return what a scan tells ``(3, 3)`` of its pose on the patches as they are, in the body's directions."""
@@ -199,14 +193,14 @@ class GraphSlam(SurfaceBackend):
             info += turn.T @ h @ turn
         return info
 
-    def _learn_mount(self, found: Alignment, info: Array) -> None:
-        """Learn where the frame of the poses sits on the base, by what a scan made of the last motion."""
+    def _learn(self, found: Alignment, info: Array) -> None:
+        """Learn what lasts of the odometry's errors, by what a scan made of the last motion."""
         moved, prior = relative(self._last[None], found.pose[None])[0], self._step_cov() + _ALIGNED
         turn = about_z(float(moved[2]))  # from the body's directions now to those of the last scan
         cov = np.asarray(np.linalg.inv(np.linalg.inv(prior) + turn @ info @ turn.T), np.float64)
-        change = moved - self._step
+        change = moved - self._step.mean
         change[2] = float(wrap(change[2]))
-        self.mount.learn(float(self._step[2]), prior, change, cov)
+        self.calibration.learn(self._step, prior, change, cov)
 
     def _is_blind(self, motion_cov: Array, info: Array) -> bool:
         """Tell whether there is a direction in which the scan tells less of the motion than the wheels do."""
@@ -215,13 +209,13 @@ class GraphSlam(SurfaceBackend):
 
     def _lasting(self) -> float:
         """Return what :func:`.matching.lasting` does of the way since the last key scan."""
-        x, y, theta = self._motion.tolist()
+        x, y, theta = self._motion.mean.tolist()
         config = self.config
         return lasting(math.hypot(x, y), theta, key_m=config.key_m, key_rad=config.key_rad, most=_STILL)
 
     def _moved_on(self, share: float) -> bool:
         """Tell whether it is time for a key scan: sooner where much is new, as in a door."""
-        x, y, theta = self._motion.tolist()
+        x, y, theta = self._motion.mean.tolist()
         part = 1.0 if share >= _KNOWN else _SOONER
         return math.hypot(x, y) >= part * self.config.key_m or abs(theta) >= part * self.config.key_rad
 
@@ -243,9 +237,9 @@ class GraphSlam(SurfaceBackend):
         """Have the motion since the key scan lead to a pose ``(3,)``, as well known as that is."""
         key = self.atlas.window.pose
         back = about_z(float(-key[2]))
-        self._motion, self._upper = relative(key[None], pose[None])[0], np.triu(back @ pose_cov @ back.T)
+        self._motion = Motion(relative(key[None], pose[None])[0], back @ pose_cov @ back.T)
         back = about_z(float(-pose[2]))
-        self._step, self._step_upper = np.zeros(3), np.triu(back @ pose_cov @ back.T)
+        self._step = Motion(np.zeros(3), back @ pose_cov @ back.T)
         self._last, self._mean, self._cov = pose.copy(), pose.copy(), pose_cov.copy()
 
     def _redraw_kept(self, poses: Array) -> None:

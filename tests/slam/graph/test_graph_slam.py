@@ -328,6 +328,22 @@ def test_it_learns_where_the_laser_sits_on_the_base() -> None:
         base = compose(base, exp(twist * 0.4))
         backend.predict(Odometry(twist, 0.4))
         backend.update(scan_of(segments, compose(base, at), rng))
-    sigma = np.sqrt(np.diag(backend.mount.cov))
-    assert sigma.max() < 0.03 and np.all(np.abs(backend.mount.mean - at[:2]) < 3.0 * sigma)
+    sigma = np.sqrt(np.diag(backend.calibration.cov)[:2])
+    assert sigma.max() < 0.03 and np.all(np.abs(backend.calibration.mean[:2] - at[:2]) < 3.0 * sigma)
     assert backend.pose_nees(compose(base, at)) < 14.16
+
+
+def test_what_scans_teach_of_the_wheels_holds_where_scans_tell_nothing() -> None:
+    """Wheels 4 % too small, round a ring, then 4 m into the open, where they would be 0.16 m off."""
+    lasting = LastingErrors(radius_sigma=0.04, white_speed_share=0.005, white_turn_share_rad_m=0.01)
+    backend = GraphSlam(GraphSlamConfig(odometry=replace(WHEELS, lasting=lasting), lidar_offset_m=OFFSET))
+    rng, body, turns = np.random.default_rng(5), np.zeros(3), np.zeros(60)
+    turns[15:23] = math.pi / 8 / 0.4
+    backend.reset(body)
+    backend.update(scan_of(ring(), body, rng))
+    for k, omega in enumerate(turns):
+        twist = np.array([0.5, 0.0, omega])
+        body = compose(body, exp(twist * 0.4))
+        backend.predict(Odometry(1.04 * twist, 0.4, (0.0, 0.0)))
+        backend.update(scan_of(ring() if k < 40 else np.zeros((0, 4)), body, rng))
+    assert np.hypot(*(backend.pose - body)[:2]) < 0.06 and backend.pose_nees(body) < 14.16
