@@ -53,7 +53,7 @@ class OdometryNoise(Config):
     slip_share: Annotated[float, Within("[0, 100]")] = 0.55  # σ, of what may slip where nobody tells
     slide_m_s2: Positive = 1.5  # by which the floor lets the body follow wheels that slip
     # 1σ, by either coordinate, of where the frame that poses are of sits, away from the wheels' centre: graph-slam
-    # learns it (slam.odometry.lasting). 0: that is where it sits.
+    # learns it (slam.graph.lasting). 0: that is where it sits.
     mount_sigma_m: Annotated[float, Within("[0, 10]")] = 0.0
     lasting: LastingErrors | None = None  # what filters take for states: slam.gaussian.wheel_errors, …
 

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from slam.backend import SurfaceBackend
 from slam.geometry import about_z, compose, relative, wrap
 from slam.graph.atlas import Atlas
+from slam.graph.lasting import LastingStates, Motion
 from slam.graph.matching import Alignment, Links, align, lasting, links
 from slam.graph.pose_graph import PoseGraph
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
-from slam.odometry.lasting import LastingStates, Motion
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["GraphSlam"]

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from slam.geometry import compose, inverse, symmetric
+from slam.graph.lasting import LastingStates, Motion
 from slam.motion import LastingErrors, OdometryNoise, jacobians, move
-from slam.odometry.lasting import LastingStates, Motion
 from tests.slam.numerics import numerical_jacobian
 
 ONE = st.floats(-1.0, 1.0)
