@@ -91,7 +91,9 @@ class ActiveSlam(PpoFrontier):
         self._lately.append((np.array(belief.pose, dtype=np.float64), np.array(belief.pose_cov, dtype=np.float64)))
         self._follower.config = self._control()
         action = super().act(observation, belief)
-        return self._to_action(self._gentle.brake(observation, belief)) if self._goal is None else action
+        if self._goal is not None or self._status == "lost":  # lost, it creeps, whether it has a goal or not
+            return action
+        return self._to_action(self._gentle.brake(observation, belief))
 
     # ---- looking first ---------------------------------------------------------------------------------------
 
@@ -145,7 +147,8 @@ class ActiveSlam(PpoFrontier):
         if grown <= 0.0 or squares <= 0.0:
             return usual
         speed = max(drift.rate_m_rt_s * math.sqrt(squares / (grown * self._step_s)), drift.slowest_m_s)
-        return replace(usual, speed_share=min(usual.speed_share, speed / self._robot.max_speed_m_s))
+        share = max(speed / self._robot.max_speed_m_s, 0.01)  # the least that there is
+        return replace(usual, speed_share=min(usual.speed_share, share))
 
 
 def _grown(before: Array, cov_before: Array, now: Array, cov_now: Array) -> float:

@@ -60,4 +60,5 @@ class CostUtility(Explorer):
             range_m=min(config.range_m, 0.8 * self._lidar.range_max_m),
             depth_m=config.depth_m,
         )
-        return np.asarray(utility - config.beta_m2_m * candidates.costs)
+        costs = config.beta_m2_m * np.where(reached, candidates.costs, 0.0)
+        return np.where(reached, utility - costs, -np.inf)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from agents.base import Goal
-from agents.driving.control import PathFollower
+from agents.driving.control import ControlConfig, PathFollower
 from agents.nearest_frontier import NearestFrontier, NearestFrontierConfig
 from slam import geometry
 from slam.belief import Belief
@@ -21,8 +21,6 @@ from slam.settings import Angle, Config, Length, Positive
 from slam.types import Array, Floats
 
 __all__ = ["ExploreAndReturn", "ExploreAndReturnConfig", "HomingConfig"]
-
-_HOME = np.zeros(3)  # the belief's frame is that of the start pose
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +53,11 @@ class ExploreAndReturn(NearestFrontier):
     config: ExploreAndReturnConfig
     config_type = ExploreAndReturnConfig
 
+    def reset(self, belief: Belief, seed: int = 0) -> None:
+        """Start an episode, at the pose that is to be returned to: in a team each robot's own."""
+        super().reset(belief, seed)
+        self._home = np.array(belief.pose, dtype=np.float64)
+
     def _forget(self) -> None:
         super()._forget()
         self._returning = False
@@ -83,12 +86,13 @@ class ExploreAndReturn(NearestFrontier):
             arrived_rad=0.6 * homing.arrived_rad,
             arrival_m_s=homing.arrival_m_s,
         )
-        self._follower = _HomeFollower(control, robot=self._robot, lidar=self._lidar, step_s=self._step_s)
+        body: dict[str, Any] = {"robot": self._robot, "lidar": self._lidar, "step_s": self._step_s}
+        self._follower = _HomeFollower(control, home_rad=float(self._home[2]), **body)
 
     def _choose_home(self, belief: Belief) -> Goal | None:
         """Return the start as the goal: the way to it, or as near to it as the map allows."""
         patience = self.config.patience
-        trouble = self._troubles.note(_HOME[:2])
+        trouble = self._troubles.note(self._home[:2])
         if trouble.looks and not self._end:
             if self._is_home(belief):
                 self._end = "returned"
@@ -107,23 +111,23 @@ class ExploreAndReturn(NearestFrontier):
         path, cost = self._way_home(belief)
         if self._target is None:
             self._allow_time(cost)
-        self._target = _HOME[:2].copy()
+        self._target = self._home[:2].copy()
         self._status = "returning"
-        return Goal(pose=np.array([*path[-1], _HOME[2]]), path=path)
+        return Goal(pose=np.array([*path[-1], self._home[2]]), path=path)
 
     def _way_home(self, belief: Belief) -> tuple[Array, float]:
         """Return the path ``(n, 2)`` [m] to the start, or to the reachable place nearest to it, and its cost."""
-        path, cost, away = self._way_near(_HOME[:2], belief)
+        path, cost, away = self._way_near(self._home[:2], belief)
         if away <= max(self.config.homing.last_leg_m, self._cost_maps.of(belief).resolution):
             # The start itself for the centre of the cell. Where that cell is not the start's own, the robot has
             # stood there all the same, and the follower's safety check keeps it off the walls.
-            path = np.vstack([path[: max(len(path) - 1, 1)], _HOME[:2]])
+            path = np.vstack([path[: max(len(path) - 1, 1)], self._home[:2]])
         return path, cost
 
     def _is_home(self, belief: Belief) -> bool:
         pose = np.asarray(belief.pose, dtype=np.float64)
-        near = float(np.hypot(*(pose[:2] - _HOME[:2]))) <= self.config.homing.arrived_m
-        return near and abs(geometry.wrap_scalar(pose[2] - _HOME[2])) <= self.config.homing.arrived_rad
+        near = float(np.hypot(*(pose[:2] - self._home[:2]))) <= self.config.homing.arrived_m
+        return near and abs(geometry.wrap_scalar(pose[2] - self._home[2])) <= self.config.homing.arrived_rad
 
     # ---- driving -------------------------------------------------------------------------------------------
 
@@ -145,5 +149,9 @@ class _HomeFollower(PathFollower):
     # Beside a wall it fits with the heading it had there, hardly with the nose to the wall.
     _turn_within_m = 0.5  # of the start
 
+    def __init__(self, config: ControlConfig, *, home_rad: float = 0.0, **body: Any) -> None:
+        super().__init__(config, **body)
+        self._home_rad = home_rad
+
     def set_path(self, path: Array, heading: float | None) -> None:
-        super().set_path(path, float(_HOME[2]))
+        super().set_path(path, self._home_rad)

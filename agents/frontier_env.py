@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
-from typing import Annotated, Any, SupportsInt, cast
+from typing import Annotated, Any, SupportsIndex, cast
 
 import gymnasium
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.arguments import check_arguments
-from mecanum_env.env import ExploreEnv
+from mecanum_env.env import ExploreEnv, time_limit_of_caller
 from slam.belief import Belief
 from slam.files import quoted
 from slam.settings import Within, argument, checked, from_mapping
@@ -59,7 +60,7 @@ def as_observation(choice: Choice | None, space: spaces.Dict) -> Observation:
     return padded
 
 
-class ChoiceEnv(gymnasium.Env[Observation, SupportsInt]):
+class ChoiceEnv(gymnasium.Env[Observation, SupportsIndex]):
     """What ``ExploreFrontier-v0`` and its rehearsal share: their spaces, and the choice that is due.
 
     Attributes
@@ -181,20 +182,22 @@ class ExploreFrontierEnv(ChoiceEnv):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
+        self._decisions = 0
+        self._most_decisions = time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
         self.base.planned_path = None
         self._seen, info = self._limited.reset(seed=seed, options=options)
         self.agent.reset(self.base.outline, 0 if seed is None else int(seed))
         self._choice = self.agent.survey(self.base.belief)
         return self._observed(), info | {"duration_s": 0.0}
 
-    def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: SupportsIndex) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Drive to a view point until the next choice is due; see the class."""
         if not hasattr(self, "_seen"):
             raise RuntimeError("call reset() before step()")
         most = self.driver.choice.most
         try:
-            k = int(action)
-        except (TypeError, ValueError, OverflowError):
+            k = operator.index(action)
+        except TypeError:
             k = most
         if not 0 <= k < most:
             raise ValueError(f"action must be 0 … {most - 1}, got {quoted(action)}")
@@ -210,7 +213,7 @@ class ExploreFrontierEnv(ChoiceEnv):
             total += weight * float(reward)
             weight *= self.discount
             steps += 1
-            idle = idle + 1 if agent.goal is None else 0
+            idle = idle + 1 if agent.goal is None and agent.status != "lost" else 0
             self._choice = None
             if terminated or truncated:
                 break
@@ -228,10 +231,12 @@ class ExploreFrontierEnv(ChoiceEnv):
             # to choose, though no choice is due.
             self._choice = agent.survey(self.base.belief)
         info["duration_s"] = steps * config.step_s
-        if terminated or truncated:
+        self._decisions += 1
+        last = self._most_decisions is not None and self._decisions >= self._most_decisions
+        if terminated or truncated or last:
             covered = bool(info.get("is_success", False))
             given_up = agent.status if idle >= patience else "collision"
-            info["end"] = "covered" if covered else "time" if truncated else given_up
+            info["end"] = "covered" if covered else "time" if truncated or not terminated else given_up
             info.setdefault("is_success", False)
             info.setdefault("episode_metrics", self.base.episode_metrics())
         return self._observed(), total, bool(terminated), bool(truncated), info

@@ -28,8 +28,6 @@ __all__ = ["FORMAT", "SHIPPED", "LearnedTour", "LearnedTourConfig", "load_statio
 FORMAT = "mecanum-slam station policy 2"
 SHIPPED = Path(__file__).parent / "policies" / "learned-tour.safetensors"
 
-_LUCK = draw_luck(6, 700)
-
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedTourConfig(TourConfig):
@@ -77,6 +75,7 @@ class LearnedTour(Tour):
     def __init__(self, config: Any = None, **body: Any) -> None:
         super().__init__(config, **body)
         self.policy_path = Path(self.config.policy or SHIPPED)
+        self._luck = draw_luck(self.config.tries, 700)
         self._network, self.about = load_station_policy(self.policy_path)
 
     def _forget(self) -> None:
@@ -85,7 +84,7 @@ class LearnedTour(Tour):
         self._decided_at: set[tuple[int, int]] = set()  # stations, since anything new was seen
 
     def _station(self, stop: StationStop) -> int:
-        openings = options(stop.found, _LUCK, most=self.config.most, most_loss_m=self.config.most_loss_m)
+        openings = options(stop.found, self._luck, most=self.config.most, most_loss_m=self.config.most_loss_m)
         best = 0
         if len(openings.targets) > 1 and self._is_news(stop):
             best = int(np.argmin(self._costs_m(stop, openings)))

@@ -104,7 +104,10 @@ def make_config(
     with argument("rooms" if "rooms_config" in changes else "rooms_config"):
         check_rooms(made.rooms, made.rooms_config)
     with argument("slam" if "slam_config" in changes else "slam_config"):
-        from_mapping(config_type(made.slam), backend_settings(made))
+        settings = backend_settings(made)
+        same = settings["grid_resolution_m"] == made.grid_resolution_m
+        require(same, "grid_resolution_m is set in config, not beside it: truth and metrics have the same cells")
+        from_mapping(config_type(made.slam), settings)
     with argument("odometry_filter" if "odometry_filter_config" in changes else "odometry_filter_config"):
         make_odometry_filter(made.odometry_filter, made.odometry_filter_config)
     return made

@@ -41,7 +41,7 @@ from slam.odometry.filters import make_odometry_filter
 from slam.settings import check_name
 from slam.types import Array, Floats, Odometry, Scan
 
-__all__ = ["ExploreEnv"]
+__all__ = ["ExploreEnv", "time_limit_of_caller"]
 
 ACTIONS = {"twist": 3, "wheels": 4}
 
@@ -121,7 +121,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
             self.config, room_seed_of(options, episode_seed),
             given=options.get("floor_plan", self._plan), start=options.get("start_pose"),
         )  # fmt: skip
-        self._step_limit = _time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
+        self._step_limit = time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
         self._set_up(plan, episode_seed)
         info = self.first_look()
         self._viewer.show(self)
@@ -342,7 +342,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         )
 
 
-def _time_limit_of_caller(env: gymnasium.Env[Any, Any]) -> int | None:
+def time_limit_of_caller(env: gymnasium.Env[Any, Any]) -> int | None:
     """Return the least step limit of the ``TimeLimit`` wrappers of ``env`` that this very reset came through.
 
     ``gym.make(…, max_episode_steps=N)`` tells nobody but such a wrapper, yet ``progress`` and the last step's

@@ -95,7 +95,6 @@ class EpisodeRecord:
         rows = self._rows
         times, coverage = rows[:, _TIME], rows[:, _COVERAGE]
         belief = backend.belief
-        score = score_map(truth, belief)
         corners = metrics.corner_deviation(handed_out(backend).points, truth.corners)
         end = rows[-1]
         heading = metrics.heading_errors(end[None, _TRUE], end[None, _ESTIMATE])
@@ -112,9 +111,7 @@ class EpisodeRecord:
             "time_to_90_s": metrics.time_to(coverage, times, level=0.9),
             "time_to_95_s": metrics.time_to(coverage, times, level=0.95),
             "time_to_99_s": metrics.time_to(coverage, times, level=0.99),
-            "map_iou": score.iou,
-            "map_precision": score.precision,
-            "map_recall": score.recall,
+            **wall_metrics(score_map(truth, belief)),
             "corner_mean_m": _number(corners.mean),
             "corner_max_m": _number(corners.max),
             "ate_rmse_m": metrics.ate(rows[:, _TRUE], rows[:, _ESTIMATE]),
@@ -149,14 +146,19 @@ class Truth:
 
 
 def score_map(truth: GroundTruth, belief: Belief) -> metrics.MapScore:
-    """Compare the belief's walls with the true ones, within :data:`WALL_TOLERANCE_M`.
+    """Compare the belief's walls with the true ones, within :data:`WALL_TOLERANCE_M`, or a cell if that is more.
 
     What the belief has beyond the true plan's extent counts as wrong as far as ten metres out.
     """
     margin = round(10.0 / truth.resolution)
     true_walls = on_lattice(truth.walls, truth.lattice_origin, truth, margin)
     walls = on_lattice(belief.grid.classes() == OCCUPIED, belief.grid.lattice_origin, truth, margin)
-    return metrics.compare_walls(walls, true_walls, tolerance_cells=WALL_TOLERANCE_M / truth.resolution)
+    return metrics.compare_walls(walls, true_walls, tolerance_cells=max(WALL_TOLERANCE_M / truth.resolution, 1.0))
+
+
+def wall_metrics(score: metrics.MapScore) -> dict[str, float | None]:
+    """Return the score of a map as ``episode_metrics`` has it."""
+    return {f"map_{name}": _number(value) for name, value in score._asdict().items()}
 
 
 def _number(value: float) -> float | None:

@@ -150,6 +150,10 @@ class PathFollower:
         self.arrived = False
         self.remaining_m = 0.0
 
+    def stand(self) -> None:
+        """Take note that the robot was told to stand; the path stays."""
+        self._velocity, self._turn = np.zeros(2), 0.0
+
     @property
     def speed_m_s(self) -> float:
         """Of the last twist that was sent; where it has arrived, as though it drove."""

@@ -21,9 +21,10 @@ from slam.belief import Belief
 from slam.settings import Config
 from slam.types import Array, Floats
 
-__all__ = ["Driver", "DriverConfig"]
+__all__ = ["LOST", "Driver", "DriverConfig"]
 
-_LOST = 0.1  # health of a belief below which it is no good for driving
+LOST = 0.1  # health of a belief below which it is no good for driving
+_SAME_SHARE = 0.2  # of the lidar's reach, within which pieces of frontier may be the same
 _LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
@@ -63,7 +64,9 @@ class Driver(Agent):
         self._anchor = (0.0, 0.0, 0.0)  # pose [m, m, rad] from which it has to get away in time
         self._anchored_at = 0.0
         self._lost_for = 0.0
-        self._troubles = Troubles(0.6 * self.config.patience.same_m)
+        # What a short-sighted robot sees beside the piece that it has looked at is another.
+        same_m = min(self.config.patience.same_m, _SAME_SHARE * self._lidar.range_max_m)
+        self._troubles = Troubles(0.6 * same_m)
         self._giving_way = GivingWay(self.config.giving_way, self._robot)
 
     @abstractmethod
@@ -76,7 +79,7 @@ class Driver(Agent):
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
         """Return the next action on the way to the goal, choosing a goal when one is due."""
-        if belief.health < _LOST:
+        if belief.health < LOST:
             return self._wait(observation, belief)
         self._lost_for = 0.0
         self._keep_watch(belief)
@@ -143,7 +146,9 @@ class Driver(Agent):
         self._time += self._step_s
         self._lost_for += self._step_s
         self._anchored_at = self._time
+        self._deadline += self._step_s
         if self._lost_for < self.config.patience.lost_s:
+            self._follower.stand()
             return np.zeros(3, dtype=np.float32)
         return self._to_action(self._follower.creep(observation, belief))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from agents.driving.driver import LOST
 from agents.explorer import Candidates
 from agents.learned.choice import Choice, ChoiceConfig, TourPlan, describe
 from agents.tour import Tour, TourConfig
@@ -56,7 +57,7 @@ class Chooser(Tour):
 
     def due(self, belief: Belief) -> bool:
         """Whether the next :meth:`act` will ask for a choice."""
-        return self._due(belief)
+        return belief.health >= LOST and self._due(belief)
 
     def survey(self, belief: Belief) -> Choice | None:
         """Return what there is to choose from, or ``None`` where no frontier can be reached."""

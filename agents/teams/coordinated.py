@@ -55,7 +55,8 @@ class Coordinated(Shared, CostUtility):
         bound = crew.bound.copy()
         bound[crew.own] = -1
         costs = crew.held(config.switch_m2 / max(config.beta_m2_m, 1e-9))
-        column = pair_off(area, overlap, config.beta_m2_m * costs, bound)[crew.own]
+        price = np.where(np.isfinite(costs), config.beta_m2_m * np.where(np.isfinite(costs), costs, 0.0), np.inf)
+        column = pair_off(area, overlap, price, bound)[crew.own]
         return np.array([column] if column >= 0 else [], dtype=np.int64)
 
 

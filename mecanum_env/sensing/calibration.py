@@ -14,9 +14,8 @@ from slam.settings import to_mapping
 __all__ = ["backend_settings", "odometry_noise"]
 
 # A wheel's radius error stays for the whole episode, while a filter without it as a state takes it for white. Over
-# the most of a second that it takes the landmarks to correct a drift, eight steps' errors add up instead of
-# averaging.
-_PERSISTENCE = 8.0
+# the most of a second that it takes landmarks to correct a drift, the steps' errors add up instead of averaging.
+_PERSISTENCE_S = 0.8
 
 # What is left of the wheels' creep when its mean is taken out (mecanum_env.sensing.sensors.creep), and some more:
 # a robot that stands must not become certain of where it is.
@@ -25,19 +24,19 @@ _FLOOR_M_S = 0.0001
 _LEAST_RANGE_SIGMA_M = 0.0001  # of a lidar that has no noise: no filter divides by zero
 
 
-def odometry_noise(robot: RobotConfig, noise: NoiseConfig) -> OdometryNoise:
-    """Return V for a robot and its declared noise (docs/reference/motion.md), from its parts.
+def odometry_noise(robot: RobotConfig, noise: NoiseConfig, step_s: float = 0.1) -> OdometryNoise:
+    """Return V for a robot, its noise and the length of a step, from what is declared (docs/reference/motion.md).
 
     Each wheel's relative error has a white part (encoder, random slip) and a lasting one (radius, lever, uniform
     within their bounds); the slip's mean the odometry takes out itself. Four wheels average into vx and vy with
     weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
     ``mecanum study calibration`` measures V on the simulated robot.
     """
-    white = noise.encoder**2 + noise.slip**2 / 3.0
-    as_white = _PERSISTENCE * (noise.radius_error**2 / 3.0)
+    white, steps = noise.encoder**2 + noise.slip**2 / 3.0, max(_PERSISTENCE_S / step_s, 1.0)
+    as_white = steps * (noise.radius_error**2 / 3.0)
     per_wheel = math.sqrt((white + as_white) / 4.0)
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.
-    base = noise.base_error * math.sqrt(_PERSISTENCE / 6.0)
+    base = noise.base_error * math.sqrt(steps / 6.0)
     white_share = math.sqrt(white / 4.0)
     return OdometryNoise(
         lever_m=robot.lever_m,
@@ -63,7 +62,7 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
         "body_length_m": config.robot.length_m,
         "body_width_m": config.robot.width_m,
         "grid_resolution_m": config.grid_resolution_m,
-        "odometry": to_mapping(odometry_noise(config.robot, config.noise)),
+        "odometry": to_mapping(odometry_noise(config.robot, config.noise, config.step_s)),
         "features": {"range_sigma_m": max(config.noise.range_sigma_m, _LEAST_RANGE_SIGMA_M)},
     }
     given = config.slam_config.get("odometry")

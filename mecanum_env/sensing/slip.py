@@ -23,6 +23,7 @@ __all__ = [
 
 _PARTS = 2  # of the time between two readings
 _ROUNDS = 2  # of finding how much a wheel slips at the end of a part, and so how it grips
+_SMALL_RAD = 0.04  # turn of a part up to which a rotation to first order stretches less than friction takes back
 _STICKS = 0.5  # share of the grip up to which wheels creep by as much as they pull
 
 # σ of what slips, as a share of what is expected to, on a floor that is the same everywhere; found in jerks.
@@ -126,7 +127,10 @@ def follow(body: Array, last: Array, now: Array, dt: float, constants: Array, lo
             lost[2] += h * (turn - vl - 0.5 * dvl)
             vx, vy, vl = vx + dvx, vy + dvy, vl + dvl
             angle = h / lever * vl  # by which the body's axes turn under its velocity
-            vx, vy = vx + angle * vy, vy - angle * vx
+            c, s = 1.0, angle
+            if abs(angle) > _SMALL_RAD:
+                c, s = math.cos(angle), math.sin(angle)
+            vx, vy = c * vx + s * vy, c * vy - s * vx
         end_x, end_y, end_turn = vx, vy, vl
     body[0], body[1], body[2] = end_x, end_y, end_turn
     return slips

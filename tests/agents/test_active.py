@@ -157,6 +157,24 @@ def test_it_rolls_out_when_all_is_explored():
     assert speeds[-1] == 0.0 and np.diff(speeds).min() > -2.05 * 0.1
 
 
+def test_lost_with_nothing_to_go_to_it_creeps():
+    done = belief_of(room(8.0, 4.0), (1.5, 2.0, 0.0))
+    agent = ready(done, **GO)
+    scan = {"scan": np.full(LIDAR.beams, 0.5, np.float32)}
+    for _ in range(5):
+        agent.act(scan, done)
+    assert agent.goal is None
+    sent = [agent.act(scan, replace(done, health=0.0)) for _ in range(40)]
+    assert agent.status == "lost" and np.any(sent[-1] != 0.0)
+
+
+def test_the_slowest_that_may_be_asked_for_is_the_least_share_of_the_top_speed():
+    agent = ready(belief_of(half_known(), (1.5, 2.0, 0.0)), drift={"slowest_m_s": 0.001, "rate_m_rt_s": 1e-6})
+    for k in range(40):
+        agent._lately.append((np.array([0.01 * k, 0.0, 0.0]), 1e-4 * (k + 1) * np.eye(3)))
+    assert agent._control().speed_share == 0.01
+
+
 def test_wheels_that_slip_are_found_out_and_driven_gently():
     rng = np.random.default_rng(1)
     limits = np.array([ROBOT.max_speed_m_s, ROBOT.max_speed_m_s, ROBOT.max_turn_rate_rad_s])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -19,9 +21,10 @@ SHORT = {"view_range_m": 0.8}
 CORNER = (-2.0, -2.0)
 
 
-def agent_in(belief, **kwargs):
+def agent_in(belief, *, start=(0.0, 0.0, 0.0), **kwargs):
+    """An agent that began at ``start`` and is where the belief says by now."""
     agent = agents.make("explore-and-return", **kwargs)
-    agent.reset(belief)
+    agent.reset(replace(belief, pose=np.array(start)))
     return agent
 
 
@@ -66,6 +69,14 @@ def test_with_nothing_left_it_chooses_the_start():
     agent.reset(belief_of(half_known(), (1.5, 2.0, 0.4)))
     assert agent.choose(belief_of(half_known(), (1.5, 2.0, 0.4))) is not None
     assert agent.status == "driving"
+
+
+def test_in_a_frame_that_is_another_s_the_start_is_its_own():
+    classes = room(8.0, 5.0)
+    agent = agent_in(belief_of(classes, (3.5, 1.5, -1.0), origin=CORNER), start=(3.0, 1.0, 0.5))
+    pose, words, _ = go(agent, classes, np.array([3.5, 1.5, -1.0]))
+    assert words[-1] == "returned"
+    np.testing.assert_allclose(pose, (3.0, 1.0, 0.5), atol=0.11)
 
 
 @pytest.mark.parametrize("preset", ["youbot", "cavity"])

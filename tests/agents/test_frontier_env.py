@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -199,10 +200,37 @@ def test_a_policy_is_driven_here_as_by_its_agent(noise):
         np.testing.assert_array_equal(info["true_pose"], other["true_pose"])
 
 
+def test_a_lost_robot_is_asked_nothing_and_has_not_ended():
+    env = gymnasium.make(ID, rooms="apartment", driver={"choice": {"most": 1}}).unwrapped
+    env.reset(seed=1)
+    belief = type(env.base).outline
+
+    class Lost(type(env.base)):
+        @property
+        def outline(self):
+            told = belief.fget(self)
+            return replace(told, health=0.0) if 20 <= self._steps < 60 else told
+
+    env.base.__class__ = Lost
+    assert not env.agent.due(replace(env.base.outline, health=0.0))
+    *_, info = env.step(0)  # all of it, where there is one to choose from
+    assert info["end"] == "covered" and info["duration_s"] > 6.0
+
+
+def test_the_limit_of_the_caller_ends_an_episode_as_any_other():
+    env = gymnasium.make(ID, rooms="apartment", max_episode_steps=3)
+    for _ in range(2):
+        env.reset(seed=1)
+        ends = [env.step(0) for _ in range(3)]
+        assert [truncated for *_, truncated, _ in ends] == [False, False, True]
+        assert "end" not in ends[1][4]
+        assert ends[2][4]["end"] == "time" and "episode_metrics" in ends[2][4] and not ends[2][4]["is_success"]
+
+
 def test_it_says_what_is_wrong():
     env = gymnasium.make(ID, rooms="rectangular").unwrapped
     env.reset(seed=0)
-    for nonsense in (24, -1, 10**30, math.nan, math.inf, None, "first", [0, 1], np.zeros((9, 9))):
+    for nonsense in (24, -1, 10**30, 2.7, math.nan, math.inf, None, "first", "3", [0, 1], np.zeros((9, 9))):
         with pytest.raises(ValueError, match=r"^action must be 0 … 23, got .*$"):
             env.step(nonsense)
     with pytest.raises(ValueError, match="discount"):

@@ -37,6 +37,14 @@ def test_a_configuration_keeps_its_settings_when_the_callers_change() -> None:
     assert config.slam_config == {"features": {"range_sigma_m": 0.01}}
 
 
+def test_cells_of_another_size_are_those_of_truth_and_metrics_too() -> None:
+    with pytest.raises(ValueError, match="grid_resolution_m is set in config"):
+        gymnasium.make("mecanum_env/Explore-v0", slam={"grid_resolution_m": 0.1})
+    env = gymnasium.make("mecanum_env/Explore-v0", config={"grid_resolution_m": 0.1}, slam={"gate": 9.0})
+    env.reset(seed=0)
+    assert env.unwrapped.belief.grid.resolution == env.unwrapped.truth.ground.resolution == 0.1
+
+
 @pytest.mark.parametrize("name", ["Explore-v0", "ExploreFrontier-v0"])
 def test_an_argument_that_there_is_not_is_named_with_those_that_there_are(name: str) -> None:
     with pytest.raises(ValueError, match=r"^unknown argument .room. \(did you mean .rooms.\?\); valid: .*slam$"):

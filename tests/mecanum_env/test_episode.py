@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,9 +9,10 @@ import pytest
 import agents
 import slam
 from mecanum_env.env import ExploreEnv
+from mecanum_env.episode import wall_metrics
 from slam.accounts.landmarks import handed_out, write_landmarks
 from slam.landmarks.database import read_landmark_map
-from slam.metrics.measures import corner_deviation
+from slam.metrics.measures import MapScore, corner_deviation
 
 
 def driven(backend: str, *, rooms: str = "rectangular", seed: int = 300, steps: int = 150) -> ExploreEnv:
@@ -58,3 +61,21 @@ def test_corners_handed_out_lie_nearer_the_true_ones():
     assert (
         0.5 < np.median(nees) / 1.39 < 3.0
     )  # of χ² with two degrees of freedom; errors of a room have much in common
+
+
+@pytest.mark.parametrize("cell_m", [0.05, 0.2, 0.5])
+def test_the_walls_of_a_map_that_is_right_match_in_cells_of_any_size(cell_m):
+    noise = {"range_sigma_m": 0.0, "dropout": 0.0}
+    where = {"rooms": "rectangular", "slam": "truth", "noise": noise, "config": {"grid_resolution_m": cell_m}}
+    env = gymnasium.make("mecanum_env/Explore-v0", **where).unwrapped
+    observation, _ = env.reset(seed=3)
+    agent = agents.make("nearest-frontier")
+    agent.reset(env.belief)
+    for _ in range(150):
+        observation, *_ = env.step(agent.act(observation, env.belief))
+    assert env.episode_metrics()["map_iou"] > 0.9
+
+
+def test_what_is_not_defined_is_none():
+    nothing = wall_metrics(MapScore(math.nan, math.nan, 0.5))
+    assert nothing == {"map_iou": None, "map_precision": None, "map_recall": 0.5}

@@ -132,9 +132,9 @@ def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None
         return ""
     return (
         f"<h3>{name_html(f'Against {baseline}, {where}')}</h3>"
-        '<p class="soft">Change of the interquartile mean with its interval, coloured where that excludes no '
-        "change; below, in what share of the episodes it did better, ties counted half.</p>"
-        + tables.html(tables.against_table(found, baseline))
+        '<p class="soft">Change of the interquartile mean, of several plans within each, the plans counting the '
+        "same, with its interval, coloured where that excludes no change; below, in what share of the episodes it "
+        "did better, ties counted half.</p>" + tables.html(tables.against_table(found, baseline))
     )
 
 

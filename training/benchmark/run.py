@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ import tomli_w
 import agents
 import slam
 from mecanum_env.arguments import make_config
-from mecanum_env.config import EnvConfig
 from mecanum_env.team.config import TeamConfig
 from slam.formats import atomic_write
 from slam.settings import check_name, to_mapping
@@ -24,7 +23,7 @@ from training.benchmark.figures import Group, group_rows, with_regrets
 from training.benchmark.output import FILES, Report, markdown, write_tables
 from training.benchmark.suites import NOMINAL, SPLITS, Place, Suite
 from training.benchmark.team_episode import TeamJob
-from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2
+from training.episodes.explore import LEAST_STEPS, STEPS_PER_M2, read_run_table
 from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import refuse_bounds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
@@ -83,7 +82,8 @@ class BenchmarkPlan:
             names = _agent_names(agents)
             if any(team is not None for team in teams):
                 refuse_bounds(names)
-            backends = tuple(backend_names(slam if slam is not None else EnvConfig().slam))
+            world = make_config(config=config, robot=robot)
+            backends = tuple(backend_names(slam if slam is not None else world.slam))
             check_name("split", split, SPLITS)
             chosen = tuple(parse_seeds(seeds, most=_MOST_SEEDS)) if seeds is not None else None
             if baseline is not None and baseline not in names:
@@ -91,7 +91,8 @@ class BenchmarkPlan:
             if suite is None:
                 suite = "apartments" if floor_plans is None else suites.FLOOR_PLANS
             which = suites.choose(suite, floor_plans=floor_plans)
-            make_config(config=config, robot=robot)
+        if config is not None:
+            read_run_table(config)
         if baseline is None and DEFAULT_BASELINE in names:
             baseline = DEFAULT_BASELINE
         return cls(
@@ -198,8 +199,10 @@ class BenchmarkPlan:
         }
 
     def _config_text(self, suite: Suite, backend: str) -> str:
-        config = make_config(slam=backend, **self._world(suite, suite.places[0]))
-        return tomli_w.dumps(to_mapping(config))
+        place = suite.places[0]
+        config = make_config(slam=backend, **self._world(suite, place))
+        plan = config.floor_plan if place.floor_plan else None  # a file's own gives way to the suite's rooms
+        return tomli_w.dumps(to_mapping(replace(config, floor_plan=plan)))
 
 
 def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:

@@ -28,7 +28,8 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "done", "make_agent", "prepare", "refuse_two_places", "run", "run_whole",
+    "done", "make_agent", "prepare", "read_run_table", "refuse_two_places", "run",
+    "run_whole",
 ]  # fmt: skip
 
 FILES = (
@@ -170,7 +171,7 @@ def asked_for(
     the end.
     """
     refuse_two_places(rooms, floor_plan)
-    past = _read_run_table(config) if config is not None else {}
+    past = read_run_table(config) if config is not None else {}
     if any(v is not None for v in (rooms, floor_plan, seed)):
         # Other rooms: neither the start nor the step limit is meant for them.
         past = {name: value for name, value in past.items() if name in _DEFAULTS}
@@ -211,7 +212,7 @@ def make_agent(name: str, env: ExploreEnv, *, config: Mapping[str, Any] | None =
     return agents.make(name, robot=told.robot, lidar=told.lidar, step_s=told.step_s, config=config)
 
 
-def _read_run_table(path: Path) -> dict[str, Any]:
+def read_run_table(path: Path) -> dict[str, Any]:
     """Return ``agent``, ``seed``, ``start`` and ``max_steps`` from a config's [run] table, where it has one."""
     _, run = read_config(path, _RUN_KINDS)
     start = run.get("start", [0.0, 0.0, 0.0])

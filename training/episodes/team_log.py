@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.base import Goal
-from mecanum_env.episode import score_map
+from mecanum_env.episode import score_map, wall_metrics
 from mecanum_env.team.member import Member
 from mecanum_env.team.team import Team
 from slam.accounts.account import Account
@@ -195,9 +195,7 @@ def team_metrics(team: Team, log: TeamLog) -> dict[str, Any]:
         "robot_collisions": int(log.robot_collisions[-1]),
         **{name: measures.time_to(coverage, times, level=level) for name, level in levels.items()},
         "map_robots": together,
-        "map_iou": score.iou,
-        "map_precision": score.precision,
-        "map_recall": score.recall,
+        **wall_metrics(score),
         "corner_mean_m": means["corner_mean_m"],
         "corner_max_m": max(corners, default=None),
         "ate_rmse_m": math.sqrt(float(np.average(squares, weights=weights))),

@@ -178,7 +178,7 @@ def compare(
         Values ``(n,)``, the same episode at the same place.
     strata
         Each episode's stratum ``(n,)``. Each counts the same: the difference is the mean over the strata, the
-        ratio their geometric mean, the probability their mean.
+        ratio the geometric mean of those that are not 0 / 0, the probability their mean.
     lower_is_better
         Which way an improvement goes.
     for_rank
@@ -202,7 +202,9 @@ def compare(
     for at in (np.arange(len(a))[None], resampled_indices(strata)):
         ours_at, theirs_at = (np.stack([iqm(v[at[:, p]]) for p in places]) for v in (a, b))  # (strata, resamples)
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.exp(np.log(ours_at / theirs_at).mean(axis=0))
+            logs = np.log(ours_at / theirs_at)
+            defined = ~np.isnan(logs)  # not 0 / 0
+            ratio = np.exp(np.sum(logs, axis=0, where=defined) / defined.sum(axis=0))
         probability = np.mean([won[at[:, p]].mean(axis=-1) for p in places], axis=0)
         found.append(((ours_at - theirs_at).mean(axis=0), ratio, probability))
     (difference, ratio, probability), resampled = found

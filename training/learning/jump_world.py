@@ -8,9 +8,10 @@ parts, on the map that the scans make, so that what is learned here serves in ``
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, SupportsInt
+from typing import Any, SupportsIndex
 
 import cv2
 import numpy as np
@@ -108,9 +109,9 @@ class JumpWorld(ChoiceEnv):
         self._choice = self.agent.survey(self.belief)
         return self._observed(), self._info(0.0)
 
-    def step(self, action: SupportsInt) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: SupportsIndex) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Go to a view point until the next choice of more than one is due."""
-        k, began = int(action), self.time_s
+        k, began = operator.index(action), self.time_s
         while not self._over:
             self._take(k)
             self._choice, k = None, 0

@@ -39,6 +39,7 @@ from slam.ros import (
     transforms_of,
     twist_message,
 )
+from slam.settings import require
 from slam.types import Array, Odometry, Scan
 
 __all__ = ["Driver", "lidar_of"]
@@ -98,6 +99,7 @@ class Driver:
         log: Callable[[str], None] = print,
     ) -> None:  # fmt: skip
         agents.check(agent)
+        require(mount is None or abs(mount.y_m) <= _BESIDE_M, f"a mount is {_BESIDE_M} m off the middle at most")
         make_backend(config)  # now, not at the first scan, it is known to fit
         self.config, self._agent_name, self._seed, self._late_s, self.log = config, agent, seed, late_s, log
         self._mount, self._frames = mount, Frames()
@@ -133,13 +135,16 @@ class Driver:
             self._older_since = min(self._older_since, now_s)
             if now_s - self._older_since < self._late_s:
                 return
-            self._complain("odometry's clock was set back")
-            self._odometry[-1] = at - 1e-3, self._odometry[-1][1]
-            while len(self._odometry) > 1:
-                self._odometry.popleft()
-            self._waiting.clear()
-            if self._backend is not None:
-                self._at = at - 1e-3, self._at[1]
+        if self._odometry and math.isfinite(self._older_since):  # the caller's clock says how old what is kept is
+            back_s = at - (now_s - self._heard["odometry"]) - self._odometry[-1][0]
+            if back_s < -_LEAST_S:
+                self._complain("odometry's clock was set back")
+                self._odometry = deque(((t + back_s, kept) for t, kept in self._odometry), maxlen=_KEPT)
+                self._waiting.clear()
+                if (
+                    self._backend is not None and self._at[0] > self._odometry[-1][0]
+                ):  # else of the clock as it is now
+                    self._at = self._at[0] + back_s, self._at[1]
         self._older_since = math.inf
         self._base = message.child_frame_id.lstrip("/") or self._base
         self._odom = message.header.frame_id.lstrip("/") or self._odom
@@ -262,7 +267,9 @@ class Driver:
             self._become(self._agent.status)
             robot = self.config.robot
             limits = np.array([robot.max_speed_m_s, robot.max_speed_m_s, robot.max_turn_rate_rad_s])
-            return twist_message((limits * action).tolist())
+            twist = limits * action
+            fastest_m_s = float(np.abs(twist) @ (1.0, 1.0, robot.lever_m))  # of the wheels, as in the environment
+            return twist_message((twist / max(fastest_m_s / robot.max_speed_m_s, 1.0)).tolist())
         return twist_message(list(_STAND))
 
     def _belief_now(self) -> Belief:

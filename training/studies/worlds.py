@@ -115,7 +115,7 @@ def _line(name: str, rows: list[Row]) -> list[str]:
         name, str(len(rows)), str(sum(row["time_to_95_s"] is not None for row in rows)),
         str(sum(row["collisions"] for row in rows)), f"{statistics.median(ates):.2f} ({max(ates):.1f})",
         f"{statistics.median(nees):.2f}, {sum(v > _NEES_OVER_3 for v in nees)}",
-        f"{statistics.fmean(row['map_iou'] for row in rows):.3f}",
+        f"{statistics.fmean(row['map_iou'] or 0.0 for row in rows):.3f}",
         f"{sum(row['lost_s'] > _LOST_S for row in rows)}",
     ]  # fmt: skip
 

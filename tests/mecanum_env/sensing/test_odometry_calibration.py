@@ -99,6 +99,17 @@ def test_the_declared_v_is_the_measured_one(preset: str) -> None:
     assert all(0.7 < ratio < 1.2 for ratio in drift_ratios(drives, declared))
 
 
+def test_errors_that_last_add_up_over_the_same_time_whatever_the_step() -> None:
+    usual, short, long = (odometry_noise(ROBOT, NOISE_PRESETS["nominal"], step_s) for step_s in (0.1, 0.02, 2.0))
+    for share, white in (
+        ("speed_share", usual.white().speed_share),
+        ("turn_share_rad_m", usual.white().turn_share_rad_m),
+    ):
+        lasting = {v: getattr(v, share) ** 2 - white**2 for v in (usual, short, long)}
+        assert lasting[short] == pytest.approx(5.0 * lasting[usual])
+        assert lasting[long] == pytest.approx(lasting[usual] / 8.0)
+
+
 def test_the_lasting_errors_declared_are_those_that_are_drawn() -> None:
     noise = NOISE_PRESETS["slippery"]
     drawn = [WheelEncoders(ROBOT, noise, np.random.default_rng(seed)) for seed in range(1000)]

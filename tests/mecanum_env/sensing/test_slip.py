@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig
+from mecanum_env.config import NOISE_PRESETS, ROBOT_PRESETS, NoiseConfig, RobotConfig
 from mecanum_env.physics.robot import WheelTargets, inverse_kinematics
 from mecanum_env.physics.world import World
 from mecanum_env.sensing.calibration import odometry_noise
@@ -161,3 +161,23 @@ def test_what_slips_in_jerks_is_in_the_declared_covariance(name: str) -> None:
     for steps in (hard, ~hard):
         ratio = np.sum(errors[steps] ** 2, axis=0) / variances[steps].sum(axis=0)
         assert ratio.max() < 1.6, ratio
+
+
+def test_a_body_that_spins_fast_is_imagined_no_faster_than_it_is() -> None:
+    """12 cm long, at 20 rad/s on ice: to first order turns would stretch what friction does not take back."""
+    robot = RobotConfig(
+        length_m=0.12, width_m=0.1, mass_kg=0.25, wheel_radius_m=0.02, wheelbase_m=0.06, track_m=0.05,
+        motor_torque_nm=0.1, motor_gain=0.01, wheel_inertia_kg_m2=1e-5, wheel_friction=0.0, max_speed_m_s=3.0,
+        max_turn_rate_rad_s=20.0,
+    )  # fmt: skip
+    noise = NoiseConfig(friction=0.2, encoder=0.0, radius_error=0.0, base_error=0.0)
+    rng = np.random.default_rng(0)
+    encoders, world = WheelEncoders(robot, noise, rng), World(open_floor(), robot, noise, rng)
+    targets = WheelTargets(robot)
+    for step in range(200):
+        if step % 5 == 0:
+            action = rng.uniform(-1.0, 1.0, 4)
+        if math.hypot(*world.pose[:2]) > 6.0:
+            world.put([0.0, 0.0, 0.0])
+        world.step(targets.of_wheels(action), STEP, 0.02)
+        assert math.hypot(*encoders.odometry(world.wheel_readings, STEP, rng).twist[:2]) < 2.0

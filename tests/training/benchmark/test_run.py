@@ -92,6 +92,12 @@ def test_another_robot_or_lidar_is_what_explores_and_has_a_folder_of_its_own(
     assert "choose another --out" in refused(command, capsys)
     assert "valid: " in refused(small(tmp_path / "new", "--robot", "youbo"), capsys)
     assert not (tmp_path / "new").exists()
+    lidar.write_text('slam = "ekf"\n\n[run]\nseed = 3\n', "utf-8")
+    assert benchmark.BenchmarkPlan.parse(suite="rooms", agents="random", slam=None, config=lidar).backends == (
+        "ekf",
+    )
+    lidar.write_text("[run]\nagent = 3\n", "utf-8")
+    assert "[run] agent has the wrong type" in refused(small(tmp_path / "new", "--config", str(lidar)), capsys)
 
 
 @pytest.mark.usefixtures("here")

@@ -173,6 +173,8 @@ def test_no_pairs_and_no_ratio() -> None:
     assert math.isnan(compare([], [], [], lower_is_better=True).ratio.value)
     zero = compare([0.0, 0.0], [0.0, 0.0], ["a", "a"], lower_is_better=True)
     assert math.isnan(zero.ratio.value) and zero.difference.value == 0.0
+    beside = compare([0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 2.0, 2.0], ["a", "a", "b", "b"], lower_is_better=True)
+    assert beside.ratio.value == pytest.approx(0.5)
 
 
 def test_the_same_values_give_the_same_interval() -> None:

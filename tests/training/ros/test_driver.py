@@ -26,10 +26,10 @@ STAND = {"linear": {"x": 0.0, "y": 0.0}, "angular": {"z": 0.0}}
 class Drive:
     """A robot and its driver, a step every 0.1 s of a clock."""
 
-    def __init__(self, *, mount: Mount | None = None, **robot: Any) -> None:
+    def __init__(self, *, agent: str = "brisk-tour", mount: Mount | None = None, **robot: Any) -> None:
         self.said: list[str] = []
         self.robot, self.now_s = Robot(**robot), 0.0
-        self.driver = Driver(make_config(), "brisk-tour", mount=mount, log=self.said.append)
+        self.driver = Driver(make_config(), agent, mount=mount, log=self.said.append)
 
     def hear(self, *, scans: bool = True, odometry: bool = True) -> None:
         if odometry:
@@ -46,8 +46,8 @@ class Drive:
         return twist
 
 
-def begun(steps: int = 20) -> Drive:
-    drive = Drive()
+def begun(steps: int = 20, *, agent: str = "brisk-tour") -> Drive:
+    drive = Drive(agent=agent)
     drive.driver.hear_transforms(drive.robot.mount())
     for _ in range(steps):
         drive.step()
@@ -160,6 +160,25 @@ def test_a_clock_that_is_set_back_is_gone_on_by() -> None:
     assert drive.robot.info["position_error_m"] < 0.1
 
 
+@pytest.mark.parametrize("back_s", [0.35, 0.6, 5.0])
+def test_what_was_driven_while_a_clock_was_set_back_is_no_jump(back_s: float) -> None:
+    drive = begun(60)
+    drive.robot.clock_s -= back_s
+    for _ in range(30):
+        drive.step()
+    assert any("clock was set back" in text for text in drive.said) and not any("jump" in t for t in drive.said)
+    assert drive.robot.info["position_error_m"] < 0.02
+
+
+def test_no_wheel_is_asked_for_more_than_there_is() -> None:
+    drive = begun(20, agent="random")
+    robot = drive.driver.config.robot
+    for _ in range(50):
+        twist = drive.step()
+        along = abs(twist["linear"]["x"]) + abs(twist["linear"]["y"])
+        assert along + robot.lever_m * abs(twist["angular"]["z"]) <= robot.max_speed_m_s * (1.0 + 1e-9)
+
+
 def test_a_transform_that_is_none_hides_no_other() -> None:
     drive = Drive()
     message = drive.robot.mount()
@@ -185,8 +204,8 @@ def test_nobody_is_told_to_drive_before_it_has_begun() -> None:
     assert drive.step() is not None
     given = Drive(mount=Mount(0.2, 0.0, 0.0))
     assert given.step() is not None
-    beside = Drive(mount=Mount(0.2, 0.3, 0.0))
-    assert beside.step() is None and "0.30 m to the left" in beside.said[0]
+    with pytest.raises(ValueError, match="off the middle"):
+        Drive(mount=Mount(0.2, 0.3, 0.0))
 
 
 def test_a_scan_waits_for_the_odometry_of_its_time() -> None:

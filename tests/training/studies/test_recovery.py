@@ -76,6 +76,9 @@ def test_what_counts_as_recovered() -> None:
     assert not recovered(a_row(precision=0.9))
     found = sum_up([a_row(), a_row(recovered_s=None), {"possible": False}])
     assert (found["episodes"], found["impossible"], found["recovered"]) == (2, 1, 1)
+    assert not recovered(a_row(precision_before=0.99, precision=0.9)) and recovered(a_row(precision=None))
+    never = sum_up([a_row(recovered_s=0.8), a_row(recovered_s=None), a_row(recovered_s=21.0)])
+    assert (never["recovered_s_median"], never["recovered_s_max"]) == (None, 0.8)
     assert false_alarms([a_row(), a_row(lost=0)]) == {"hours": 1.0, "times_lost": 1, "in_10_hours": 10.0}
 
 

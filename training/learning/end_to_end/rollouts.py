@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -125,7 +126,8 @@ class _Scene(_Drive):
         self.maps: list[dict[str, Any]] = []
         self._maps_at = 0.0
         self._shake, self._shake_end = np.zeros(3), 0.0
-        self._shake_at = float(self.rng.exponential(_PAUSE_S))
+        first = float(self.rng.exponential(_PAUSE_S))
+        self._shake_at = first if self._lessons.shaken > 0.0 else math.inf
 
     def note_maps(self) -> None:
         """Keep a lesson on the maps, if one is due."""

@@ -45,7 +45,9 @@ def study(
     ] = "apartment",
     noise: Annotated[str, typer.Option(help="Noise preset.")] = "nominal",
     seeds: Seeds = "10000:10049",
-    max_steps: Annotated[int, typer.Option(min=1, max=1_000_000, help="Step limit.")] = 3000,
+    max_steps: Annotated[
+        int, typer.Option(min=1, max=1_000_000, help="Step limit of episodes without a fault.")
+    ] = 3000,
     workers: Workers = None,
     ray: Ray = None,
     out: Out = Path("out/recovery"),

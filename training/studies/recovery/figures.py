@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,19 +27,21 @@ def recovered(row: Row) -> bool:
 
 
 def _doubled(row: Row) -> bool:
-    return bool(row["precision"] < row["precision_before"] - _DOUBLED)
+    before, after = row["precision_before"], row["precision"]
+    return None not in (before, after) and bool(after < before - _DOUBLED)
 
 
 def sum_up(rows: Sequence[Row]) -> dict[str, Any]:
     """Return the figures of the episodes with one fault."""
     done = [row for row in rows if row["possible"]]
-    times = [row["recovered_s"] for row in done if row["recovered_s"] is not None]
+    times = [row["recovered_s"] for row in done if recovered(row)]
+    median = statistics.median(times + [math.inf] * (len(done) - len(times))) if done else math.inf
     return {
         "episodes": len(done),
         "impossible": len(rows) - len(done),
         "recovered": sum(map(recovered, done)),
-        "recovered_s_median": statistics.median(times) if times else None,
-        "recovered_s_max": max(times) if times else None,
+        "recovered_s_median": median if math.isfinite(median) else None,  # those that never were count as late
+        "recovered_s_max": max(times, default=None),  # of those that were
         "doubled_walls": sum(map(_doubled, done)),
         "error_m_max_median": statistics.median(row["worst_m"] for row in done) if done else None,
         "relocalisations": sum(row["found"] for row in done),
