@@ -25,6 +25,7 @@ __all__ = ["LOST", "Driver", "DriverConfig"]
 
 LOST = 0.1  # health of a belief below which it is no good for driving
 _SAME_SHARE = 0.2  # of the lidar's reach, within which pieces of frontier may be the same
+_NARROW_DEG = 90.0  # field of view below which a robot without a way turns round before it gives up
 _LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
@@ -64,6 +65,9 @@ class Driver(Agent):
         self._anchor = (0.0, 0.0, 0.0)  # pose [m, m, rad] from which it has to get away in time
         self._anchored_at = 0.0
         self._lost_for = 0.0
+        # Of a wedge of free space no cell may be far enough from the unknown to be driven to.
+        self._circle_rad = 2.0 * math.pi if self._lidar.field_of_view_deg < _NARROW_DEG else 0.0
+        self._to_turn_rad, self._turning = self._circle_rad, False
         # What a short-sighted robot sees beside the piece that it has looked at is another.
         same_m = min(self.config.patience.same_m, _SAME_SHARE * self._lidar.range_max_m)
         self._troubles = Troubles(0.6 * same_m)
@@ -89,7 +93,8 @@ class Driver(Agent):
             self._status = "giving way"
             return self._to_action(self._follower.follow(observation, belief))
         if self._due(belief):
-            had_one = self._goal is not None
+            had_one = self._goal is not None and not self._turning
+            self._turning = False
             self._goal = self.choose(belief)
             if had_one:
                 self._had_one_at = self._time
@@ -99,12 +104,17 @@ class Driver(Agent):
                 all_round = self._lidar.field_of_view_deg >= 360.0
                 self._follower.set_path(self._goal.path, None if all_round else float(self._goal.pose[2]))
         self._time += self._step_s
+        if self._goal is None and self._status == "unreachable" and self._to_turn_rad > 0.0:
+            self._turning = True
+        if self._turning:
+            return self._turn(observation, belief)
         if self._goal is None:
             if self._status == "unreachable" and self._time < self._had_one_at + _LOOK_S:
                 self._status = "looking"
             self._follower.reset()
             self._anchored_at = self._time
             return np.zeros(3, dtype=np.float32)
+        self._to_turn_rad = self._circle_rad
         if self._time < self._recover_until:
             self._status = "recovering"
             twist = self._back_off(observation, belief)
@@ -151,6 +161,17 @@ class Driver(Agent):
             self._follower.stand()
             return np.zeros(3, dtype=np.float32)
         return self._to_action(self._follower.creep(observation, belief))
+
+    def _turn(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:
+        """Turn on the spot, for a robot that sees little at a time to see what is around it."""
+        self._status = "looking"
+        self._anchored_at = self._time
+        turn = 0.5 * self._robot.max_turn_rate_rad_s
+        self._to_turn_rad -= turn * self._step_s
+        self._turning = self._to_turn_rad > 0.0
+        pose = np.array(belief.pose, dtype=np.float64)
+        self._goal = Goal(pose=pose, path=pose[None, :2]) if self._turning else None
+        return self._to_action(self._follower.drive(np.zeros(2), turn, observation, belief))
 
     def _due(self, belief: Belief) -> bool:
         patience = self.config.patience

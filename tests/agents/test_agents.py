@@ -418,3 +418,18 @@ def test_who_weighs_no_ways_goes_where_it_can_all_the_same(name):
     for _ in range(150):
         observation, *_ = env.step(agent.act(observation, env.belief))
     assert env.truth.record.path_length_m > 2.0
+
+
+def test_who_sees_a_wedge_turns_round_before_it_gives_up():
+    """Where all that was seen is too near to the unknown to be driven to, the way on is beside or behind."""
+    env = ExploreEnv(rooms="rectangular", lidar={"field_of_view_deg": 20.0, "beams": 20})
+    observation, _ = env.reset(seed=1)
+    agent = agents.make("nearest-frontier", lidar=env.config.lidar)
+    agent.reset(env.belief)
+    idle, coverage = 0, 0.0
+    for _ in range(600):
+        observation, _, terminated, _, info = env.step(agent.act(observation, env.belief))
+        idle, coverage = idle + 1 if agent.goal is None else 0, info["coverage"]
+        if terminated or idle > 20:
+            break
+    assert coverage >= 0.95
