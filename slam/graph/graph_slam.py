@@ -186,12 +186,12 @@ class GraphSlam(SurfaceBackend):
 
     def _information(self, found: Alignment, seen: Links) -> Array:
         """Return what a scan tells ``(3, 3)`` of its pose on the patches as they are, in the body's directions."""
-        frames = self.atlas.window.frames[seen.patches]
-        info = np.zeros((3, 3))
-        for frame, h in zip(frames, seen.info, strict=True):
-            turn = about_z(float(found.pose[2] - frame[2]))
-            info += turn.T @ h @ turn
-        return info
+        turns = found.pose[2] - self.atlas.window.frames[seen.patches, 2]
+        turn = np.zeros((len(turns), 3, 3))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(turns)
+        turn[:, 1, 0] = np.sin(turns)
+        turn[:, 0, 1], turn[:, 2, 2] = -turn[:, 1, 0], 1.0
+        return np.asarray((turn.transpose(0, 2, 1) @ seen.info @ turn).sum(axis=0), np.float64)
 
     def _learn(self, found: Alignment, info: Array) -> None:
         """Learn what lasts of the odometry's errors, by what a scan made of the last motion."""

@@ -13,11 +13,14 @@ calibration, localization, and mapping"). That c is correlated with pose and map
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 from slam.gaussian.wheel_errors import WheelErrors
 from slam.geometry import symmetric
-from slam.motion import OdometryNoise, Twist, jacobians, predict_robot
+from slam.motion import OdometryNoise, Twist, predict_robot
 from slam.types import Array
 
 __all__ = ["LastingStates", "Motion"]
@@ -44,9 +47,7 @@ class Motion:
 
     def add(self, twist: Twist, by: Array, dt: float, var_v: float, var_w: float) -> None:
         """Go on by a twist, its Jacobian ``by`` ``(3, 7)`` and the variances of its speed and turn rate."""
-        fx, fu = jacobians(self.mean, np.array(twist), dt)
-        self.by = fx @ self.by + fu @ by
-        predict_robot(self.mean, self._upper, 3, *twist, dt, var_v, var_w)
+        _add(self.mean, self._upper, self.by, *twist, by, dt, var_v, var_w)
 
     def doubt(self, cov: Array) -> None:
         """Add to the covariance ``(3, 3)``."""
@@ -96,8 +97,32 @@ class LastingStates:
         change : Array
             ``(3,)`` by which the scan has moved its mean.
         """
-        if not self.unknown or float(change @ np.linalg.solve(prior_cov, change)) > _GATE:
-            return
-        gain = np.linalg.solve(prior_cov, motion.by @ self.cov).T
-        self.mean = self.mean + gain @ change
-        self.cov = symmetric(self.cov + gain @ (cov - prior_cov) @ gain.T)
+        if self.unknown:
+            _learn(self.mean, self.cov, motion.by, prior_cov, change, cov)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add(
+    mean: Array, upper: Array, by: Array, vx: float, vy: float, omega: float, twist_by: Array, dt: float,
+    var_v: float, var_w: float,
+) -> None:  # fmt: skip
+    """Predict a motion, and D ← Fx D + Fu B, B being ``twist_by``."""
+    before_x, before_y, middle = mean[0], mean[1], mean[2] + 0.5 * omega * dt
+    predict_robot(mean, upper, 3, vx, vy, omega, dt, var_v, var_w)
+    # Fx's entries by θ are J times the step, Fu's a rotation by the heading half way and half of Fx's.
+    fx, fy = -(mean[1] - before_y), mean[0] - before_x
+    c, s = math.cos(middle) * dt, math.sin(middle) * dt
+    for i in range(by.shape[1]):
+        by[0, i] += fx * (by[2, i] + 0.5 * dt * twist_by[2, i]) + c * twist_by[0, i] - s * twist_by[1, i]
+        by[1, i] += fy * (by[2, i] + 0.5 * dt * twist_by[2, i]) + s * twist_by[0, i] + c * twist_by[1, i]
+        by[2, i] += dt * twist_by[2, i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _learn(mean: Array, c_cov: Array, by: Array, prior_cov: Array, change: Array, cov: Array) -> None:
+    info = np.linalg.inv(prior_cov)
+    if change @ (info @ change) > _GATE:
+        return
+    gain = c_cov @ by.T @ info
+    mean += gain @ change
+    c_cov += gain @ (cov - prior_cov) @ gain.T
