@@ -8,6 +8,7 @@ import pytest
 import agents
 from agents.nearest_frontier import NearestFrontier
 from mecanum_env.config import RobotConfig
+from mecanum_env.env import ExploreEnv
 from slam.grids.occupancy import FREE, UNKNOWN
 from tests.agents.grids import belief_of, drive, fill, half_known, room, two_rooms
 
@@ -217,3 +218,14 @@ def test_a_robot_does_not_go_to_and_fro_between_two_goals_for_ever(doubts, ends)
     agent = Fickle({"frontiers": SHORT, "patience": {"doubts": doubts, "looks": 1}})
     driven(agent, classes, pose, 1200)
     assert (agent.goal is None) is ends
+
+
+@pytest.mark.parametrize("name", ["cost-utility", "coordinated"])
+def test_who_weighs_no_ways_goes_where_it_can_all_the_same(name):
+    env = ExploreEnv(rooms="apartment")
+    observation, _ = env.reset(seed=1)
+    agent = agents.make(name, config={"beta_m2_m": 0.0})
+    agent.reset(env.belief)
+    for _ in range(150):
+        observation, *_ = env.step(agent.act(observation, env.belief))
+    assert env.truth.record.path_length_m > 2.0

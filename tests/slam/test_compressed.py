@@ -270,7 +270,7 @@ def test_rooms_are_explored_as_by_the_whole_filter_however_unsure_the_start(carr
     regional.reset(seed=2)
     agent, far = agents.make("brisk-tour"), 0
     agent.reset(whole.belief, 0)
-    for k in range(600):
+    for k in range(800):
         if carried_off and k == 250:
             assert all(FAULTS["teleport"]().begin(env, np.random.default_rng(0)) for env in (whole, regional))
         action = agent.act(observation, whole.belief)

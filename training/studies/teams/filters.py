@@ -105,7 +105,8 @@ def explore(job: Job) -> dict[str, dict[str, Any]]:
     team.reset(guess, covs)
     filters: dict[str, list[Backend]] = {TEAM: list(team.members)}
     for name in SINGLE:
-        filters[name] = [slam.make(name, config=settings(name)) for _ in robots]
+        told = settings(name) | ({"wheel_states": False} if name == "ekf-lines" else {})  # a team has none, either
+        filters[name] = [slam.make(name, config=told) for _ in robots]
         for backend, pose, cov in zip(filters[name], guess, covs, strict=True):
             backend.reset(pose, pose_cov=cov)
     true: list[list[Array]] = [[] for _ in robots]
