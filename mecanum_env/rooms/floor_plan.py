@@ -116,7 +116,8 @@ class FloorPlan:
         """True corner points ``(n, 2)`` [m]: where free space bends by more than 5°.
 
         They are end points of surfaces. One that is hidden (a cupboard's back corner in a room's corner) or
-        where the surface goes on straight (two cupboards side by side) is no corner.
+        where the surface goes on straight (two cupboards side by side) is no corner. Obstacles that reach into a
+        wall or one another have corners where they end, not where they are seen to: let them touch.
         """
         return self._corners_and_kinds[0]
 
