@@ -55,6 +55,6 @@ def drive(
     pose: NDArray[np.float64], twist: NDArray[np.float64], sigmas: tuple[float, float],
     rng: np.random.Generator, dt: float = 0.1,
 ) -> tuple[NDArray[np.float64], Odometry]:  # fmt: skip
-    """Move truly by ``twist``; return the new pose and the noisy odometry."""
+    """Move truly by ``twist``; return the new pose and the noisy odometry of wheels that do not slip."""
     noise = rng.standard_normal(3) * np.array([sigmas[0], sigmas[0], sigmas[1]])
-    return compose(pose, exp(twist * dt)), Odometry(twist + noise, dt)
+    return compose(pose, exp(twist * dt)), Odometry(twist + noise, dt, (0.0, 0.0))
