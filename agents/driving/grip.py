@@ -101,8 +101,8 @@ class GentleFollower(PathFollower):
     _sent = (np.zeros(2), 0.0)
 
     def stand(self) -> None:
-        """Take it that the robot stands still."""
-        self.reset()
+        """Take note that the robot was told to stand; the path stays."""
+        super().stand()
         self._sent = (np.zeros(2), 0.0)
 
     def brake(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:

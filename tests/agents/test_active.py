@@ -157,6 +157,19 @@ def test_it_rolls_out_when_all_is_explored():
     assert speeds[-1] == 0.0 and np.diff(speeds).min() > -2.05 * 0.1
 
 
+def test_lost_on_its_way_it_keeps_the_way():
+    half = belief_of(half_known(), (1.5, 2.0, 0.0))
+    agent = ready(half, **GO)
+    for _ in range(12):
+        agent.act(None, half)
+    path = agent._follower._path.copy()
+    assert len(path) > 1
+    for _ in range(10):
+        assert not agent.act(None, replace(half, health=0.0)).any()
+    np.testing.assert_array_equal(agent._follower._path, path)
+    assert agent._follower.speed_m_s == 0.0
+
+
 def test_lost_with_nothing_to_go_to_it_creeps():
     done = belief_of(room(8.0, 4.0), (1.5, 2.0, 0.0))
     agent = ready(done, **GO)
