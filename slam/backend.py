@@ -42,8 +42,8 @@ class BackendConfig(Config):
     health: HealthConfig = field(default_factory=HealthConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     # Of the start pose where none is given: never exactly zero.
-    start_sigma_m: Annotated[float, Within("[1e-9, 10]")] = 1e-4
-    start_sigma_rad: Annotated[float, Within("[1e-9, 10]")] = 1e-4
+    start_sigma_m: Annotated[float, Within("[1e-9, 10]")] = 1e-6  # a map begins where its robot does
+    start_sigma_rad: Annotated[float, Within("[1e-9, 10]")] = 1e-6
 
 
 class Backend(abc.ABC):

@@ -135,7 +135,7 @@ class Team:
                 start_error=sigmas * drawn[k], step_limit=self.max_steps,
             )  # fmt: skip
         if self.joint is not None:
-            exact = np.diag(np.full(3, 1e-8))
+            exact = np.diag(np.full(3, 1e-12))
             covs = [exact if member.start_cov is None else member.start_cov for member in self.members]
             self.joint.reset([member.start for member in self.members], covs, seed)
         self.ground: GroundTruth = first.truth.ground

@@ -34,7 +34,6 @@ from slam.features.surfaces import (
     VAR_OFFSET,
     VAR_SLOPE,
     R,
-    add_hidden,
 )
 from slam.types import CONCAVE, CONVEX, LINE, Array
 
@@ -235,17 +234,15 @@ def _past_the_end(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def walls_first(
-    lines: Array, corners: Array, limits: Array, length: float, points: float, lasting: float, sigma_r: float,
-    sigma_alpha: float, out: Array,
+    lines: Array, corners: Array, limits: Array, length: float, points: float, sigma_r: float, sigma_alpha: float,
+    out: Array,
 ) -> int:  # fmt: skip
     """Write the rows of :meth:`FeatureExtractor.with_walls`; return their number."""
-    near = max(limits[SPLIT_SIGMAS] * limits[SIGMA], limits[SPLIT_FLOOR])
     count = 0
     for k in range(lines.shape[0]):
         line, row = lines[k], out[count]
         if not _is_wall(line, length, points):
             continue
-        add_hidden(line, near, lasting - 1.0)
         middle = line[NX] * line[MY] - line[NY] * line[MX]  # of the centroid along the line, from its foot
         # A slope turns the normal back by as much: δα = −slope, δr = offset − middle · slope.
         row[0], row[1] = line[R], math.atan2(line[NY], line[NX])

@@ -57,7 +57,6 @@ class FeatureConfig(Config):
     wall_points: Count = 5
     # What a fit does not see of a wall (chamfers, ledges) shifts it by the same in some scans, those past a door's
     # jamb. As noise of each it counts for so much more, and adds up to no less.
-    wall_lasting_scans: Annotated[float, Within("[1, 1e6]")] = 4.0
     # Of a wall's curvature (slam.landmarks.curved_walls): the probability that it has one, 1σ of it where it has,
     # and the share by which it changes along the wall. Chosen in caves of the training seeds 100-115.
     wall_curved_share: Annotated[float, Within("[0, 1)")] = 0.25
@@ -134,7 +133,7 @@ class FeatureExtractor:
         c = self.config
         count = walls_first(
             self._lines[: self._line_count], self._corners[: self._corner_count], self._limits, c.wall_length_m,
-            c.wall_points, c.wall_lasting_scans, c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
+            c.wall_points, c.wall_sigma_m, c.wall_sigma_rad, self._walls_and_corners,
         )  # fmt: skip
         return self._walls_and_corners[:count]
 

@@ -12,7 +12,7 @@ from slam.types import Array, Indices
 MAX_LINES = 128
 GRAZING = 0.003  # c² that beams along a surface count as at least: bearings are not as exact as that
 _OUTLIER = 4.0  # σ along the beam by which a point may be off the line that it is fitted to
-HIDDEN = 0.25  # 1σ of that shift; see :func:`add_hidden`
+HIDDEN = 0.25  # 1σ of that shift; see :func:`_add_hidden`
 _STEPS = 2  # of Gauss-Newton: the second takes its points by the line of the first
 MAX_STEP = 4  # beams; neighbours farther apart than this, the ones between lost, are not joined
 
@@ -200,21 +200,21 @@ def fit(xy: Array, first: int, last: int, limits: Array, line: Array) -> bool:
     length = t1 - t0
     if length < limits[MIN_LENGTH]:
         return False
-    add_hidden(line, near, 1.0)
+    _add_hidden(line, near)
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def add_hidden(line: Array, near: float, times: float) -> None:
-    """Add to a line's variances, so many times, what the splitting did not see.
+def _add_hidden(line: Array, near: float) -> None:
+    """Add to a line's variances what the splitting did not see.
 
     What departs by less than ``near`` [m] (a ledge, a chamfer, a neighbour's last points) was not told apart. If
     it is as long as it is high, it shifts the line the more, the shorter that is.
     """
     length = line[T1] - line[T0]
     hidden = HIDDEN * near * near / length
-    line[VAR_OFFSET] += times * hidden * hidden
-    line[VAR_SLOPE] += times * 12.0 * hidden * hidden / (length * length)
+    line[VAR_OFFSET] += hidden * hidden
+    line[VAR_SLOPE] += 12.0 * hidden * hidden / (length * length)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

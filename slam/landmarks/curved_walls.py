@@ -28,10 +28,10 @@ _KAPPA, _VAR_KAPPA = 10, 11  # columns of an observation row
 
 
 def curvature_model(config: FeatureConfig) -> Array:
-    """Return what :func:`straighten` takes of a config ``(4,)``: odds, 1/τ², share, scans."""
+    """Return what :func:`straighten` takes of a config ``(3,)``: odds, 1/τ², share."""
     share = config.wall_curved_share
     odds = share / max(1.0 - share, 1e-12)
-    return np.array([odds, config.wall_curvature_sigma**-2, config.wall_shape_share, config.wall_lasting_scans])
+    return np.array([odds, config.wall_curvature_sigma**-2, config.wall_shape_share])
 
 
 def first_bend(along: float, z: Array) -> tuple[float, float, float]:
@@ -76,9 +76,9 @@ def straighten(x: Array, offset: float, z: Array, match: Indices, marks: Array, 
 
         φ ← φ + κΔ,  d ← d cos κΔ + t sin κΔ − κΔ²/2
 
-    The slope's variance grows by N (σκ² Δ² + κ² q² (l² + Δ²)): along the wall κ changes by a share q, and none of
-    this is noise of one scan, but lasts over N. The offset's grows by as much times l²/12 + Δ²/4. That κΔ changes
-    with the pose, too, is left out of the Jacobian: a pose is known to centimetres, and κ is 0.1/m.
+    The slope's variance grows by σκ² Δ² + κ² q² (l² + Δ²): along the wall κ changes by a share q. The offset's
+    grows by as much times l²/12 + Δ²/4. That κΔ changes with the pose, too, is left out of the Jacobian: a pose is
+    known to centimetres, and κ is 0.1/m.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def straighten(x: Array, offset: float, z: Array, match: Indices, marks: Array, 
         row[0] = row[0] * math.cos(turn) + middle * math.sin(turn) - 0.5 * turn * beyond
         row[1] += turn
         length2, beyond2 = (row[9] - row[8]) ** 2, beyond * beyond
-        slope = model[3] * (var * beyond2 + square * model[2] ** 2 * (length2 + beyond2))
+        slope = var * beyond2 + square * model[2] ** 2 * (length2 + beyond2)
         row[2] += slope * (length2 / 12.0 + beyond2 / 4.0 + middle * middle)
         row[3] += slope * middle
         row[4] += slope

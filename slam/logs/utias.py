@@ -49,6 +49,7 @@ _ODOMETRY = {
 _LASTING = {"difference_sigma": 0.015, "lever_sigma": 0.04, "white_turn_share_rad_m": 2.8}
 SETTINGS = {
     "lidar_offset_m": 0.0,
+    "start_sigma_m": 1e-4,
     "start_sigma_rad": 0.01,  # Vicon's: 0.005 to 0.02 rad, by the heading
     "association": "nearest",
     "known_gate": 18.4,  # 99.99 %: a few bar codes were misread

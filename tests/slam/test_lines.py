@@ -100,7 +100,7 @@ def test_a_wall_s_covariance_is_the_noise_s() -> None:
     """Distance and bearing of the four walls over 400 noisy scans from one place, normalised."""
     rng = np.random.default_rng(1)
     pose = np.array([2.0, 1.7, 0.4])
-    extractor = FeatureExtractor(FeatureConfig(wall_lasting_scans=1.0))  # of noise, nothing lasts
+    extractor = FeatureExtractor(FeatureConfig())
     floors = np.diag([extractor.config.wall_sigma_m**2, extractor.config.wall_sigma_rad**2])
     errors = []
     for _ in range(400):

@@ -254,8 +254,7 @@ def test_noise_neither_turns_nor_moves_the_walls_of_a_closet() -> None:
     rng = np.random.default_rng(2)
     size, sigma = np.array([2.4, 1.6]), 0.03
     closet = size * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    # Of each look by itself, each from another place: nothing lasts.
-    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma, wall_lasting_scans=1.0))
+    extractor = FeatureExtractor(FeatureConfig(range_sigma_m=sigma))
     errors, nees = [], []
     for _ in range(600):
         pose = np.array([*(size * rng.uniform(0.2, 0.8, 2)), rng.uniform(-3, 3)])

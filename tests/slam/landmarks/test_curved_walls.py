@@ -37,7 +37,7 @@ def round_room(pose: np.ndarray, radius: float, rng: np.random.Generator, *, ins
 @pytest.mark.parametrize("aside", [0.0, 1.2])  # looked at from the front and at an angle
 def test_curvature_is_measured_with_the_variance_that_it_says(inside: bool, aside: float) -> None:
     rng, radius = np.random.default_rng(3), 25.0
-    extractor = FeatureExtractor(FeatureConfig(wall_lasting_scans=1.0))
+    extractor = FeatureExtractor(FeatureConfig())
     pose = np.array([radius + (-2.0 if inside else 2.0), aside, 0.0 if inside else math.pi])
     errors = []
     for _ in range(300):
@@ -105,7 +105,7 @@ def test_what_is_not_known_of_a_wall_s_shape_goes_along_its_slope_and_offset() -
     marks[0, 8:11] = first_bend(along - 0.5, z[0])
     straighten(x, OFFSET, z, np.zeros(1, np.int64), marks, curvature_model(config))
     _, var, square = curvature(2 / 0.05**2, 2 * 0.08 / 0.05**2, curvature_model(config))
-    slope = config.wall_lasting_scans * (var * 0.25 + square * config.wall_shape_share**2 * (1.6**2 + 0.25))
+    slope = var * 0.25 + square * config.wall_shape_share**2 * (1.6**2 + 0.25)
     across = z[0, 2] - before[2] - 0.2**2 * slope  # at the middle, 0.2 m from the foot
     np.testing.assert_allclose(z[0, 3:5] - before[3:5], [0.2 * slope, slope])
     assert across == pytest.approx(slope * (1.6**2 / 12 + 0.25 / 4))
