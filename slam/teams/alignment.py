@@ -64,8 +64,6 @@ class Alignment:
     cov: Array  # (3, 3) in ordinary coordinates
     points: Pairs  # (k, 2) rows of the corners in a and b that are the same
     walls: Pairs  # (m, 2) the same of walls
-    chi_square: float  # of all matches together …
-    dof: int  # … and its degrees of freedom
     rival: float  # matches that the next best explains, as a share
     contradicted: float  # share of walls in the other's free space; nan without grids
 
@@ -117,7 +115,7 @@ def align(
     fit = found[0]
     return Alignment(
         a=a.robot, b=b.robot, pose=fit.pose, cov=fit.joint.cov[-3:, -3:], points=fit.points, walls=fit.walls,
-        chi_square=fit.joint.chi_square, dof=fit.joint.dof, rival=rival, contradicted=fit.contradicted,
+        rival=rival, contradicted=fit.contradicted,
     )  # fmt: skip
 
 

@@ -30,7 +30,6 @@ class MergedMap:
     """What several robots know together, in one frame: the first account's, or that in which frames were given."""
 
     robots: tuple[int, ...]  # N
-    stamps: tuple[float, ...]  # [s] of their accounts
     frames: Array  # (N, 3) poses of the robots' own frames
     frame_covs: Array  # (N, 3, 3)
     poses: Array  # (N, 3) of the robots
@@ -152,7 +151,7 @@ def _merged(accounts: Sequence[Account], joint: Joint, clusters: Sequence[list[M
     values = mean[3 * count :].reshape(-1, 2)
     blocks = [cov[a : a + 2, a : a + 2] for a in range(3 * count, 3 * count + 2 * len(points), 2)]
     return MergedMap(
-        robots=tuple(a.robot for a in accounts), stamps=tuple(a.stamp for a in accounts), frames=joint.frames,
+        robots=tuple(a.robot for a in accounts), frames=joint.frames,
         frame_covs=np.array([joint.cov[a : a + 3, a : a + 3] for a in range(s, s + 3 * count, 3)]),
         poses=mean[: 3 * count].reshape(-1, 3),
         pose_covs=np.array([cov[a : a + 3, a : a + 3] for a in range(0, 3 * count, 3)]),

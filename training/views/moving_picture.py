@@ -15,12 +15,15 @@ import typer
 from numpy.typing import NDArray
 
 from training.episodes import explore
-from training.runs.errors import BadInput, Interrupted, check_writable
+from training.runs.errors import Interrupted, check_writable
 from training.runs.options import Seed
 from training.views.film import Camera, check_video, film
 
 __all__ = ["moving_picture", "study"]
 
+_SPEED = 4  # times as fast as true
+_WIDTH = 800  # pixels, even: colours are kept for two
+_UNTIL = 0.97  # coverage
 _STOPS_S = 2.5  # shown at the end before it begins anew
 # One palette for all frames; without dithering what does not move costs nothing.
 _FILTER = (
@@ -28,18 +31,18 @@ _FILTER = (
 )
 
 
-def moving_picture(episode: explore.Episode, path: Path, *, speed: int, width: int, until: float) -> int:
-    """Write an animated GIF of an episode until its coverage is ``until``; return the number of frames."""
+def moving_picture(episode: explore.Episode, path: Path) -> int:
+    """Write an animated GIF of an episode until it has explored nearly all; return the number of frames."""
     frames: list[NDArray[np.uint8]] = []
 
     def keep(frame: NDArray[np.uint8]) -> None:
-        height = 2 * round(width * frame.shape[0] / frame.shape[1] / 2)
-        frames.append(np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), np.uint8))
+        height = 2 * round(_WIDTH * frame.shape[0] / frame.shape[1] / 2)
+        frames.append(np.asarray(cv2.resize(frame, (_WIDTH, height), interpolation=cv2.INTER_AREA), np.uint8))
 
-    camera = Camera(keep, speed=speed)
+    camera = Camera(keep, speed=_SPEED)
 
     def stop_there(*, coverage: float, time_s: float, steps: int, max_steps: int) -> None:
-        if coverage >= until:
+        if coverage >= _UNTIL:
             raise _Enough
 
     with suppress(_Enough):
@@ -62,17 +65,12 @@ def study(
     agent: Annotated[str, typer.Option(help="Who explores.")] = "brisk-tour",
     rooms: Annotated[str, typer.Option(help="Generator of the rooms.")] = "apartment",
     seed: Seed = 4,
-    speed: Annotated[int, typer.Option(min=1, max=100, help="Times as fast as true.")] = 4,
-    width: Annotated[int, typer.Option(min=16, max=4096, help="Of the picture [pixels].")] = 800,
-    until: Annotated[float, typer.Option(min=0, max=1, help="Coverage at which it ends.")] = 0.97,
     out: Annotated[Path, typer.Option(metavar="FILE.gif")] = Path("out/explore.gif"),
 ) -> None:
     """Make the README's moving picture of one episode."""
-    if width % 2:
-        raise BadInput(f"--width {width} is odd; give {width - 1} or {width + 1}: colours are kept for two pixels")
     check_video()
     check_writable(out.parent, [out.name])
     episode = explore.prepare(out=out.parent, agent=agent, rooms=rooms, seed=seed)
     out.parent.mkdir(parents=True, exist_ok=True)
-    count = moving_picture(episode, out, speed=speed, width=width, until=until)
+    count = moving_picture(episode, out)
     print(f"{out}: {count} frames, {out.stat().st_size / 1e6:.1f} MB")

@@ -29,7 +29,7 @@ def tied(i: int, j: int, robots: int = 3) -> Alignment:
     walls = np.column_stack([np.arange(8), np.arange(8)])
     pose = compose(compose(inverse(FRAMES[i]), FRAMES[j]), np.array([0.1, -0.1, 0.03]))  # a first guess
     return Alignment(
-        a=i, b=j, pose=pose, cov=np.eye(3), points=points, walls=walls, chi_square=0.0, dof=1, rival=0.0,
+        a=i, b=j, pose=pose, cov=np.eye(3), points=points, walls=walls, rival=0.0,
         contradicted=0.0,
     )  # fmt: skip
 
