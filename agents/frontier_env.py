@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Annotated, Any, SupportsIndex, cast
 
@@ -204,13 +205,15 @@ class ExploreFrontierEnv(ChoiceEnv):
         self._take(k)
         config, agent = self.config, self.agent
         patience = math.ceil(_DONE_AFTER_S / config.step_s)
-        total, weight, steps, idle = 0.0, 1.0, 0, 0
+        terms: defaultdict[str, float] = defaultdict(float)
+        weight, steps, idle = 1.0, 0, 0
         belief = self.base.outline
         while True:
             act = agent.act(self._seen, belief)
             self.base.planned_path = None if agent.goal is None else agent.goal.path
-            self._seen, reward, terminated, truncated, info = self._limited.step(act)
-            total += weight * float(reward)
+            self._seen, _, terminated, truncated, info = self._limited.step(act)
+            for name, term in info["reward_terms"].items():
+                terms[name] += weight * term
             weight *= self.discount
             steps += 1
             idle = idle + 1 if agent.goal is None and agent.status != "lost" else 0
@@ -230,6 +233,7 @@ class ExploreFrontierEnv(ChoiceEnv):
             # Whoever learns estimates from the last observation what would have followed: it shows what there is
             # to choose, though no choice is due.
             self._choice = agent.survey(self.base.belief)
+        info["reward_terms"] = dict(terms)
         info["duration_s"] = steps * config.step_s
         self._decisions += 1
         last = self._most_decisions is not None and self._decisions >= self._most_decisions
@@ -239,7 +243,7 @@ class ExploreFrontierEnv(ChoiceEnv):
             info["end"] = "covered" if covered else "time" if truncated or not terminated else given_up
             info.setdefault("is_success", False)
             info.setdefault("episode_metrics", self.base.episode_metrics())
-        return self._observed(), total, bool(terminated), bool(truncated), info
+        return self._observed(), sum(terms.values()), bool(terminated), bool(truncated), info
 
     def render(self) -> Any:
         """Return truth beside belief as an RGB image ``(h, w, 3)``; with ``"human"`` None: it is shown already."""

@@ -68,10 +68,16 @@ def make_config(
         with argument("config"):
             base = from_mapping(EnvConfig, config)
     changes: dict[str, Any] = {}
-    if isinstance(robot, str) and robot in ROBOT_PRESETS:
+    preset = robot.get("preset") if isinstance(robot, Mapping) else robot
+    if isinstance(preset, str) and preset in ROBOT_PRESETS:
         given_parts = config if isinstance(config, Mapping) else {}
-        lidar = robot if lidar is None and "lidar" not in given_parts else lidar
-        noise = robot if noise is None and "noise" not in given_parts else noise
+        lidar = preset if lidar is None and "lidar" not in given_parts else lidar
+        noise = preset if noise is None and "noise" not in given_parts else noise
+    require(
+        rooms is None or floor_plan is None, "rooms and floor_plan are two places to explore; give one of them"
+    )
+    if rooms is not None:
+        changes["floor_plan"] = None
     for name, given in (("rooms", rooms), ("slam", slam), ("odometry_filter", odometry_filter)):
         if isinstance(given, Mapping):
             options = dict(given)

@@ -141,7 +141,8 @@ class NoiseConfig(Config):
     radius_error: Annotated[float, Within("[0, 1)")] = 0.01
     # Largest relative error of the lever l, drawn per episode.
     base_error: Annotated[float, Within("[0, 1)")] = 0.01
-    slip: Annotated[float, Within("[0, 1)")] = 0.0  # mean share of the commanded motion that is lost at random
+    # Mean share of the commanded motion that is lost at random: up to twice as much at a time.
+    slip: Annotated[float, Within("[0, 0.5]")] = 0.0
     friction: Annotated[float, Within("[0.01, 2]")] = 0.6  # μ of the floor
     # μ of the slippery patches, drawn per patch.
     patch_friction: Annotated[tuple[float, float], Span("[0.01, 2]")] = (0.15, 0.3)
@@ -194,6 +195,11 @@ class EnvConfig(Config):
         require(
             abs(substeps - round(substeps)) < 1e-6,
             f"EnvConfig.step_s must be a multiple of physics_step_s, {self.physics_step_s}, got {self.step_s}",
+        )
+        require(
+            abs(self.lidar.offset_m) <= 0.5 * self.robot.length_m,
+            f"lidar.offset_m must be at most half of robot.length_m, {0.5 * self.robot.length_m:g}: from beyond "
+            f"its body a robot looks through walls; got {self.lidar.offset_m:g}",
         )
         for name in ("rooms_config", "slam_config", "odometry_filter_config"):
             object.__setattr__(self, name, _plain(getattr(self, name)))

@@ -18,7 +18,7 @@ from slam.types import Array, Flags, Indices, Scan
 
 __all__ = ["Coverage", "GroundTruth"]
 
-_VIEW_SPACING_M = 0.8  # side of the squares in each of which visibility is computed: a quarter finds 0.3 % more
+_VIEW_SPACING_M = 0.8  # side of squares, or less: from one cell in each all is seen. A quarter finds 0.3 % more
 _VIEW_BEAMS = 360
 _MOST_CELLS = 30_000_000  # of the rasters: some 70 bytes each while they are made
 
@@ -77,12 +77,13 @@ class GroundTruth:
         """Map the plan without noise from all over the places that the robot's body can reach."""
         plan = self.plan
         here = plan.reachable(robot.inscribed_radius_m, self.start)
-        cells = _one_a_block(here, max(round(_VIEW_SPACING_M / plan.resolution), 1))
+        spacing = min(_VIEW_SPACING_M, lidar.range_max_m)
+        cells = _one_a_block(here, max(round(spacing / plan.resolution), 1))
         views = (cells[:, ::-1] + 0.5) * plan.resolution + np.array(plan.origin)
         views = np.vstack([views, self.start[:2]])
         grid = OccupancyGrid(self.resolution)
         to_start = inverse(self.start)
-        all_round = LidarConfig(beams=_VIEW_BEAMS, range_max_m=lidar.range_max_m, offset_m=0.0)
+        all_round = LidarConfig(beams=_VIEW_BEAMS, range_min_m=0.0, range_max_m=lidar.range_max_m, offset_m=0.0)
         eye = Lidar(all_round, NoiseConfig())
         for x, y in views:
             pose = np.array([x, y, self.start[2]])

@@ -12,6 +12,7 @@ import numpy as np
 
 from slam.belief import Belief
 from slam.features.extraction import FeatureConfig, FeatureExtractor
+from slam.geometry import wrap_scalar
 from slam.grids.key_scans import KeyScanConfig, KeyScans
 from slam.grids.occupancy import OccupancyGrid
 from slam.health.monitor import HealthConfig
@@ -81,6 +82,7 @@ class Backend(abc.ABC):
         start = np.array(pose, dtype=np.float64)
         if start.shape != (3,) or not np.all(np.isfinite(start)):
             raise ValueError(f"a pose is three finite numbers x, y, θ; got {pose!r}")
+        start[2] = wrap_scalar(float(start[2]))
         if pose_cov is None:
             c = self.config
             pose_cov = np.diag([c.start_sigma_m**2, c.start_sigma_m**2, c.start_sigma_rad**2])
@@ -116,6 +118,7 @@ class Backend(abc.ABC):
         if form != self._checked:
             scan.check()
             self._checked = form
+        scan = scan.by_rep_117()
         if self._first is None:
             self._first = self.pose, self._drawing_cov()
         recovery = self.recovery

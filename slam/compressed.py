@@ -27,6 +27,7 @@ from slam.gaussian.lanes import aligned_zeros
 from slam.gaussian.low_rank import FEWEST_SAMPLES, factor, root_of_loss
 from slam.gaussian.settings import EkfConfig
 from slam.gaussian.tiles import add_combination, downdate, product
+from slam.landmark_backend import observation_rows
 from slam.landmarks.book import MARKS
 from slam.settings import Gap, Within
 from slam.types import LINE, Array, Indices, Observations, Scan
@@ -96,14 +97,13 @@ class CompressedEkfSlam(EkfSlam):
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations, in the region that holds them."""
-        rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
-        finite = rb[np.isfinite(rb[:, 0]), 0]
-        self._settle(float(finite.max()) if len(finite) else 0.0)
-        if observations.ids is not None:
-            ids = np.asarray(observations.ids)
-            strangers = [int(i) for i in ids if self._book.row(int(i)) < 0]  # mostly none, which is soon seen
+        z = observation_rows(observations)
+        self._settle(float(z[:, 0].max(initial=0.0)))
+        ids = self._ids_told(observations)
+        if ids is not None:
+            strangers = [i for i in ids if self._book.row(i) < 0]  # mostly none, which is soon seen
             if strangers and np.isin(strangers, self._map_ids[self._far]).any():
-                self._choose_region(ids)
+                self._choose_region(np.array(ids))
         super().observe(observations)
 
     def _find(self, pose: Array, pose_cov: Array) -> None:

@@ -172,13 +172,14 @@ class EkfSlam(HeldByMap):
 
     def observe(self, observations: Observations) -> None:
         """Correct by observations without a scan; known ids are believed up to ``known_gate``, new ones added."""
-        z, nis, dof = observation_rows(observations), 0.0, 0
+        z, ids = observation_rows(observations), self._ids_told(observations)
+        nis, dof = 0.0, 0
         for begin in range(0, len(z), MAX_OBSERVATIONS):
             part = z[begin : begin + MAX_OBSERVATIONS]
-            if observations.ids is None:
+            if ids is None:
                 self._take(part, None)
             else:
-                self._take_known(part, [int(i) for i in observations.ids[begin : begin + MAX_OBSERVATIONS]])
+                self._take_known(part, ids[begin : begin + MAX_OBSERVATIONS])
             if self.nis_dof:
                 nis, dof = nis + self.nis, dof + self.nis_dof
         self.recovery.monitor.take_innovations(nis, dof)
@@ -361,10 +362,9 @@ class EkfSlam(HeldByMap):
         self._beside.add(self._n, joint.landmark_by_pose(self._x, z, offset))
         joint.add_landmark(self._x, self._p, self._n, z, offset)
         direction = float(z[DIRECTION]) + float(self._x[2])
-        sensor_x, sensor_y, _ = self.sensor_pose().tolist()
-        along = along_wall(sensor_x, sensor_y, direction)
-        wall = (along + float(z[FROM]), along + float(z[TO]))
-        extent = wall if z[KIND] == LINE else (float(z[EDGE]), 0.0)
+        x, y, _ = self.sensor_pose().tolist()
+        along = along_wall(x, y, direction)
+        extent = (along + float(z[FROM]), along + float(z[TO])) if z[KIND] == LINE else (float(z[EDGE]), 0.0)
         self._n += 2
         self._book.add(float(z[KIND]), direction, known_id, extent=extent, bend=first_bend(along, z))
 

@@ -125,13 +125,13 @@ class FastSlam(LandmarkBackend):
 
     def observe(self, observations: Observations) -> None:
         """Correct by landmark observations without a scan; known ids are believed (up to ``known_gate``)."""
-        z = observation_rows(observations)
-        if observations.ids is None:
+        z, ids = observation_rows(observations), self._ids_told(observations)
+        if ids is None:
             match, _ = self._associate(z)
             best = self._correct(z, match)
             self._manage(z, match[best], best, None)
         else:
-            self._take_known(z, [int(i) for i in observations.ids])
+            self._take_known(z, ids)
         self._resample(len(z))
         self._believe()
 

@@ -51,6 +51,16 @@ class LandmarkBackend(Backend):
 
     # ---- landmarks with labels -----------------------------------------------------------------------------
 
+    @property
+    def label_ids(self) -> dict[int, int]:
+        """The ids that landmarks with labels have, by label: the same, but where another has that number."""
+        return dict(self._book.label_ids)
+
+    def _ids_told(self, observations: Observations) -> list[int] | None:
+        """Return the ids of what was observed, where the association is known."""
+        labels = observations.ids
+        return None if labels is None else self._book.of_labels(np.asarray(labels).tolist())
+
     def _rows(self, ids: Sequence[int]) -> Indices:
         """Return the book's row of each landmark ``(m,)``, or -1."""
         return np.array([self._book.row(i) for i in ids], np.int64)
@@ -127,6 +137,8 @@ def observation_rows(observations: Observations) -> Array:
     cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
     if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
         raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
+    if np.any(rb[:, 0] < 0.0):
+        raise ValueError(f"ranges of observations are 0 m or more, got {rb[:, 0].min()}")
     if np.any(cov[:, 0, 0] <= 0.0) or np.any(cov[:, 0, 0] * cov[:, 1, 1] <= cov[:, 0, 1] ** 2):
         raise ValueError("covariances of observations must be positive definite; what is not known is large")
     if observations.ids is not None:

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 __all__ = [
-    "CONCAVE", "CONVEX", "LINE", "VIRTUAL", "Array", "Bytes", "Cells", "Flags", "Floats", "Indices",
+    "CONCAVE", "CONVEX", "FARTHEST_M", "LINE", "VIRTUAL", "Array", "Bytes", "Cells", "Flags", "Floats", "Indices",
     "Observations", "Odometry", "Scan", "Sighting",
 ]  # fmt: skip
 
@@ -35,6 +36,8 @@ LINE = 2
 """A straight wall, not a point: its two coordinates are α [rad] and r [m], x cos α + y sin α = r."""
 VIRTUAL = 3
 """A point that no scan shows: with its twin it stands for a place, see :mod:`slam.graph.places`."""
+FARTHEST_M = 100.0
+"""As far as estimators look at what a lidar says [m]: maps are drawn in memory."""
 
 
 # Named tuples where each step makes a new one: a frozen dataclass takes 0.5 µs longer to build.
@@ -89,9 +92,33 @@ class Scan(NamedTuple):
                 "order of the ranges round, and begin at what was the last angle"
             )
 
+    def by_rep_117(self) -> Scan:
+        """Return the scan with ``inf`` and ``nan`` for what drivers say instead; itself where they do not.
+
+        At ``range_max`` or beyond 100 m nothing returned. Below ``range_min``, at 0 or beyond ``range_max`` the
+        beam is lost.
+        """
+        low, high = self.range_min, self.range_max
+        if high <= FARTHEST_M and _all_within(self.ranges, low, high):
+            return self
+        ranges, farthest = self.ranges.astype(np.float64), min(high, FARTHEST_M)
+        lost = (ranges < low) | (ranges <= 0.0) | ((ranges > high) & (ranges < np.inf))
+        ranges[ranges >= farthest] = np.inf
+        ranges[lost] = np.nan
+        return self._replace(ranges=ranges, range_max=farthest)
+
     def kept(self) -> Scan:
         """Return a scan with ranges of its own: those given may be a buffer that the next scan goes into."""
         return Scan(self.ranges.copy(), self.angle_min, self.angle_increment, self.range_max, self.range_min)
+
+
+@njit(cache=True, nogil=True)
+def _all_within(ranges: Array, low: float, high: float) -> bool:
+    """Tell whether all ranges lie within their bounds, but for infinite ones and those that are no numbers."""
+    beyond = False
+    for r in ranges:
+        beyond |= r < low or r <= 0.0 or high <= r < np.inf
+    return not beyond
 
 
 class Sighting(NamedTuple):

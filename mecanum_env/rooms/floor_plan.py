@@ -169,15 +169,14 @@ class FloorPlan:
         """Return which cells ``(rows, cols)`` have a clearance [m] and hang together with a start ``(≥ 2,)`` [m].
 
         The start may stand nearer to a surface than that: what counts is the cell with that clearance that is
-        nearest to it. Where no cell has it, none is reachable.
+        nearest to it, of those that no wall parts from it. Where no cell has it, none is reachable.
         """
-        roomy: Flags = self.clearance() >= clearance_m
-        rows, cols = roomy.shape
+        rows, cols = self.free.shape
         dx = (np.arange(cols) + 0.5) * self.resolution + self.origin[0] - start[0]
         dy = (np.arange(rows) + 0.5) * self.resolution + self.origin[1] - start[1]
-        nearest = int(np.argmin(np.where(roomy, dx**2 + dy[:, None] ** 2, np.inf)))
-        _, labels = cv2.connectedComponents(roomy.astype(np.uint8), connectivity=4)
-        return np.asarray(roomy & (labels == labels.flat[nearest]), np.bool_)
+        squared = dx**2 + dy[:, None] ** 2
+        room = _part_nearest(self.free, squared)
+        return _part_nearest(room & (self.clearance() >= clearance_m), squared)
 
     def distance_to_surfaces(self, points: Array) -> Array:
         """Return the exact distance [m] ``(n,)`` from points ``(n, 2)`` to the nearest wall or obstacle."""
@@ -207,6 +206,13 @@ class FloorPlan:
         except (TypeError, ValueError) as error:
             raise FloorPlanError(f"plan {self.name}: start must be three numbers x, y, θ") from error
         return dataclasses.replace(self, start=pose, start_clearance_m=clearance_m)  # type: ignore[arg-type]
+
+
+def _part_nearest(cells: Flags, squared: Array) -> Flags:
+    """Return the cells that hang together with the one of them whose squared distance is least."""
+    _, labels = cv2.connectedComponents(cells.astype(np.uint8), connectivity=4)
+    nearest = int(np.argmin(np.where(cells, squared, np.inf)))
+    return np.asarray(cells & (labels == labels.flat[nearest]), np.bool_)
 
 
 def _array(plan: FloorPlan, what: str, values: Array, columns: int) -> Array:

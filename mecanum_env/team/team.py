@@ -168,11 +168,17 @@ class Team:
             raise ValueError(f"start_poses must be {robots} poses x, y, θ; got {quoted(starts)}") from None
         if starts.shape != (robots, 3):
             raise ValueError(f"start_poses must be {robots} poses x, y, θ; got shape {starts.shape}")
-        return [
+        plans = [
             plan if k == 0 and tuple(start) == tuple(plan.start)
             else plan.with_start(start.tolist(), clearance_m=robot.inscribed_radius_m)
             for k, start in enumerate(starts)
         ]  # fmt: skip
+        if "start_poses" in options:
+            parts = [plan.reachable(robot.inscribed_radius_m, start) for start in starts]
+            for k, part in enumerate(parts):
+                if not (parts[0] & part).any():
+                    raise ValueError(f"start_poses: no robot gets from {k} to 0; start all where they can meet")
+        return plans
 
     def step(self, actions: Mapping[int, Floats]) -> dict[int, Outcome]:
         """Act for one control step; ``actions`` and what is returned are by the numbers of the active robots."""

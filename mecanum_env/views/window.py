@@ -168,6 +168,9 @@ class Viewer:
         self._clock = self._pygame.time.Clock()
         self._window: Window | None = None
 
+    def __reduce__(self) -> tuple[type[Viewer], tuple[float]]:
+        return Viewer, (self._fps,)  # a copy opens a window of its own
+
     def show(self, env: Shown) -> None:
         """Show the environment as it is now, and wait until the frame is due."""
         if self._window is None:

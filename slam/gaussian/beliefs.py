@@ -32,6 +32,9 @@ class GaussianBackend(LandmarkBackend):
         super().__init__(config)
         self._given: list[weakref.ref[Belief]] = []  # beliefs, since the state last changed
 
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_given": []}  # a copy has given none
+
     @property
     def _points(self) -> Array:
         return self._x[3 : self._n].reshape(-1, 2)

@@ -7,6 +7,7 @@ kind, enters the estimator's state. One that the scan keeps looking *through* wa
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +63,8 @@ class LandmarkBook:
         self.count = 0
         self.row_of_id = np.full(64, -1, np.int64)  # id → row, -1 where there is none (any more)
         self.next_id = 0  # of the next landmark that gets its own
+        self._own: set[int] = set()  # ids given here
+        self.label_ids: dict[int, int] = {}  # by label
         self.now = 0  # updates reviewed
         self._ids = np.zeros(32, np.int64)
         self._marks = np.zeros((32, MARKS))
@@ -91,6 +94,17 @@ class LandmarkBook:
         """Ids ``(n,)``; an id is never used twice. A view."""
         return self._ids[: self.count]
 
+    def of_labels(self, labels: Sequence[int]) -> list[int]:
+        """Return the ids of landmarks that are told apart by labels: the labels, but where one is another's id."""
+        for label in labels:
+            if label not in self.label_ids:
+                new_id = label
+                if label in self._own:
+                    new_id = self.next_id
+                    self._own.add(new_id)
+                self.label_ids[label], self.next_id = new_id, max(self.next_id, new_id + 1)
+        return [self.label_ids[label] for label in labels]
+
     def row(self, landmark_id: int) -> int:
         """Return the row of a landmark, or -1."""
         return int(self.row_of_id[landmark_id]) if 0 <= landmark_id < len(self.row_of_id) else -1
@@ -106,8 +120,8 @@ class LandmarkBook:
     ) -> None:
         """Append a landmark; without a known id it gets the next one. ``extent`` and ``bend``: see ``marks``."""
         new_id = self.next_id if known_id is None else known_id
-        if new_id < 0:
-            raise ValueError(f"a landmark id must be ≥ 0, got {new_id}")
+        if known_id is None:
+            self._own.add(new_id)
         self._make_room(self.count + 1)
         while new_id >= len(self.row_of_id):
             self.row_of_id = np.concatenate([self.row_of_id, np.full_like(self.row_of_id, -1)])
@@ -162,17 +176,16 @@ class LandmarkBook:
         """Count sightings; return the observations that are new landmarks by now, and rows to drop, highest first.
 
         Dropped are, where there is a scan, points that its beams keep passing through, or never show; and walls
-        that their sightings contradict. Add what
-        is new first or last: it was just seen. With ``at_once``, what is seen where features meet is a landmark at
-        its first sighting. ``x`` is the state (robot pose first), ``z`` the observation rows and ``match`` their
-        landmarks.
+        that their sightings contradict. Add what is new first or last: it was just seen. With ``at_once``, what is
+        seen where features meet is a landmark at its first sighting. ``x`` is the state (robot pose first), ``z``
+        the observation rows and ``match`` their landmarks.
         """
         self.now += 1
         if len(self._new) < len(z):
             self._new = np.zeros(len(z), np.int64)
         seen = scan or _NO_SCAN
         count, self._tentative_count, doubtful = _review(
-            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, self.now,
+            x, offset, z, match, seen.ranges, seen.angle_min, seen.angle_increment, seen.range_max, self.now,
             self._marks[: self.count], self._tentative, self._tentative_count, self._limits, at_once, self._new,
         )  # fmt: skip
         return self._new[:count].tolist() if count else [], self._to_drop() if doubtful else []
@@ -320,10 +333,10 @@ def _sightings(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look_through(
-    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, now: int, marks: Array,
-    limits: Array,
+    x: Array, offset: float, ranges: Array, angle_min: float, increment: float, range_max: float, now: int,
+    marks: Array, limits: Array,
 ) -> bool:  # fmt: skip
-    """Count, for each point near by, whether three beams pass it or one ends at it; tell of any doubt."""
+    """Count, for points near by that scans found, whether beams pass it or one ends there; tell of any doubt."""
     margin, drop_after, overlook_after, overlook_ratio = limits[5], limits[6], limits[7], limits[8]
     c, s = math.cos(x[2]), math.sin(x[2])
     sx, sy = x[0] + offset * c, x[1] + offset * s
@@ -333,14 +346,14 @@ def _look_through(
     doubtful = False
     for i in range(marks.shape[0]):
         doubtful |= marks[i, DOUBT] > limits[10]
-        if marks[i, LAST_SEEN] == now or marks[i, _KIND] >= LINE:
+        if marks[i, LAST_SEEN] == now or marks[i, _KIND] >= LINE or marks[i, _KIND] == 0.0:
             continue
         dx, dy = x[3 + 2 * i] - sx, x[4 + 2 * i] - sy
         d2 = dx * dx + dy * dy
         # Farther away, an uncertain heading moves the beams past a corner that is there.
-        if d2 > 25.0:
-            continue
         rho = math.sqrt(d2)
+        if rho > min(range_max, 5.0):
+            continue
         b = round(wrap_scalar(math.atan2(dy, dx) - x[2] - angle_min) / increment)
         if b < 0:
             b += circle
@@ -366,12 +379,12 @@ def _look_through(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _review(
-    x: Array, offset: float, z: Array, match: Indices, ranges: Array, angle_min: float, increment: float, now: int,
-    marks: Array, tentative: Array, n: int, limits: Array, at_once: bool, new: Indices,
+    x: Array, offset: float, z: Array, match: Indices, ranges: Array, angle_min: float, increment: float,
+    range_max: float, now: int, marks: Array, tentative: Array, n: int, limits: Array, at_once: bool, new: Indices,
 ) -> tuple[int, int, bool]:  # fmt: skip
     """Do what :meth:`LandmarkBook.review` does; return the numbers of new and of tentative ones, and of doubts."""
     found, kept = _sightings(x, offset, z, match, now, marks, tentative, n, limits, at_once, new)
-    return found, kept, _look_through(x, offset, ranges, angle_min, increment, now, marks, limits)
+    return found, kept, _look_through(x, offset, ranges, angle_min, increment, range_max, now, marks, limits)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -55,11 +55,7 @@ def scan_of(message: Any) -> Scan:
                          "is no sweep")  # fmt: skip
     if not 0.0 <= low < high <= _FARTHEST_RANGE_M:
         raise ValueError(f"has a scan with range_min {low:.4g} and range_max {high:.4g}, in m; correct its driver")
-    with np.errstate(invalid="ignore"):
-        lost = (ranges < low) | (ranges <= 0.0) | ((ranges > high) & np.isfinite(ranges))
-        ranges[ranges == high] = math.inf
-    ranges[lost] = math.nan
-    return Scan(ranges, first, step, high, low)
+    return Scan(ranges, first, step, high, low).by_rep_117()
 
 
 def odometry_of(message: Any) -> Array:

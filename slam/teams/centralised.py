@@ -380,7 +380,7 @@ class _TeamBook(LandmarkBook):
         other._seen = np.full(size, -np.inf)
         other._seen[ids] = other.marks[:, LAST_SEEN]
         self.count, self.next_id, self.row_of_id = other.count, other.next_id, other.row_of_id
-        self._ids, self._marks = other._ids, other._marks
+        self._ids, self._marks, self._own, self.label_ids = other._ids, other._marks, other._own, other.label_ids
         seen = np.full(size, -np.inf)
         seen[: len(self._seen)] = self._seen
         self.marks[:, LAST_SEEN] = seen[ids]

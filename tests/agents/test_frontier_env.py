@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import replace
 
 import gymnasium
@@ -159,6 +160,17 @@ def test_one_seed_is_one_episode_and_whatever_is_no_candidate_is_the_first():
     none = play(gymnasium.make(ID, rooms="rectangular", driver=many), 5, pick=lambda *_: 199, most=5)
     assert all(o["present"].sum() < len(o["present"]) for o, _, _ in none)  # so that the last is no candidate
     assert [i["time_s"] for _, _, i in first] == [i["time_s"] for _, _, i in none]
+
+
+def test_what_the_reward_is_made_of_adds_up_to_it_and_a_copy_goes_on_alike():
+    env = gymnasium.make(ID, rooms="rectangular", discount=0.99)
+    env.reset(seed=0)
+    env.step(0)
+    twin = pickle.loads(pickle.dumps(env))
+    for _ in range(3):
+        (observation, reward, *_, info), (other, *_) = env.step(0), twin.step(0)
+        assert sum(info["reward_terms"].values()) == reward
+        assert all(np.array_equal(observation[key], other[key]) for key in other)
 
 
 def test_the_discount_is_per_control_step():

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import gymnasium
+import numpy as np
 import pytest
 
 import mecanum_env
-from mecanum_env.config import EnvConfig, from_toml, to_toml
+from mecanum_env.arguments import make_config
+from mecanum_env.config import LIDAR_PRESETS, NOISE_PRESETS, EnvConfig, from_toml, to_toml
 
 
 @pytest.mark.parametrize(
@@ -43,6 +46,27 @@ def test_cells_of_another_size_are_those_of_truth_and_metrics_too() -> None:
     env = gymnasium.make("mecanum_env/Explore-v0", config={"grid_resolution_m": 0.1}, slam={"gate": 9.0})
     env.reset(seed=0)
     assert env.unwrapped.belief.grid.resolution == env.unwrapped.truth.ground.resolution == 0.1
+
+
+def test_rooms_given_are_explored_whatever_plan_the_configuration_has(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.png"
+    image = np.full((80, 100), 255, np.uint8)
+    image[[0, -1]], image[:, [0, -1]] = 0, 0
+    cv2.imwrite(str(plan), image)
+    base = {"floor_plan": str(plan), "rooms": "cave"}
+    assert make_config(config=base).floor_plan == str(plan)
+    laid_over = make_config(config=base, rooms="maze")
+    assert (laid_over.floor_plan, laid_over.rooms) == (None, "maze")
+    with pytest.raises(ValueError, match="rooms and floor_plan are two places to explore; give one of them"):
+        make_config(rooms="maze", floor_plan=str(plan))
+
+
+def test_a_robot_s_preset_brings_its_lidar_and_no_lidar_lies_beyond_its_body() -> None:
+    config = make_config(robot={"preset": "cavity", "mass_kg": 3.0})
+    assert (config.lidar, config.noise) == (LIDAR_PRESETS["cavity"], NOISE_PRESETS["cavity"])
+    assert make_config(robot={"preset": "cavity"}, lidar="cavity", noise="slippery").noise.slip == 0.1
+    with pytest.raises(ValueError, match=r"at most half of robot.length_m, 0.1: .*; got 0.2"):
+        make_config(robot={"length_m": 0.2, "width_m": 0.16})
 
 
 @pytest.mark.parametrize("name", ["Explore-v0", "ExploreFrontier-v0"])

@@ -211,10 +211,13 @@ def test_the_least_of_several_step_limits_is_the_last_step() -> None:
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_goes_on_as_the_original_does(duplicate: Any) -> None:
     """Into walls, too: pymunk's own copies report contacts to the original."""
-    env = make(slam="ekf")
+    env = make(slam="ekf", render_mode="rgb_array")
     env.reset(seed=1)
     env.step(np.zeros(3, np.float32))
+    env.render()
+    belief = env.unwrapped.belief  # type: ignore[attr-defined]
     twin = duplicate(env)
+    assert np.array_equal(belief.landmarks, twin.unwrapped.belief.landmarks)
     for k in range(60):
         action = np.array([1.0, -0.2, 0.1 if k % 2 else -0.1], np.float32)
         (observation, *rest, info), (other, *other_rest, other_info) = env.step(action), twin.step(action)

@@ -53,6 +53,24 @@ def test_a_start_beside_a_wall_reaches_what_one_in_the_open_does() -> None:
     assert cells[0] * 0.05**2 > 0.95 * plan.area_m2
 
 
+def test_nobody_is_held_to_what_lies_behind_a_wall() -> None:
+    free = np.zeros((70, 180), bool)
+    free[5:65, 60:170] = free[10:60, 10:14] = True
+    # In a corridor of 0.4 m no cell has room for the body, though it fits; the hall is beyond a wall.
+    plan = from_raster(free, name="apart", resolution=0.1, start=(1.2, 3.0, 0.5 * np.pi))
+    truth = GroundTruth(plan, np.array(plan.start), robot=RobotConfig(), lidar=LidarConfig(), resolution=0.05)
+    assert 1.0 < truth.mappable_cells * 0.05**2 <= 2.0
+
+
+@pytest.mark.parametrize("range_m", [0.015, 0.3, 0.5, 2.0])
+def test_a_lidar_that_sees_less_far_may_map_as_much(range_m: float) -> None:
+    plan = rooms.make("rectangular", seed=2)
+    lidar = LidarConfig(range_min_m=0.0, range_max_m=range_m)
+    resolution = 0.05 if range_m > 0.1 else 0.01
+    truth = GroundTruth(plan, np.array(plan.start), robot=RobotConfig(), lidar=lidar, resolution=resolution)
+    assert truth.mappable_cells * resolution**2 > (0.95 if range_m > 0.1 else 0.0) * plan.area_m2
+
+
 @pytest.mark.parametrize("offset", [0, 3, 6, 9, 12])
 def test_narrow_passages_are_mappable_wherever_they_lie(offset: int) -> None:
     free = np.zeros((300, 300), bool)

@@ -12,7 +12,7 @@ import pytest
 import slam
 from slam.geometry import compose, exp
 from slam.types import Observations, Odometry, Scan
-from tests.slam.simulated import circle_twist, room_scan
+from tests.slam.simulated import circle_twist, observe_landmarks, room_scan
 
 BLIND = ("odometry", "truth")
 OBSERVERS = [name for name in slam.names() if slam.make(name).observes_landmarks and name not in BLIND]
@@ -136,10 +136,62 @@ def test_scans_may_come_in_one_buffer_each_after_the_other(name: str) -> None:
     assert np.array_equal(fresh.grid.log_odds, reused.grid.log_odds)
 
 
+@pytest.mark.parametrize("name", slam.names())
+def test_what_drivers_say_instead_is_what_the_standard_says(name: str) -> None:
+    """No return is ``inf`` by REP 117, a lost beam ``nan``; some say ``range_max``, 0, or less than they see."""
+    rng, pose = np.random.default_rng(0), np.array([2.5, 2.0, 0.0])
+    backends = [slam.make(name), slam.make(name)]
+    for backend in backends:
+        backend.reset()
+    for k in range(12):
+        twist = circle_twist(k)
+        pose = compose(pose, exp(twist * 0.1))
+        scan = room_scan(pose, rng)._replace(range_min=0.3, range_max=3.0)
+        gone, lost = scan.ranges >= 3.0, rng.random(360) < 0.1
+        said = np.where(gone, 3.0, scan.ranges)
+        said[lost] = rng.choice([0.0, 0.1, -1.0, 3.5, 65.5], np.count_nonzero(lost))
+        meant = np.where(lost, np.nan, np.where(gone, np.inf, scan.ranges))
+        for backend, ranges in zip(backends, (said, meant), strict=True):
+            backend.predict(Odometry(tuple(twist), 0.1))
+            backend.update(scan._replace(ranges=ranges))
+    one, other = backends
+    assert np.array_equal(one.pose, other.pose) and np.array_equal(one.grid.log_odds, other.grid.log_odds)
+
+
+@pytest.mark.parametrize("name", ["invariant-ekf", "graph-slam"])
+def test_a_lidar_said_to_see_without_end_takes_no_more_memory(name: str) -> None:
+    backend = slam.make(name)
+    backend.reset()
+    backend.update(Scan(np.where(np.arange(360) < 90, np.inf, 3.0), -math.pi, 2.0 * math.pi / 360, 1e30))
+    assert backend.grid.known_area_m2 < 1.1 * 0.25 * math.pi * 100.0**2 + 4.0 * math.pi * 9.0
+
+
+@pytest.mark.parametrize("name", OBSERVERS)
+def test_labels_and_what_scans_show_are_kept_apart(name: str) -> None:
+    """Labels are numbers of their own, and what has one need not be seen by a lidar."""
+    rng, start, backend = np.random.default_rng(0), np.array([1.0, 1.0, 0.0]), slam.make(name)
+    backend.reset(start)
+    tags, pose = np.array([[2.0, 2.5], [4.0, 1.0], [3.0, 4.5], [5.5, 3.0], [0.5, 4.0]]), start
+    for k in range(240):
+        twist = np.array([0.25 * math.cos(k / 20), 0.25 * math.sin(k / 20), 0.0])
+        pose = compose(pose, exp(twist * 0.1))
+        backend.predict(Odometry(tuple(twist + 0.01 * rng.standard_normal(3)), 0.1))
+        backend.update(room_scan(compose(pose, np.array([0.2, 0.0, 0.0])), rng))
+        tag = (k - 40) // 5  # each is seen for half a second, one after the other
+        if 0 <= tag < len(tags):
+            seen = observe_landmarks(pose, tags[[tag]], 0.2, np.diag([1e-4, 1e-5]), rng)
+            backend.observe(replace(seen, ids=np.array([tag])))
+    belief = backend.belief
+    assert np.hypot(*(belief.pose - pose)[:2]) < 0.05
+    rows = [belief.landmark_ids.tolist().index(backend.label_ids[tag]) for tag in range(len(tags))]
+    assert np.abs(belief.landmarks[rows] - tags).max() < 0.2
+
+
 @pytest.mark.parametrize("name", OBSERVERS)
 @pytest.mark.parametrize(
     ("wrong", "what"),
     [
+        ({"range_bearing": np.array([[2.0, 0.3], [-1.0, 0.0]])}, "ranges of observations are 0 m or more, got -1"),
         ({"ids": np.array([0])}, "ids of 2 observations must be as many whole numbers"),
         ({"ids": np.array([0.0, 1.0])}, "as many whole numbers"),
         ({"ids": np.array([0, -1])}, r"must be in \[0, 1000000\], got -1 to 0"),

@@ -40,7 +40,7 @@ from slam.ros import (
     twist_message,
 )
 from slam.settings import require
-from slam.types import Array, Odometry, Scan
+from slam.types import FARTHEST_M, Array, Odometry, Scan
 
 __all__ = ["Driver", "lidar_of"]
 
@@ -49,7 +49,6 @@ _KEPT = 1000  # odometry messages: seconds of the fastest
 _WAITING = 100  # scans that are newer than all odometry so far: of the fastest lidar, two seconds
 _TOO_FAST = 3.0  # times its limits: no robot's motion, but odometry that began anew
 _LEAST_S = 0.1  # in which so much way is no jump: stamps of single messages may lie closer
-_FARTHEST_M = 100.0  # that a lidar of the agents sees
 _BESIDE_M = 0.05  # that a lidar may sit off the middle line of the body that the agents drive
 _NARROWEST_RAD = math.radians(30.0)
 _STAND = (0.0, 0.0, 0.0)
@@ -344,5 +343,5 @@ def lidar_of(scan: Scan, offset_m: float) -> LidarConfig:
                              "15° to either side of straight ahead are the least to drive by")  # fmt: skip
     return LidarConfig(
         beams=beams, field_of_view_deg=min(math.degrees(sweep), 360.0), offset_m=offset_m,
-        range_min_m=scan.range_min, range_max_m=min(scan.range_max, _FARTHEST_M),
+        range_min_m=scan.range_min, range_max_m=min(scan.range_max, FARTHEST_M),
     )  # fmt: skip

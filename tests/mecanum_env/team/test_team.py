@@ -11,6 +11,7 @@ import pytest
 import agents
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
+from mecanum_env.rooms.files.importers import from_raster
 from mecanum_env.rooms.floor_plan import FloorPlanError
 from mecanum_env.team.config import COMMUNICATION, TeamConfig
 from mecanum_env.team.team import Team
@@ -123,6 +124,14 @@ def test_others_are_seen_and_not_mapped() -> None:
     assert observed[0, 0] == 1.0
     assert np.hypot(*(observed[0, 1:3] - expected[:2])) < 0.1
     assert second.observation_space.contains(second.observe())
+
+
+def test_robots_that_could_never_meet_are_refused() -> None:
+    free = np.zeros((60, 160), bool)
+    free[5:55, 5:75] = free[5:55, 80:155] = True
+    plan = from_raster(free, name="two halls", resolution=0.1, start=(3.0, 3.0, 0.0))
+    with pytest.raises(ValueError, match="no robot gets from 1 to 0"):
+        Team(2).reset(seed=0, options={"floor_plan": plan, "start_poses": [(3.0, 3.0, 0.0), (11.0, 3.0, 0.0)]})
 
 
 def test_where_frames_are_one_what_a_robot_tells_counts_before_an_older_sighting_of_it() -> None:

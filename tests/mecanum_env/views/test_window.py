@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import subprocess
 import sys
@@ -52,6 +53,16 @@ def test_reset_and_step_show_the_frame_and_render_returns_none(env_id: str, pyga
     assert env.render() is None
     env.close()
     assert not pygame.display.get_init()
+    env.close()
+
+
+def test_a_copy_shows_itself(pygame: Any) -> None:
+    env = make()
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    twin.step(np.array([0.5, 0.0, 0.0], np.float32))
+    assert np.array_equal(on_screen(pygame), render_frame(twin.unwrapped))
+    twin.close()
     env.close()
 
 

@@ -126,6 +126,16 @@ def test_a_landmark_that_beams_pass_through_is_dropped_and_one_on_a_wall_is_not(
     assert book.ids.tolist() == [1, 2]  # ids are never used twice
 
 
+def test_beams_that_see_less_far_pass_no_landmark_and_what_no_scan_found_is_not_looked_for() -> None:
+    book = LandmarkBook(LandmarkPolicy(drop_after=3))
+    book.add(1.0, 0.0, None)
+    book.add(0.0, 0.0, 7)
+    x = np.array([0.0, 0.0, 0.0, 4.0, 0.0, 1.0, 0.0])
+    scan = Scan(np.full(360, np.inf), ANGLE_MIN, INCREMENT, 3.0)
+    for _ in range(9):
+        assert book.review(x, 0.0, np.zeros((0, 12)), np.zeros(0, np.int64), scan) == ([], [])
+
+
 @pytest.mark.parametrize("beams, increment", [(1, 0.0), (1, 5.0), (2, 3.0)])
 def test_a_beam_or_two_do_not_look_all_round(beams: int, increment: float) -> None:
     """Of one beam the increment says nothing; it passed for three on every landmark near by."""

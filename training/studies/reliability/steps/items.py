@@ -26,7 +26,7 @@ ROOMS = (*sorted(rooms.names()), _DRAWN)
 """Generators, and a plan read from an image that is drawn."""
 
 _HARSH = NoiseConfig(
-    range_sigma_m=0.2, dropout=0.5, encoder=0.3, radius_error=0.2, base_error=0.2, slip=0.6, friction=0.1,
+    range_sigma_m=0.2, dropout=0.5, encoder=0.3, radius_error=0.2, base_error=0.2, slip=0.5, friction=0.1,
     patch_share=0.5, patch_friction=(0.01, 0.1),
 )  # fmt: skip
 _NONE = NoiseConfig(range_sigma_m=0.0, dropout=0.0, encoder=0.0, radius_error=0.0, base_error=0.0)
