@@ -129,6 +129,12 @@ class ExploreAndReturn(NearestFrontier):
         near = float(np.hypot(*(pose[:2] - self._home[:2]))) <= self.config.homing.arrived_m
         return near and abs(geometry.wrap_scalar(pose[2] - self._home[2])) <= self.config.homing.arrived_rad
 
+    def _makes_way(self, belief: Belief) -> bool:
+        makes_way = super()._makes_way(belief)
+        if makes_way and self._end == "returned":  # it goes back there
+            self._end, self._troubles.note(self._home[:2]).looks = "", 0
+        return makes_way
+
     # ---- driving -------------------------------------------------------------------------------------------
 
     def act(self, observation: Mapping[str, Any] | None, belief: Belief) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,6 +29,7 @@ class Teammate(NamedTuple):
     age_s: float  # since it was there
     goal: Array | None = None  # (2,) where it said to go [m], in the belief's frame
     ended: bool = False  # it has told that it stands where it is for good
+    heard_s: float = math.inf  # since it was last heard
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

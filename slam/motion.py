@@ -80,9 +80,9 @@ class OdometryNoise(Config):
         Raises ``ValueError`` where it is not finite: a belief that has once taken that in has lost everything.
         """
         twist, slip = odometry.numbers, odometry.slip
-        if not math.isfinite(twist[0] + twist[1] + twist[2] + odometry.dt):
+        if not (math.isfinite(twist[0] + twist[1] + twist[2] + odometry.dt) and odometry.dt >= 0.0):
             raise ValueError(
-                f"vx, vy, ω and dt of an odometry are finite numbers, got {twist} and {odometry.dt}; leave it out"
+                f"vx, vy, ω and dt of an odometry are finite, and no time goes back; got {twist} and {odometry.dt}"
             )
         if slip is None:
             slip, body = self.slip(body, twist, odometry.dt) if odometry.dt > 0.0 else (NO_SLIP, body)

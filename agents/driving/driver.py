@@ -26,6 +26,8 @@ __all__ = ["LOST", "Driver", "DriverConfig"]
 LOST = 0.1  # health of a belief below which it is no good for driving
 _SAME_SHARE = 0.2  # of the lidar's reach, within which pieces of frontier may be the same
 _NARROW_DEG = 90.0  # field of view below which a robot without a way turns round before it gives up
+# Shares of a slow robot's speed: what it moves at least unless it is stuck; what a goal is given time by.
+_STUCK_SHARE, _SLOWEST_SHARE = 0.075, 0.3
 _LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
@@ -198,7 +200,8 @@ class Driver(Agent):
 
     def _allow_time(self, cost: float) -> None:
         """Give a new target as long as a way of so much [weighted m] may take."""
-        self._deadline = self._time + 10.0 + cost / self.config.patience.slowest_m_s
+        slowest_m_s = min(self.config.patience.slowest_m_s, _SLOWEST_SHARE * self._robot.max_speed_m_s)
+        self._deadline = self._time + 10.0 + cost / slowest_m_s
         self._arrived_for = 0.0
 
     def _watch(self, belief: Belief) -> None:
@@ -216,7 +219,12 @@ class Driver(Agent):
         anchor_x, anchor_y, anchor_heading = self._anchor
         moved = math.hypot(x - anchor_x, y - anchor_y)
         turned = abs(geometry.wrap_scalar(heading - anchor_heading))
-        if moved > 0.15 or turned > 0.4 or self._follower.arrived:
+        time_s, robot = patience.stuck_s, self._robot
+        if (
+            moved > min(0.15, _STUCK_SHARE * time_s * robot.max_speed_m_s)
+            or turned > min(0.4, _STUCK_SHARE * time_s * robot.max_turn_rate_rad_s)
+            or self._follower.arrived
+        ):
             self._anchor, self._anchored_at = (x, y, heading), now
         stuck = now - self._anchored_at > patience.stuck_s
         if (stuck or now > self._deadline) and now >= self._recover_until:

@@ -30,7 +30,7 @@ class Crew:
     costs: Array  # (k, n) [weighted m] from each robot to where it would look at each piece from; inf: no way
     bound: Cells  # (k,) the column that each is on its way to, −1 where none is known
     cells: Cells  # (n, 2) where each piece is looked at from by the robot that is nearest to it
-    travel: TravelCosts  # of the first robot: from the same tree all work out the same
+    travels: tuple[TravelCosts, ...]  # of each: from the same trees all work out the same
 
     def of(self, kept: Flags) -> Crew:
         """Return the crew with some of the pieces ``(n,)`` alone."""
@@ -98,5 +98,5 @@ def muster(
         robots=np.array(robots), own=robots.index(belief.robot), pieces=pieces, costs=all_costs,
         bound=np.array([row[3] for row in rows]),
         cells=np.array([row[2] for row in rows])[np.argmin(all_costs, axis=0), np.arange(len(pieces))],
-        travel=rows[0][4],
+        travels=tuple(row[4] for row in rows),
     )  # fmt: skip

@@ -81,7 +81,7 @@ class Rendezvous(TeamTour):
         """
         others = 0 if observation is None else len(observation.get("teammates", ()))
         # Who has ended comes to no appointment.
-        counted = sum(mate.ended or mate.age_s < 0.5 * self._step_s for mate in belief.teammates)
+        counted = sum(mate.ended or mate.heard_s < 0.5 * self._step_s for mate in belief.teammates)
         self._apart = counted < others
         last_s, next_s = self._appointed_s(self._next - 1), self._appointed_s(self._next)
         if self._apart:

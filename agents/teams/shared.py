@@ -43,7 +43,12 @@ class Shared(Explorer):
         config = self._sharing()
         near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]
         starts, cells = np.minimum(crew.held(config.hold_m)[:, near], FAR_M), crew.cells[near]
-        distance = np.nan_to_num(between(found.cost_map, crew.travel, cells, searched=0), nan=FAR_M, posinf=FAR_M)
+        distance = np.full((len(cells), len(cells)), FAR_M)
+        for travel in crew.travels:  # what the first cannot get to, another can
+            if (distance < FAR_M).all():
+                break
+            ways = between(found.cost_map, travel, cells, searched=0)
+            distance = np.where(distance < FAR_M, distance, np.nan_to_num(ways, nan=FAR_M, posinf=FAR_M))
         owner = share_tours(starts, distance)
         return np.asarray(near[owner == crew.own])
 

@@ -22,7 +22,7 @@ from slam.types import Array, Indices
 
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
 
-_SLOW_M_S = 0.06  # that is held up
+_SLOW_M_S, _SLOW_SHARE = 0.06, 0.12  # that is held up, of a slow robot as a share of its speed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +51,7 @@ class GivingWay:
 
     def __init__(self, config: GivingWayConfig, robot: RobotConfig) -> None:
         self.config, self._radius_m = config, robot.circumscribed_radius_m
+        self._slow_m_s = min(_SLOW_M_S, _SLOW_SHARE * robot.max_speed_m_s)
         self.until_s = -math.inf
         self._held_s = 0.0
 
@@ -75,7 +76,7 @@ class GivingWay:
         if mate is None or (idle and mate.goal is None):
             self._held_s = 0.0
             return None
-        if speed_m_s is not None and speed_m_s > _SLOW_M_S:
+        if speed_m_s is not None and speed_m_s > self._slow_m_s:
             # Two that stand before each other get a little way on now and then.
             self._held_s = max(self._held_s - step_s, 0.0)
             return None

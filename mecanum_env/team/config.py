@@ -75,6 +75,6 @@ class TeamConfig(Config):
         all_known = self.known_starts and self.communication.model == "unlimited"
         require(
             not joint or all_known,
-            "TeamConfig.belief joint needs known_starts and unlimited communication, got "
-            f"{self.known_starts} and {self.communication.model}",
+            "one belief over all robots (joint) needs known starts and unlimited communication, got known_starts "
+            f"{self.known_starts} and {self.communication.model}; leave out what it is, or the joint belief",
         )

@@ -150,5 +150,6 @@ class Knowledge:
             # Copies: reports are everybody's.
             goal = None if goal is None else goal.copy()
             ended = report is not None and report.ended
-            found.append(Teammate(robot, pose.copy(), time_s - when, goal, ended))
+            heard_s = math.inf if report is None else time_s - report.time_s
+            found.append(Teammate(robot, pose.copy(), time_s - when, goal, ended, heard_s))
         return tuple(found)

@@ -106,6 +106,8 @@ class Team:
         if self.team.robots > 1 and self.joint is None and not self.team.starts_exact:
             Account.of(0, 0.0, self.members[0].backend)  # raises where frames could not be found
         self._rng = np.random.default_rng()
+        self.ends_covered = True
+        """Whether coverage of the target ends the episode."""
         self.active: list[int] = []
         """Numbers of the robots that are still exploring; the others stand where they ended."""
 
@@ -205,7 +207,7 @@ class Team:
         outcomes = {}
         for member, info in zip(active, infos, strict=True):
             hit = config.terminate_on_collision and member.truth.world.collisions > 0
-            terminated = bool(covered or hit)
+            terminated = bool((covered and self.ends_covered) or hit)
             if terminated or late:
                 info["is_success"] = bool(covered)
                 info["episode_metrics"] = member.episode_metrics()

@@ -145,6 +145,9 @@ def scan_log(
         raise ValueError(
             f"{path}: no range is above 0 and below {_NO_RETURN_CM_M} m, so nothing was measured; give ranges in m"
         )
+    moved = int(np.count_nonzero(np.abs(times - stamps) > 1e-6))
+    if moved:
+        note += f"; {moved} of {len(stamps)} stamps did not rise, and were put between those that do"
     angle_min, increment = beam_angles(ranges.shape[1])
     return ScanLog(
         name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]),

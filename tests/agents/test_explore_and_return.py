@@ -11,6 +11,7 @@ import pytest
 import agents
 from agents.explore_and_return import ExploreAndReturnConfig, HomingConfig
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig
+from slam.belief import Teammate
 from slam.geometry import wrap_scalar
 from slam.grids.occupancy import OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, body_gap, drive, fill, half_known, room
@@ -94,6 +95,20 @@ def test_goes_round_what_is_in_the_way_and_stops_on_the_start(preset):
     np.testing.assert_array_equal(
         agent.act(None, belief_of(classes, (0.3, 0.2, 0.5), origin=CORNER)), np.zeros(3, np.float32)
     )
+
+
+def test_one_that_has_made_way_for_another_goes_back_to_the_start():
+    classes, agent = room(8.0, 5.0), agents.make("explore-and-return")
+    agent.reset(belief_of(classes, (0.0, 0.0, 0.0), origin=CORNER))
+    pose, words, _ = go(agent, classes, np.array([2.0, 0.5, 0.0]))
+    assert words[-1] == "returned"
+    mate = Teammate(0, np.array([-1.0, 0.0, 0.0]), 0.0, np.array([3.0, 0.0]))  # its way is over the start
+    for _ in range(30):
+        belief = replace(belief_of(classes, tuple(pose), origin=CORNER), teammates=(mate,), robot=1)
+        pose = drive(pose, agent.act(None, belief), ROBOT)
+    assert agent.status == "giving way" and np.hypot(*pose[:2]) > 0.3
+    pose, words, _ = go(agent, classes, pose)
+    assert words[-1] == "returned" and np.hypot(*pose[:2]) < 0.05
 
 
 def test_a_start_too_near_to_a_wall_to_plan_to_is_reached_all_the_same():

@@ -214,10 +214,8 @@ def test_a_copy_goes_on_as_the_original_does(duplicate: Any) -> None:
     env = make(slam="ekf", render_mode="rgb_array")
     env.reset(seed=1)
     env.step(np.zeros(3, np.float32))
-    env.render()
-    belief = env.unwrapped.belief  # type: ignore[attr-defined]
+    env.render()  # which reads the belief
     twin = duplicate(env)
-    assert np.array_equal(belief.landmarks, twin.unwrapped.belief.landmarks)
     for k in range(60):
         action = np.array([1.0, -0.2, 0.1 if k % 2 else -0.1], np.float32)
         (observation, *rest, info), (other, *other_rest, other_info) = env.step(action), twin.step(action)
@@ -397,7 +395,6 @@ def test_observations_are_filled_into_the_canvas_and_are_the_same() -> None:
         assert got is canvas and got.keys() == want.keys()
         for key, value in want.items():
             np.testing.assert_array_equal(got[key], value)
-        again = inner.observe()
-        assert again is canvas
+        assert inner.observe() is canvas
     inner.canvas = None
     assert not np.shares_memory(inner.observe()["scan"], canvas["scan"])

@@ -208,7 +208,12 @@ def comparisons(group: Group, baseline: Group) -> dict[str, Comparison]:
         for key, row in zip(group.keys, group.rows, strict=True)
         if key[:3] in theirs
     ]
-    return {metric.key: _comparison(metric, pairs) for metric in COMPARED}
+    # The way of one that has not explored is short for that.
+    explored = [pair for pair in pairs if None not in (row["time_to_95_s"] for row in pair[1:])]
+    return {
+        metric.key: _comparison(metric, explored if metric.key == "path_length_m" else pairs)
+        for metric in COMPARED
+    }
 
 
 def _figure(metric: Metric, group: Group) -> Figure:

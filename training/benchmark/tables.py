@@ -205,7 +205,7 @@ def _best(metric: Metric, found: Mapping[str, Intervals]) -> str | None:
     """Return the agents' best value as shown, None where there is nothing to choose between."""
     values = [figures.get(metric.key, NONE).value for name, figures in found.items() if not _is_bound(name)]
     values = [v for v in values if not math.isnan(v)]
-    if not metric.better or len(values) < 2:
+    if not metric.better or min(values, default=0.0) == max(values, default=0.0):
         return None
     return shown(metric, min(values) if metric.better == "low" else max(values))
 

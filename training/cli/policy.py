@@ -144,7 +144,7 @@ def _over_the_hub(source: str, target: str, private: bool) -> None:
 
 def _kind(path: Path) -> str:
     if not path.exists():
-        raise BadInput(f"there is no {path}")
+        raise BadInput(f"there is no {path}; give a policy's file, or the folder of a training")
     return ".run" if path.is_dir() else path.suffix
 
 

@@ -91,7 +91,8 @@ def train(
     try:
         run.train()
     except KeyboardInterrupt as error:
-        raise Interrupted(f"interrupted; {out} keeps the last checkpoint: go on with --resume") from error
+        raise Interrupted("interrupted; --resume goes on from the last checkpoint, if there was one") from error
+    print(f"trained; mecanum policy {out} FILE.safetensors makes a file of the best policy")
 
 
 def _runner(settings: TrainConfig | DriveConfig) -> Callable[..., FolderRun]:

@@ -42,13 +42,13 @@ EXTRAS = {"video": "episode.mp4", "mcap": "episode.mcap", "rerun": "episode.rrd"
 """What it writes besides when asked to, by the option."""
 
 LEAST_STEPS, STEPS_PER_M2 = 3000, 12.0
-"""The step limit where none is given: so many, or so many a square metre of free space."""
+"""The step limit where none is given: so many of 0.1 s, or so many a square metre of free space."""
 
 ENDINGS = {
     **AGENT_ENDINGS,
     "time": "the step limit was reached first",
     "collision": "it touched a wall or another robot, and the configuration ends an episode there",
-    "interrupted": "broken off by Ctrl-C",
+    "interrupted": "broken off, by Ctrl-C or SIGTERM",
     "running": "it goes on: written on the way",
 }
 """Why an episode ended: the word in ``metrics.json``, and what it means."""
@@ -189,8 +189,13 @@ def asked_for(
         world = replace(world, coverage_target=coverage_target)
     check_writable(out, files)
     plan = make_plan(world, run["seed"])
-    limit = run.get("max_steps") or max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * plan.area_m2))
+    limit = run.get("max_steps") or _step_limit(plan.area_m2, world.step_s)
     return world, run | {"max_steps": limit}, plan
+
+
+def _step_limit(area_m2: float, step_s: float) -> int:
+    """Return how many steps an episode may have: the same time, however long a step is."""
+    return math.ceil(round(max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * area_m2)) * 0.1 / step_s, 6))
 
 
 def refuse_two_places(rooms: str | None, floor_plan: Path | None) -> None:

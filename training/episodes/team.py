@@ -165,6 +165,7 @@ def prepare(team: TeamConfig, *, out: Path, slam: str | None = None, **asked: An
         explorers = tuple(make_agent(run["agent"], member) for member in robots.members)
         for k, (explorer, member) in enumerate(zip(explorers, robots.members, strict=True)):
             explorer.reset(member.belief, run["seed"] + k)
+        robots.ends_covered = not any(explorer.outlives_coverage for explorer in explorers)
     return TeamEpisode(
         team=robots, agents=explorers, observations=[observation for observation, _ in found], config=world,
         run=run, out=out,

@@ -26,7 +26,7 @@ def draw_replay(
     ----------
     reference, reckoned, estimate : (n, ≥ 2)
         Trajectories [m]; each may be empty, and broken by rows of nan. The picture covers reference, estimate
-        and landmarks; dead reckoning may leave it.
+        and landmarks; dead reckoning may leave it, which is said then.
     landmarks, surveyed : (n, 2), (m, 2)
         Estimated places, drawn as dots, and true ones, as circles [m]; rows with nan are left out.
     title : str
@@ -34,13 +34,18 @@ def draw_replay(
     """
     surveyed = surveyed[np.isfinite(surveyed).all(axis=1)]
     figure, (axes,) = chart(size=(1000, 900))
-    axes.plot(reference[:, 0], reference[:, 1], color=INK, linewidth=1, label="reference")
+    if len(reference):
+        axes.plot(reference[:, 0], reference[:, 1], color=INK, linewidth=1, label="reference")
     axes.plot(estimate[:, 0], estimate[:, 1], color=COLOURS[0], linewidth=1, label="estimate")
     if len(surveyed):
         axes.plot(*surveyed.T, "o", color=COLOURS[1], markersize=8, fillstyle="none", label="surveyed")
-    axes.plot(*landmarks.T, "o", color=COLOURS[1], markersize=3, label="landmarks")
+    if len(landmarks):
+        axes.plot(*landmarks.T, "o", color=COLOURS[1], markersize=3, label="landmarks")
     shown = axes.axis()
-    axes.plot(reckoned[:, 0], reckoned[:, 1], color=COLOURS[4], linewidth=1, label="odometry", zorder=1)
+    x, y = reckoned[:, 0], reckoned[:, 1]
+    leaves = bool(np.any((x < shown[0]) | (x > shown[1]) | (y < shown[2]) | (y > shown[3])))
+    name = "odometry, which leaves the picture" if leaves else "odometry"
+    axes.plot(x, y, color=COLOURS[4], linewidth=1, label=name, zorder=1)
     axes.axis(shown)
     axes.set_aspect("equal")
     label(axes, told(title), "x [m]", "y [m]")

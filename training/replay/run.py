@@ -233,6 +233,7 @@ def run(replay: Replay, progress: Callable[[float], None]) -> None:
                 )
         else:
             _sample(replay, math.inf, (0.0, 0.0, 0.0))
+            replay.end = "end of the log" if "limit_s" not in replay.run else "the limit, --limit-s"
     replay.wall_time_s = time.perf_counter() - began
 
 

@@ -96,6 +96,8 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
         old = before if isinstance(before, dict) else {}
         keys = [key for key in (*now, *old) if now.get(key) != old.get(key)]
         key = keys[0] if keys else "other settings"
+        if key == "code":
+            raise BadInput(f"{out} holds runs of other code; go back to it, or choose another --out")
         raise BadInput(
             f"{out} holds runs with {quoted(key)[1:-1]} = {_told(old.get(key))}, not {_told(now.get(key))}; "
             "choose another --out, or give the same to go on"

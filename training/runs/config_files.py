@@ -6,10 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from slam.files import read_toml
-from training.runs.errors import BadInput, bad_input
+from slam.files import quoted, read_toml
+from training.runs.errors import BadInput, bad_input, suggestion
 
 __all__ = ["read_config"]
+
+# What a run says of itself, and whoever runs it again is not asked for.
+_SAID = {
+    "agents", "backends", "baseline", "clock_start_s", "log", "robot", "robots", "seeds", "split", "step_limit",
+    "suites", "team", "teams", "versions",
+}  # fmt: skip
 
 
 def read_config(path: Path, kinds: Mapping[str, tuple[type, ...]]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -25,6 +31,10 @@ def read_config(path: Path, kinds: Mapping[str, tuple[type, ...]]) -> tuple[dict
     run = values.pop("run", {})
     if not isinstance(run, dict):
         raise BadInput(f"config {path}: [run] has the wrong type, it is a table; see a config.toml")
+    for name in run:
+        close = suggestion(name, kinds)
+        if name not in kinds and name not in _SAID and close:
+            raise BadInput(f"config {path}: [run] has no {quoted(name)[1:-1]}{close}")
     run = {name: run[name] for name in kinds if name in run}
     for name, value in run.items():
         if type(value) not in kinds[name]:

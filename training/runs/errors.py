@@ -49,8 +49,9 @@ def one_line(error: object) -> str:
 
 def suggestion(name: str, valid: Iterable[str]) -> str:
     """Return ``" (did you mean …?)"`` where one of the valid names is close, else nothing."""
-    close = difflib.get_close_matches(name, list(valid), n=1)
-    return f" (did you mean {close[0]}?)" if close else ""
+    names = {one.lstrip("-"): one for one in valid}  # what options begin with makes none of them alike
+    close = difflib.get_close_matches(name.lstrip("-"), names, n=1)
+    return f" (did you mean {names[close[0]]}?)" if close else ""
 
 
 def check_writable(folder: Path, files: Iterable[str] = ()) -> None:

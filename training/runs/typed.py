@@ -22,4 +22,6 @@ def whole_numbers(option: str, text: str, *, low: int, high: int) -> list[int]:
         numbers = sorted(set(map(int, words)))
         if low <= numbers[0] and numbers[-1] <= high:
             return numbers
-    raise BadInput(f"{option} {text!r} must be whole numbers in {low} … {high}, for instance 25,50,100")
+    raise BadInput(
+        f"{option} {text!r} must be whole numbers in {low} … {high}, for instance {low},{min(low + 1, high)}"
+    )

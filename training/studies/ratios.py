@@ -47,10 +47,8 @@ def table(episodes: Path, suite: str, agent: str) -> str:
     """
     values = _read(episodes, suite)
     if agent not in values:
-        there = ", ".join(values) or "none of that suite"
-        raise BadInput(
-            f"{episodes} holds no rows of {agent} on {suite}, but {there}; run mecanum benchmark with both"
-        )
+        there = f"but of {', '.join(values)}" if values else "and none of that suite"
+        raise BadInput(f"{episodes} holds no rows of {agent} on {suite}, {there}; run mecanum benchmark with both")
     head = [suite, *(name for name, _, _ in COLUMNS.values())]
     head += [f"`{agent}`: {name.split(' [')[0]}" for name, _, _ in COLUMNS.values()]
     rows = []

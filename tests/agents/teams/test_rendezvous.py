@@ -16,7 +16,7 @@ OF_TWO = {"teammates": np.zeros((1, 6))}
 
 def standing(x: float, age_s: float | None, *, ended: bool = False) -> Belief:
     """Where the robot is, the meeting place at x = 0; the other was last heard so long ago near that, or never."""
-    mates = () if age_s is None else (Teammate(1, np.array([0.0, -1.0, 0.0]), age_s, ended=ended),)
+    mates = () if age_s is None else (Teammate(1, np.array([0.0, -1.0, 0.0]), age_s, ended=ended, heard_s=age_s),)
     return replace(belief_of(half_known(), (x, 0.0, 0.0), origin=(-1.0, -2.0)), teammates=mates, robot=0)
 
 

@@ -12,9 +12,12 @@ import pytest
 import agents
 from agents.teams.assigned import Assigned
 from agents.teams.crew import Crew
+from agents.ways.cost_map import CostMaps, PlannerConfig
+from agents.ways.giving_way import costs_from
+from mecanum_env.config import RobotConfig
 from mecanum_env.team.team import Team
 from slam.belief import Teammate
-from slam.grids.occupancy import UNKNOWN
+from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from tests.agents.grids import belief_of, fill, room
 from tests.agents.teams.teams import crew_of, explore, run, touched
 
@@ -108,10 +111,26 @@ def test_a_cluster_that_one_cannot_reach_is_left_to_whoever_can():
     costs = np.array([[1.0, 4.0], [2.0, np.inf]])
     crew = Crew(
         robots=np.arange(2), own=0, pieces=np.arange(2), costs=costs, bound=np.full(2, -1),
-        cells=np.zeros((2, 2), np.int64), travel=cast(Any, None),
+        cells=np.zeros((2, 2), np.int64), travels=(),
     )  # fmt: skip
     found = cast(Any, SimpleNamespace(frontiers=SimpleNamespace(target_labels=np.arange(2))))
     assert Assigned()._owned(crew, found).tolist() == [1]
+
+
+def test_places_that_the_first_cannot_get_to_are_as_far_apart_as_the_others_find():
+    classes = np.full((80, 200), FREE, np.int8)
+    classes[:, 98:102] = OCCUPIED  # robot 0 is to the left of a wall, robots 1 and 2 to the right
+    cost_map = CostMaps(PlannerConfig(), RobotConfig()).of(belief_of(classes, (2.0, 2.0, 0.0)))
+    starts = [np.array([x, y]) for x, y in ((2.0, 2.0), (6.0, 2.0), (9.0, 2.0))]
+    travels = tuple(costs_from(cost_map, start) for start in starts)
+    cells = cost_map.to_cells(np.array([[6.5, 1.0], [6.5, 3.0], [9.5, 2.0]]))
+    costs = np.array([[travel.cost[tuple(cell)] for cell in cells] for travel in travels])
+    crew = Crew(
+        robots=np.arange(3), own=1, pieces=np.arange(3), costs=costs, bound=np.full(3, -1), cells=cells,
+        travels=cast(Any, travels),
+    )  # fmt: skip
+    agent = agents.make("team-tour")
+    assert agent._owned(crew, cast(Any, SimpleNamespace(cost_map=cost_map))).tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(("name", "alone"), [("team-tour", "brisk-tour"), ("team-frontier", "ppo-frontier")])

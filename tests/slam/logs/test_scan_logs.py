@@ -172,6 +172,13 @@ def test_a_late_stamp_is_put_between_its_neighbours():
     assert rising(np.array([3.0, 3.0])).tolist() == [2.0, 3.0]
 
 
+def test_a_clock_that_jumps_back_is_told_of(tmp_path):
+    lines = carmen_lines(30)
+    log = scan_log(put_lines(tmp_path / "a.log", lines))
+    back = scan_log(put_lines(tmp_path / "b.log", [*lines[15:], *lines[:15]]))
+    assert "did not rise" not in log.note and " of 30 stamps did not rise" in back.note
+
+
 def test_codes_for_no_return():
     ranges, reach = without_returns(np.array([[1.0, 8.183, 8.175, 0.0]]))
     assert reach == 8.18 and ranges[0, :3].tolist() == [1.0, math.inf, 8.175] and math.isnan(ranges[0, 3])

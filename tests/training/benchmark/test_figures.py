@@ -34,6 +34,13 @@ def test_what_was_never_reached_counts_as_the_limit_and_loses() -> None:
     assert against.probability.value == pytest.approx((1 + 0 + 0 + 0.5) / 4) and against.n == 4
 
 
+def test_the_way_of_one_that_has_not_explored_is_compared_with_none() -> None:
+    group = made_up_group(time_to_95_s=[40.0, None], path_length_m=[20.0, 1.0])
+    other = made_up_group("b", time_to_95_s=[40.0, 40.0], path_length_m=[10.0, 10.0])
+    against = comparisons(group, other)["path_length_m"]
+    assert against.n == 1 and against.probability.value == 0.0
+
+
 def test_what_is_not_defined_is_left_out_and_counted() -> None:
     found = figures(made_up_group(map_iou=[0.5, None, 0.7]))["map_iou"]
     assert found.averages.n == 2 and found.centre.value == pytest.approx(0.6)

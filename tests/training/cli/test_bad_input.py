@@ -150,6 +150,7 @@ def test_a_start_inside_a_wall_or_too_near_to_one(tmp_path: Path, capsys: pytest
             (f"odometry_filter = 'differential-transform'\n[odometry_filter_config]\n{line}", [line.split()[0]])
             for line in ("start_sigmas = ['a', 1, 2]", "start_sigmas = 3.0", "rest_speed_m_s = inf")
         ),
+        ("[run]\nagnet = 'ppo'", ["[run] has no agnet", "did you mean agent?"]),
         ("[run]\nagent = 'nobody'", ["unknown agent 'nobody'"]),
         ("[run]\nseed = 'x'", ["seed", "wrong type"]),
         ("[run]\nseed = -3", ["seed ≥ 0"]),

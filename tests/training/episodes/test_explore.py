@@ -41,6 +41,13 @@ def test_an_agent_that_is_lost_has_not_ended(tmp_path: Path) -> None:
     assert episode.metrics()["time_s"] == pytest.approx(4.9 + explore.AGENT_DONE_AFTER_S)
 
 
+@pytest.mark.parametrize(("step_s", "steps"), [(0.02, 15_000), (0.1, 3000), (1.0, 300)])
+def test_an_episode_may_take_as_long_whatever_a_step_is(step_s: float, steps: int, tmp_path: Path) -> None:
+    config = tmp_path / "c.toml"
+    config.write_text(f"step_s = {step_s}", "utf-8")
+    assert explore.prepare(out=tmp_path, config=config, rooms="rectangular", seed=5).run["max_steps"] == steps
+
+
 class WithoutGoals(Agent):
     """Drives by its observation alone, and never says that it has ended."""
 

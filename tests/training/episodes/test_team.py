@@ -168,6 +168,13 @@ def test_it_ends_when_nobody_has_anything_left(tmp_path: Path) -> None:
     assert math.isclose(episode.log.times[-1], 0.1 * (len(episode.log.times) - 1))
 
 
+def test_who_comes_back_is_not_ended_by_what_the_others_cover(tmp_path: Path) -> None:
+    asked = {"rooms": "rectangular", "seed": 431, "agent": "explore-and-return"}
+    episode = task.prepare(TeamConfig(robots=3), out=tmp_path, **asked)
+    task.run(episode, lambda **_: None)
+    assert episode.end == "returned" and episode.log.coverage[-1] > 0.95
+
+
 def test_a_joint_belief_has_one_map_which_is_nobodys(tmp_path: Path) -> None:
     team = TeamConfig(robots=2, belief="joint")
     episode = task.prepare(team, out=tmp_path, rooms="rectangular", seed=3, max_steps=10)

@@ -114,6 +114,12 @@ def test_options_and_config_lie_over_the_logs_own_values(logs: Path, tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
+def test_a_replay_that_is_limited_says_so(logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(logs / "utias" / "Robot1_Odometry.dat")
+    found = replayed([log, "--limit-s", "5", "--out", str(tmp_path / "out")], capsys)
+    assert found["end"] == "the limit, --limit-s" and found["duration_s"] == pytest.approx(5.0)
+
+
 def test_a_log_has_values_for_one_backend_alone(logs: Path, tmp_path: Path) -> None:
     told = {
         name: task.prepare(logs / "utias", out=tmp_path / "out", slam=name).backend.config.loop_sigma_m  # type: ignore[attr-defined]

@@ -182,6 +182,8 @@ def complexity(*, backends: str, landmarks: str, steps: int, out: Path) -> dict[
     result["config"] = settings
     write_json(out / "complexity.json", result)
     label(axes, f"Time per step: predict, and observe {SEEN} of n landmarks", "landmarks n", "µs", log="xy")
+    axes.set_xticks(sizes, list(map(str, sizes)))
+    axes.set_xticks([], minor=True)
     atomic_write(out / "complexity.png", png(figure))
     return result
 

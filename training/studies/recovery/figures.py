@@ -95,7 +95,13 @@ def draw_reliability(found: Mapping[str, Mapping[str, Any]]) -> Figure:
             health, true, yerr=spread, fmt="o-", color=COLOURS[k % len(COLOURS)], capsize=3, label=name
         )
         bars = np.arange(len(one["seconds"])) + (k - 0.5 * (len(found) - 1)) * width
-        counts.bar(bars, np.maximum(one["seconds"], 0.5), width, color=COLOURS[k % len(COLOURS)], label=name)
+        counts.bar(
+            bars,
+            np.where(np.array(one["seconds"]) > 0, one["seconds"], np.nan),
+            width,
+            color=COLOURS[k % len(COLOURS)],
+            label=name,
+        )
     diagram.set_xlim(0.0, 1.0)
     diagram.set_ylim(0.0, 1.02)
     label(diagram, "Is the belief true as often as it says?", "health", "share within the 99.7 % region")
