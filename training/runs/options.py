@@ -37,7 +37,7 @@ FloorPlanFile = Annotated[
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output, nothing else.")]
 MaxSteps = Annotated[
     int | None,
-    typer.Option(min=1, max=1_000_000, help="Step limit.  [default: 12 per m² of free space, at least 3000]"),
+    typer.Option(min=1, max=1_000_000, help="Step limit.  [default: 1.2 s per m² of free space, at least 300 s]"),
 ]
 Noise = Annotated[str | None, typer.Option(help="Noise preset.  [default: nominal]")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
