@@ -137,8 +137,6 @@ def observation_rows(observations: Observations) -> Array:
     cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
     if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
         raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
-    if np.any(rb[:, 0] < 0.0):
-        raise ValueError(f"ranges of observations are 0 m or more, got {rb[:, 0].min()}")
     if np.any(cov[:, 0, 0] <= 0.0) or np.any(cov[:, 0, 0] * cov[:, 1, 1] <= cov[:, 0, 1] ** 2):
         raise ValueError("covariances of observations must be positive definite; what is not known is large")
     if observations.ids is not None:

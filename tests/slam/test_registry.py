@@ -192,7 +192,6 @@ def test_labels_and_what_scans_show_are_kept_apart(name: str) -> None:
 @pytest.mark.parametrize(
     ("wrong", "what"),
     [
-        ({"range_bearing": np.array([[2.0, 0.3], [-1.0, 0.0]])}, "ranges of observations are 0 m or more, got -1"),
         ({"ids": np.array([0])}, "ids of 2 observations must be as many whole numbers"),
         ({"ids": np.array([0.0, 1.0])}, "as many whole numbers"),
         ({"ids": np.array([0, -1])}, r"must be in \[0, 1000000\], got -1 to 0"),
