@@ -68,7 +68,7 @@ explore: $(VENV)/core.stamp ## one episode: an unseen apartment, explored and ma
 test: ## everything CI checks (WORKERS)
 	$(MAKE) --no-print-directory -j2 $(VENV)/kernels.stamp $(VENV)/test.stamp
 	$(MAKE) --no-print-directory -j2 lint types pytest
-	$(MAKE) --no-print-directory other-gymnasium package
+	$(MAKE) --no-print-directory -j2 other-gymnasium package
 
 # What an episode runs is compiled, and kept.
 $(VENV)/kernels.stamp: $(VENV)/core.stamp
