@@ -143,6 +143,9 @@ def _has(key: str, found: Mapping[str, Intervals]) -> bool:
     return any(not math.isnan(figures.get(key, NONE).value) for figures in found.values())
 
 
+_FEWEST = 10  # episodes: a bootstrap of fewer is too sure
+
+
 def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None) -> Table:
     """Return a table of name → metric → comparison with the baseline."""
     rows = []
@@ -151,7 +154,8 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
         for key in AGAINST:
             share = against[key].probability
             note = "" if math.isnan(share.value) else _plain(_share(share))
-            cells.append(change(BY_KEY[key], against[key].ratio, note))
+            cell = change(BY_KEY[key], against[key].ratio, note)
+            cells.append(cell if against[key].n >= _FEWEST else replace(cell, tone=""))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))
     labels = [BY_KEY[key].label for key in AGAINST]

@@ -9,6 +9,7 @@ import pytest
 
 from tests.training.benchmark.small import made_up_group
 from training.benchmark.figures import comparisons, figures, with_regrets
+from training.benchmark.tables import AGAINST, against_table
 
 
 def test_regret_is_over_the_least_time_in_the_same_room_whoever_had_it() -> None:
@@ -39,6 +40,13 @@ def test_the_way_of_one_that_has_not_explored_is_compared_with_none() -> None:
     other = made_up_group("b", time_to_95_s=[40.0, 40.0], path_length_m=[10.0, 10.0])
     against = comparisons(group, other)["path_length_m"]
     assert against.n == 1 and against.probability.value == 0.0
+
+
+@pytest.mark.parametrize(("episodes", "tone"), [(9, ""), (10, "better")])
+def test_what_few_episodes_say_has_no_colour(episodes: int, tone: str) -> None:
+    pair = [made_up_group(time_to_95_s=[time_s] * episodes) for time_s in (20.0, 40.0)]
+    table = against_table({"a": comparisons(*pair)}, "b")
+    assert table.rows[0][1][AGAINST.index("time_to_95_s")].tone == tone
 
 
 def test_what_is_not_defined_is_left_out_and_counted() -> None:
