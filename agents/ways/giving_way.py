@@ -1,8 +1,9 @@
 """Who gives way where two robots hold each other up, and where to.
 
 The lower number has right of way: the other drives to the nearest place beside the way that the first one takes,
-and waits there. Both work it out by themselves. One that has nothing to do gives way to all that have. One with
-right of way does so, too, if it is held up for longer: the other may have no place to go.
+and waits there. Both work it out by themselves. One that has nothing to do gives way to all that have.
+One with right of way does so, too, if it is held up for longer: the other may have no place to go. Of one that is
+not heard nobody knows where it goes: it is taken to want to get past, as long as it moves.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from slam.types import Array, Indices
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
 
 _SLOW_M_S, _SLOW_SHARE = 0.06, 0.12  # that is held up, of a slow robot as a share of its speed
+_HEARD_S = 1.0  # ago, at most, that another was heard of whom it is known whether it has a goal
+_STIRRED_M, _STANDS_S = 0.3, 8.0  # one that has moved no farther in so long wants nothing
+_PAST_M = (3.0, 1.5)  # beyond this robot that another wants to get, where there is room
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +58,8 @@ class GivingWay:
         self._slow_m_s = min(_SLOW_M_S, _SLOW_SHARE * robot.max_speed_m_s)
         self.until_s = -math.inf
         self._held_s = 0.0
+        self._watched: tuple[int, float, float] = (-1, 0.0, 0.0)  # a robot that is not heard, and where it was …
+        self._stood_s = 0.0  # … since when
 
     def nearest(self, belief: Belief, within_m: float) -> Teammate | None:
         """Return the nearest of the other robots within a distance [m]."""
@@ -73,7 +79,8 @@ class GivingWay:
         config = self.config
         idle = speed_m_s is None
         mate = self.nearest(belief, config.idle_near_m if idle else config.near_m)
-        if mate is None or (idle and mate.goal is None):
+        silent = mate is not None and self._watch(mate, step_s)
+        if mate is None or (idle and mate.goal is None and not silent):
             self._held_s = 0.0
             return None
         if speed_m_s is not None and speed_m_s > self._slow_m_s:
@@ -81,19 +88,31 @@ class GivingWay:
             self._held_s = max(self._held_s - step_s, 0.0)
             return None
         self._held_s += step_s
-        behind = idle or (mate.robot < belief.robot and mate.goal is not None)
+        behind = idle or (mate.robot < belief.robot and (silent or mate.goal is not None))
         if self._held_s + 1e-9 < (config.patience_s if behind else config.firm_s):
             return None
         self._held_s = 0.0
         return mate
+
+    def _watch(self, mate: Teammate, step_s: float) -> bool:
+        """Tell whether another is not heard, and moves."""
+        if not _unheard(mate):
+            return False
+        robot, x, y = self._watched
+        if robot != mate.robot or math.hypot(float(mate.pose[0]) - x, float(mate.pose[1]) - y) > _STIRRED_M:
+            self._watched, self._stood_s = (mate.robot, float(mate.pose[0]), float(mate.pose[1])), 0.0
+        self._stood_s += step_s
+        return self._stood_s < _STANDS_S
 
     def refuge(
         self, cost_map: CostMap, belief: Belief, mate: Teammate
     ) -> tuple[TravelCosts, tuple[int, int]] | None:
         """Return travel costs, and the nearest place beside another's way; ``None``: it stands there, or none is.
 
-        Where the other's goal is not known, beside the other.
+        Where the other's goal is not known, beside the other; of one that is not heard, beside the way past here.
         """
+        if _unheard(mate):
+            mate = mate._replace(goal=_past(cost_map, mate, belief.pose))
         reach = (2.0 * self._radius_m + self.config.beside_m) / cost_map.resolution  # a team's robots are alike
         open_ = np.ones(cost_map.weight.shape, np.uint8)
         open_[tuple(_way(cost_map, mate).T)] = 0
@@ -114,6 +133,23 @@ class GivingWay:
         if not costs[best] <= self.config.far_m:
             return None
         return travel, (int(best[0]), int(best[1]))
+
+
+def _unheard(mate: Teammate) -> bool:
+    return mate.goal is None and mate.heard_s > _HEARD_S and not mate.ended
+
+
+def _past(cost_map: CostMap, mate: Teammate, pose: Array) -> Array:
+    """Return where another comes to that goes straight on past a pose ``(≥ 2,)``, as far as there is room."""
+    here = np.asarray(pose, np.float64)[:2]
+    ahead = here - np.asarray(mate.pose)[:2]
+    ahead /= max(float(np.hypot(*ahead)), 1e-9)
+    for beyond in _PAST_M:
+        row, col = (int(v) for v in cost_map.to_cells((here + beyond * ahead)[None])[0])
+        rows, cols = cost_map.plain.shape
+        if 0 <= row < rows and 0 <= col < cols and cost_map.plain[row, col] > 0.0:
+            return np.asarray(here + beyond * ahead)
+    return here
 
 
 def _way(cost_map: CostMap, mate: Teammate) -> Indices:

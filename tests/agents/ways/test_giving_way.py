@@ -30,8 +30,11 @@ def corridor_with_bay() -> np.ndarray:
     return classes
 
 
-def meeting(own: tuple[float, float], other: tuple[float, float], goal, robot: int = 1) -> Belief:
-    mate = Teammate(1 - robot, np.array([*other, 0.0]), 0.0, None if goal is None else np.array(goal))
+def meeting(
+    own: tuple[float, float], other: tuple[float, float], goal, robot: int = 1, *, heard_s: float = 0.0
+) -> Belief:
+    told = None if goal is None else np.array(goal)
+    mate = Teammate(1 - robot, np.array([*other, 0.0]), 0.0, told, heard_s=heard_s)
     return replace(belief_of(corridor_with_bay(), (*own, 0.0)), teammates=(mate,), robot=robot)
 
 
@@ -63,6 +66,20 @@ def test_who_gives_way_and_when(robot, goal, speed, after_s):
     giving, belief = GivingWay(GivingWayConfig(), ROBOT), meeting((5.0, 0.6), (4.0, 0.6), goal, robot)
     asked = [giving.asked(belief, speed, 0.1) is not None for _ in range(60)]
     assert (asked.index(True) + 1 if True in asked else None) == (None if after_s is None else round(10 * after_s))
+
+
+@pytest.mark.parametrize(("robot", "speed", "after_s"), [(1, 0.0, 0.8), (0, 0.0, 4.0), (0, None, 0.8)])
+def test_one_that_is_not_heard_is_let_past_as_long_as_it_moves(robot, speed, after_s):
+    giving = GivingWay(GivingWayConfig(), ROBOT)
+    belief = meeting((5.0, 0.6), (4.0, 0.6), None, robot, heard_s=np.inf)
+    asked = [giving.asked(belief, speed, 0.1) is not None for _ in range(200)]
+    assert asked.index(True) + 1 == round(10 * after_s)
+    assert any(asked[100:]) is (speed is not None)  # one without a goal makes way for none that stands
+    cost_map = build(belief, PlannerConfig(), ROBOT)
+    found = giving.refuge(cost_map, belief, belief.teammates[0])
+    assert found is not None
+    x, y = cost_map.to_points(np.array([found[1]]))[0]
+    assert 7.0 < x < 8.6 and y > 1.2  # in the bay: it will come by here
 
 
 def test_ways_lead_round_another_and_are_as_before_when_it_has_gone():
@@ -123,11 +140,12 @@ class Commuter(Explorer):
         return True
 
 
+@pytest.mark.parametrize("model", ["unlimited", "none"])
 @pytest.mark.parametrize("seed", [0, 2])
 @pytest.mark.parametrize("bay", [3.0, 4.2])
 @pytest.mark.parametrize("order", [1, -1])
-def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed):
-    """Wherever the bay is, and whoever of the two has right of way."""
+def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed, model):
+    """Wherever the bay is, whoever of the two has right of way, and whether or not they hear each other."""
     left, right = bay, bay + 1.6
     walls = [
         [0.0, 0.0, 9.0, 0.0], [9.0, 0.0, 9.0, 1.2], [9.0, 1.2, right, 1.2], [right, 1.2, right, 2.8],
@@ -138,7 +156,9 @@ def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed):
     free[:, round(left / 0.05) : round(right / 0.05)] = True
     starts = np.array([[0.8, 0.6, 0.0], [8.2, 0.6, 0.0]])[::order]
     plan = FloorPlan(name="bay", walls=np.array(walls), free=free, resolution=0.05, start=tuple(starts[0]))
-    team = Team(robots=2, floor_plan=plan, config={"coverage_target": 1.0})
+    team = Team(
+        robots=2, floor_plan=plan, config={"coverage_target": 1.0}, team={"communication": {"model": model}}
+    )
     observed = team.reset(seed=seed, options={"start_poses": starts})
     crew = {}
     for member in team.members:
@@ -150,7 +170,13 @@ def test_two_that_meet_in_a_corridor_get_past_each_other(bay, order, seed):
         goal = crew[k].goal
         return None if goal is None else goal.pose[:2].copy()
 
-    run(team, lambda k, seen, belief: crew[k].act(seen, belief), observed, 700, announce)
+    run(
+        team,
+        lambda k, seen, belief: crew[k].act(seen, belief),
+        observed,
+        700 if model == "unlimited" else 1000,
+        announce,
+    )
     assert touched(team) == 0
     for member in team.members:
         there = starts[1 - member.number][:2]
