@@ -112,7 +112,7 @@ monte-carlo: $(VENV)/test.stamp ## the long statistical runs
 evaluate: $(VENV)/core.stamp ## the table of docs/studies/estimators.md: 300 episodes on the test seeds
 	$(BIN)/mecanum study accuracy --workers $(WORKERS) --out out/evaluate
 
-benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (40 min on two cores; goes on where it was broken off)
+benchmark: $(VENV)/core.stamp ## BENCHMARK.md: the agents above on every suite (an hour on two cores; goes on where it was broken off)
 	$(BIN)/mecanum benchmark --suite all --agents $(AGENTS) --workers $(WORKERS) --out out/benchmark --report
 	$(BIN)/mecanum study leaderboard out/benchmark BENCHMARK.md
 
