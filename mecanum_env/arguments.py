@@ -74,7 +74,8 @@ def make_config(
         lidar = preset if lidar is None and "lidar" not in given_parts else lidar
         noise = preset if noise is None and "noise" not in given_parts else noise
     require(
-        rooms is None or floor_plan is None, "rooms and floor_plan are two places to explore; give one of them"
+        rooms is None or floor_plan is None,
+        "a floor plan is explored instead of rooms; leave out the one or the other",
     )
     if rooms is not None:
         changes["floor_plan"] = None

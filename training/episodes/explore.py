@@ -28,7 +28,7 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "done", "make_agent", "prepare", "read_run_table", "refuse_two_places", "run",
+    "done", "make_agent", "prepare", "read_run_table", "run",
     "run_whole",
 ]  # fmt: skip
 
@@ -170,7 +170,6 @@ def asked_for(
     An agent maps all that it can reach; what counts as success, the world's ``coverage_target``, is judged at
     the end.
     """
-    refuse_two_places(rooms, floor_plan)
     past = read_run_table(config) if config is not None else {}
     if any(v is not None for v in (rooms, floor_plan, seed)):
         # Other rooms: neither the start nor the step limit is meant for them.
@@ -181,9 +180,7 @@ def asked_for(
     if run["agent"].endswith(".safetensors"):
         run["agent"] = str(Path(run["agent"]).absolute())  # as a floor plan's
     world = make_config(config=config, rooms=rooms, slam=slam, robot=robot, noise=noise, floor_plan=floor_plan)
-    if rooms is not None and floor_plan is None:
-        world = replace(world, floor_plan=None)
-    elif world.floor_plan is not None:
+    if world.floor_plan is not None:
         world = replace(world, floor_plan=str(Path(world.floor_plan).absolute()))
     if coverage_target is not None:
         world = replace(world, coverage_target=coverage_target)
@@ -196,12 +193,6 @@ def asked_for(
 def _step_limit(area_m2: float, step_s: float) -> int:
     """Return how many steps an episode may have: the same time, however long a step is."""
     return math.ceil(round(max(LEAST_STEPS, math.ceil(STEPS_PER_M2 * area_m2)) * 0.1 / step_s, 6))
-
-
-def refuse_two_places(rooms: str | None, floor_plan: Path | None) -> None:
-    """Raise ``ValueError`` where both rooms and a plan are asked for: the rooms would be passed over."""
-    if rooms is not None and floor_plan is not None:
-        raise ValueError("a floor plan is explored instead of rooms; leave out the one or the other")
 
 
 def done(agent: Agent) -> bool:

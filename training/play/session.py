@@ -19,7 +19,7 @@ from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.render import render_frame
 from slam.files import plain_name
-from training.episodes.explore import make_agent, refuse_two_places
+from training.episodes.explore import make_agent
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 from training.runs.typed import LAST_SEED
@@ -38,7 +38,6 @@ def checked_config(agent: str, **where: Any) -> EnvConfig:
         In one line: which option, file or name is wrong, the agent's among them, and what to do.
     """
     with bad_input():
-        refuse_two_places(where.get("rooms"), where.get("floor_plan"))
         agents.check(agent)
         return make_config(**where)
 

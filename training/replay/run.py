@@ -127,9 +127,11 @@ def prepare(
         check_name("association", known, ASSOCIATIONS)
         if known == "known" and log.ids is None:
             raise ValueError(f"log {log.name} does not tell landmarks apart; give --association unknown")
-        limit = run.get("limit_s")
+        limit, end = run.get("limit_s"), "end of the log"
         if limit is not None:
             require(0 < limit < math.inf, f"--limit-s must be above 0 and finite, got {limit}")
+            if limit < log.duration_s:
+                end = "the limit, --limit-s"
             log = log.until(float(limit))
         effective = _make_config(log, values, slam)
         backend = make(effective.slam, config=effective.slam_config)
@@ -145,7 +147,7 @@ def prepare(
     if robot is not None:
         run["robot"] = robot
     times, rows = sample_times(log)
-    return Replay(log, effective, backend, run, out, times, rows)
+    return Replay(log, effective, backend, run, out, times, rows, end=end)
 
 
 def _topics(run: Mapping[str, Any]) -> BagTopics | None:
@@ -233,7 +235,6 @@ def run(replay: Replay, progress: Callable[[float], None]) -> None:
                 )
         else:
             _sample(replay, math.inf, (0.0, 0.0, 0.0))
-            replay.end = "end of the log" if "limit_s" not in replay.run else "the limit, --limit-s"
     replay.wall_time_s = time.perf_counter() - began
 
 

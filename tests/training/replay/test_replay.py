@@ -118,6 +118,8 @@ def test_a_replay_that_is_limited_says_so(logs: Path, tmp_path: Path, capsys: py
     log = str(logs / "utias" / "Robot1_Odometry.dat")
     found = replayed([log, "--limit-s", "5", "--out", str(tmp_path / "out")], capsys)
     assert found["end"] == "the limit, --limit-s" and found["duration_s"] == pytest.approx(5.0)
+    found = replayed([log, "--limit-s", "500", "--out", str(tmp_path / "out")], capsys)
+    assert found["end"] == "end of the log" and found["duration_s"] == pytest.approx(20.0)
 
 
 def test_a_log_has_values_for_one_backend_alone(logs: Path, tmp_path: Path) -> None:
