@@ -156,7 +156,7 @@ def make_plan(
     if not isinstance(given, FloorPlan | str | Path | None):
         raise ValueError(f"floor_plan must be a FloorPlan or a path, got {quoted(given)}")
     if given is not None and not isinstance(given, FloorPlan):
-        return room_registry.load(given, start=start, seed=seed)
+        return room_registry.load(given, start=start, seed=seed, roomy_m=config.robot.circumscribed_radius_m)
     plan = room_registry.make(config.rooms, seed=seed, config=config.rooms_config) if given is None else given
     return plan if start is None else plan.with_start(start, clearance_m=config.robot.inscribed_radius_m)
 

@@ -18,7 +18,7 @@ from slam.logs import carmen, dpslam, ros_bag, utias, victoria_park
 from slam.logs.log import Event
 from slam.logs.recorded import ObservationNoise, RecordedLog
 from slam.logs.ros_bag import BagTopics, parse_mount
-from slam.logs.scans import ScanLog
+from slam.logs.scans import ScanLog, beside
 from slam.logs.tables import read_lines
 from slam.types import Indices
 
@@ -105,8 +105,9 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
     log : ScanLog
         What is replayed.
     path : path
-        A CARMEN log, whose FLASER poses are taken; scans are matched by their time stamps, equal ones in order.
-        Or a DP-SLAM log of as many scans, which are matched by their number.
+        A CARMEN log, whose FLASER poses are taken; beside a bag they are of the robot's frame. Scans are matched
+        by their time stamps, equal ones in order. Or a DP-SLAM log of as many scans, which are matched by their
+        number.
 
     Raises
     ------
@@ -134,7 +135,7 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
         raise ValueError(
             f"reference {path} has no scan at a time stamp of {log.name}'s; give a log of the same scans"
         )
-    return log.with_reference(scans, poses[matched], note)
+    return log.with_reference(scans, beside(poses[matched], log.beside_m), note)
 
 
 _KNOWN = (

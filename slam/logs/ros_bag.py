@@ -9,6 +9,7 @@ point of the robot's frame that lies straight behind it.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 
 from slam.files import BagMessage, bag_messages, plain_name, quoted
 from slam.geometry import relative, wrap
-from slam.logs.scans import SETTINGS, ScanLog, chain, moved_by, rising
+from slam.logs.scans import SETTINGS, ScanLog, beside, chain, rising
 from slam.ros import Frames, Mount, mount_of, odometry_of, pose_of, resampled, scan_of, stamp_of, transforms_of
 from slam.types import Array, Scan
 
@@ -101,7 +102,7 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     Scans before the first odometry and after the last are left out; at the others the odometry is interpolated.
     Where that jumps, as when its driver was started again, it goes on from where it was. Messages may lie in any
     order; their stamps tell.
-    Scans whose beams lie otherwise than the first one's take, at each of its bearings, the nearest beam.
+    Scans whose beams lie otherwise than most scans' take, at each of those bearings, the nearest beam.
 
     Raises
     ------
@@ -132,10 +133,10 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     if len(covered) > 1 and np.ptp(stamps[covered]) == 0.0:
         raise ValueError(f"{where}: all scans of {scan_topic} have one time stamp; correct its driver")
     stamps = stamps[covered]
-    poses = _beside(_at(stamps, odometry_times, odometry), mount)
-    ranges, first = _ranges([scans[i][1] for i in covered], mount)
-    if np.isnan(ranges).all():
-        within = f"range_min and range_max, {first.range_min:.4g} and {first.range_max:.4g} m"
+    poses = beside(_at(stamps, odometry_times, odometry), mount.y_m)
+    ranges, usual = _ranges([scans[i][1] for i in covered], mount)
+    if not np.isfinite(ranges).any():
+        within = f"range_min and range_max, {usual.range_min:.4g} and {usual.range_max:.4g} m"
         raise ValueError(
             f"{where}: every beam of {scan_topic} is lost: no range lies between {within}; correct its driver"
         )
@@ -143,8 +144,9 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     gap_s = max(_REFERENCE_GAP_S, _GAP_SCANS * float(np.median(np.diff(times)))) if len(times) > 1 else 0.0
     log = ScanLog(
         name=plain_name(path.absolute().name.split(".")[0]), clock_start_s=float(times[0]), times=times - times[0],
-        stamps=stamps, ranges=ranges, angle_min=first.angle_min, angle_increment=first.angle_increment,
-        range_max=first.range_max, odometry_poses=poses, start_pose=poses[0].copy(), reference_times=np.zeros(0),
+        stamps=stamps, ranges=ranges, angle_min=usual.angle_min, angle_increment=usual.angle_increment,
+        range_max=usual.range_max, odometry_poses=poses, start_pose=poses[0].copy(), beside_m=mount.y_m,
+        reference_times=np.zeros(0),
         reference_poses=np.zeros((0, 3)), reference_gap_s=gap_s,
         settings=SETTINGS | {"lidar_offset_m": mount.x_m},
         note=f"no reference; give one with --reference-topic{left_out}",
@@ -157,7 +159,7 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     if not len(rows):
         raise ValueError(f"{where}: {topics.reference} has no pose within {_REFERENCE_GAP_S} s of a scan")
     note = f"reference: {topics.reference}; the start pose is the reference's{left_out}"
-    at = _beside(_at(stamps[rows], reference_times, reference), mount)
+    at = beside(_at(stamps[rows], reference_times, reference), mount.y_m)
     return log.with_reference(rows, at, plain_name(note))
 
 
@@ -284,15 +286,16 @@ def _mount(found: _Found, base: str, sensor: str, where: str) -> Mount:
 
 
 def _ranges(scans: list[Scan], mount: Mount) -> tuple[Any, Scan]:
-    """Return ranges ``(n, beams)`` at the first scan's bearings by the robot's heading, and that scan."""
-    first = mount.level(scans[0])
-    like = (first.angle_min, first.angle_increment, len(first.ranges))
+    """Return ranges ``(n, beams)`` at most scans' bearings by the robot's heading, and the first of those."""
+    lie = [(scan.angle_min, scan.angle_increment, len(scan.ranges)) for scan in scans]
+    usual = mount.level(scans[lie.index(Counter(lie).most_common(1)[0][0])])
+    like = (usual.angle_min, usual.angle_increment, len(usual.ranges))
     levelled = (mount.level(scan) for scan in scans)
     rows: Iterator[Array] = (
         s.ranges if (s.angle_min, s.angle_increment, len(s.ranges)) == like else resampled(s, *like)
         for s in levelled
     )
-    return np.stack([np.asarray(row, np.float32) for row in rows]), first
+    return np.stack([np.asarray(row, np.float32) for row in rows]), usual
 
 
 def _in_order(scans: list[tuple[float, Scan]]) -> list[tuple[float, Scan]]:
@@ -323,11 +326,6 @@ def _at(stamps: Array, times: Array, poses: Array) -> Array:
     """Return poses ``(m, 3)`` at stamps, between those at times ``(n,)``, whose headings are unwrapped."""
     x, y, theta = (np.interp(stamps, times, column) for column in poses.T)
     return np.column_stack([x, y, wrap(theta)])
-
-
-def _beside(poses: Array, mount: Mount) -> Array:
-    """Return poses ``(n, 3)`` of the robot's frame, moved sideways to stand behind the lidar."""
-    return moved_by(poses, np.array([0.0, mount.y_m, 0.0])) if mount.y_m else poses
 
 
 def _bracketed(stamps: Array, times: Array) -> Any:

@@ -17,7 +17,17 @@ from slam.logs.recorded import ObservationNoise
 from slam.motion import twist_between
 from slam.types import Array, Floats, Indices, Odometry, Scan
 
-__all__ = ["SETTINGS", "ScanLog", "beam_angles", "chain", "moved_by", "rising", "scan_log", "without_returns"]
+__all__ = [
+    "SETTINGS",
+    "ScanLog",
+    "beam_angles",
+    "beside",
+    "chain",
+    "moved_by",
+    "rising",
+    "scan_log",
+    "without_returns",
+]
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
 # way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.
@@ -44,6 +54,9 @@ _UNTOLD = {"odometry": _ODOMETRY | {"mount_sigma_m": 0.1}, "health": {"recover":
 _NO_RETURN_MM_M = 8.18
 _NO_RETURN_CM_M = 81.8
 _HIGHEST_MM_M = 8.192
+# Another laser says the farthest that it measures. So many beams, at so many bearings, are no wall: on real logs
+# the highest range is that of 1 beam of 100,000.
+_SATURATED, _SATURATED_BEAMS, _SATURATED_BEARINGS, _SAME_M = 0.005, 10, 0.05, 1e-3
 
 
 # First bearing and step [°], where the number of beams tells them; GMapping's reader has the same steps.
@@ -71,6 +84,7 @@ class ScanLog(Log):
     angle_increment: float  # [rad]
     range_max: float  # [m]
     odometry_poses: Array  # (n, 3) [m, m, rad] by the wheels alone, in a frame of their own
+    beside_m: float = 0.0  # how far to the left of the robot's middle the lidar sits; poses are of its line
 
     # What a log of landmark observations has, and this one has not.
     ids = None
@@ -141,7 +155,7 @@ def scan_log(
 ) -> ScanLog:
     """Return a log without a reference, of ranges ``(n, beams)`` [m] as they were recorded."""
     measured, reach = without_returns(ranges)
-    if np.isnan(measured).all():
+    if not np.isfinite(measured).any():
         raise ValueError(
             f"{path}: no range is above 0 and below {_NO_RETURN_CM_M} m, so nothing was measured; give ranges in m"
         )
@@ -184,6 +198,11 @@ def moved_by(poses: Array, offset: Array) -> Array:
     return relative(relative(poses, np.zeros_like(poses)), np.broadcast_to(offset, poses.shape))
 
 
+def beside(poses: Array, beside_m: float) -> Array:
+    """Return poses ``(n, 3)`` moved to the left: of the point of the robot that lies straight behind its lidar."""
+    return moved_by(poses, np.array([0.0, beside_m, 0.0])) if beside_m else poses
+
+
 def rising(stamps: Array) -> Array:
     """Return time stamps ``(n ≥ 1,)`` that rise: those out of order are put evenly between their neighbours.
 
@@ -217,7 +236,8 @@ def without_returns(ranges: Array) -> tuple[Array, float]:
     A log that goes up to the codes of the millimetre mode is a short-range laser's: nothing returned within
     8.18 m, which is ``inf``. In the centimetre mode, 81.8 m and more, a beam is taken for lost, ``nan``: in a
     building it met glass or a black surface, not 80 m of free space. There the reach is that of the log's
-    farthest measurement. A range of 0 is a beam lost, too.
+    farthest measurement. A range of 0 is a beam lost, too. Where many beams at many bearings have the highest
+    range of all, that is no measurement either: taken as these codes are, by how far it is.
     """
     out = np.where(ranges > 0.0, ranges, math.nan)
     highest = float(np.nanmax(out, initial=0.0))
@@ -225,5 +245,13 @@ def without_returns(ranges: Array) -> tuple[Array, float]:
         out[out >= _NO_RETURN_MM_M] = math.inf
         return out, _NO_RETURN_MM_M
     out[out >= _NO_RETURN_CM_M] = math.nan
+    highest = float(np.nanmax(out, initial=0.0))
+    at = out >= highest - _SAME_M
+    beams, of = np.count_nonzero(at), np.count_nonzero(np.isfinite(out))
+    if max(_SATURATED * of, _SATURATED_BEAMS) < beams < of and at.any(axis=0).mean() > _SATURATED_BEARINGS:
+        if highest < _NO_RETURN_MM_M:
+            out[at] = math.inf
+            return out, highest
+        out[at] = math.nan
     # Above the farthest, since a range at the reach itself counts as no return.
     return out, (math.floor(float(np.nanmax(out, initial=0.0)) * 10.0 + 1e-6) + 1) / 10.0

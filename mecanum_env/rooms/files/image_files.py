@@ -7,7 +7,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from mecanum_env.rooms.floor_plan import FloorPlanError
 from slam.files import read_bytes as read_file
@@ -52,7 +52,7 @@ def _reason(error: Exception) -> str:
 def read_grey(path: Path) -> Floats:
     """Return an image as grey values ``(rows, cols)`` in 0 to 255, row 0 at the top; transparent is NaN.
 
-    Colours are averaged, as ROS's map_server does.
+    Colours are averaged, as ROS's map_server does. An image is turned as its EXIF says.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def read_grey(path: Path) -> Floats:
         if max(image.size) > _MAX_SIDE or image.width * image.height > _MAX_PIXELS:
             raise Image.DecompressionBombError(f"it has {image.width} × {image.height} pixels")
         image.verify()  # a PNG's checksums; the image must be opened again after it
-        return _grey(Image.open(data, formats=_FORMATS))
+        return _grey(ImageOps.exif_transpose(Image.open(data, formats=_FORMATS)))
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise FloorPlanError(
             f"image {path} is too large ({error}); scale it down to at most {_MAX_SIDE} a side and "
@@ -81,6 +81,8 @@ def read_grey(path: Path) -> Floats:
 
 def _grey(image: Image.Image) -> Floats:
     if image.mode.startswith("I"):  # 16 bits, which Pillow scales to 65535
-        return np.asarray(image, np.float32) * np.float32(255.0 / 65535.0)
+        values = np.asarray(image, np.float32)
+        grey = values * np.float32(255.0 / 65535.0)
+        return np.where(values == image.info.get("transparency"), np.float32(np.nan), grey)
     pixels = np.asarray(image.convert("RGBA"))
     return np.where(pixels[..., 3] >= 128, pixels[..., :3].mean(axis=2, dtype=np.float32), np.float32(np.nan))

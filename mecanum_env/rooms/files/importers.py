@@ -38,8 +38,9 @@ _MOST_WALLS = 100_000  # the time that their corners take goes by the square
 
 
 def load(
-    path: str | Path, *, start: Pose | None = None, seed: int = 0, resolution: float | None = None
-) -> FloorPlan:
+    path: str | Path, *, start: Pose | None = None, seed: int = 0, resolution: float | None = None,
+    roomy_m: float = 0.0,
+) -> FloorPlan:  # fmt: skip
     """Read a floor plan from a file; its suffix says how.
 
     Parameters
@@ -50,6 +51,8 @@ def load(
         Start pose x, y [m], θ [rad] in the plan's frame; None chooses a roomy place by ``seed``.
     resolution
         Size of an image's pixel [m], 0.05 where None; a ROS map says its own.
+    roomy_m
+        How far a start that is chosen is clear of everything [m], where there is such a place; 0.6 at least.
 
     Raises
     ------
@@ -74,7 +77,9 @@ def load(
         what = f"map {shown_path(path)}"
         raster = _read_ros_map(path, what)
     free, cell_m, origin = raster
-    return from_raster(free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, what=what)
+    return from_raster(
+        free, name=path.stem, resolution=cell_m, origin=origin, start=start, seed=seed, roomy_m=roomy_m, what=what
+    )
 
 
 def image_of(path: Path) -> Path:
@@ -145,13 +150,14 @@ def from_raster(
     origin: tuple[float, float] = (0.0, 0.0),
     start: Pose | None = None,
     seed: int = 0,
+    roomy_m: float = 0.0,
     what: str | None = None,
 ) -> FloorPlan:
     """Return the plan of a raster of free cells ``(rows, cols)``, row 0 at the lowest y.
 
     Its walls lie within half a cell of the edges between free and other cells; see :mod:`.outline`. The start is
     given, or chosen by ``seed`` in the largest area that a disc of 0.40 m can drive in (or a smaller one, where
-    that fits nowhere), 0.6 m clear of everything if possible, heading 0.
+    that fits nowhere), 0.6 m or ``roomy_m`` clear of everything if possible, heading 0.
 
     Raises
     ------
@@ -177,12 +183,12 @@ def from_raster(
         free=free,
         resolution=resolution,
         origin=origin,
-        start=_start(free, resolution, origin, rng) if start is None else _given(start, what),
+        start=_start(free, resolution, origin, rng, roomy_m) if start is None else _given(start, what),
     )
 
 
 def _start(
-    free: Flags, resolution: float, origin: tuple[float, float], rng: np.random.Generator
+    free: Flags, resolution: float, origin: tuple[float, float], rng: np.random.Generator, roomy_m: float
 ) -> tuple[float, float, float]:
     clearance = clearance_of(free, resolution)
     # Of a free cell's centre at the least, so that some radius fits.
@@ -190,7 +196,7 @@ def _start(
     area = largest_part((clearance >= radius) & free)
     assert area is not None
     # Surfaces may lie half a cell before the cells' edges.
-    wanted = min(_START_CLEARANCE_M + 0.5 * resolution, float(clearance[area].max()))
+    wanted = min(max(roomy_m, _START_CLEARANCE_M) + 0.5 * resolution, float(clearance[area].max()))
     places = np.flatnonzero(area & (clearance >= wanted))
     row, col = divmod(int(places[int(rng.integers(places.size))]), free.shape[1])
     return origin[0] + (col + 0.5) * resolution, origin[1] + (row + 0.5) * resolution, 0.0

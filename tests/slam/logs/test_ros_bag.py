@@ -242,6 +242,8 @@ def test_a_lidar_that_measures_nothing_is_refused(tmp_path: Path) -> None:
     in_mm = drive(mount=mounted(0.2, 0.0, 0.0), place=lambda _, ranges: scan(1e3 * ranges))
     text = refused(write_bag(tmp_path / "b", in_mm))
     assert "every beam of /scan is lost: no range lies between range_min and range_max, 0.02 and 8 m" in text
+    glass = drive(mount=mounted(0.2, 0.0, 0.0), place=lambda _, r: scan(np.where(r > 2.0, 1e3 * r, math.inf)))
+    assert "every beam of /scan is lost" in refused(write_bag(tmp_path / "glass", glass))
 
 
 def test_messages_of_ros_1_are_told_what_to_do(tmp_path: Path) -> None:
@@ -257,12 +259,34 @@ def test_messages_of_ros_1_are_told_what_to_do(tmp_path: Path) -> None:
     assert "is of ROS 1; take the bag that it was made from, and make it one of ROS 2" in refused(path)
 
 
-def test_scans_of_changing_beams_are_laid_on_the_first(tmp_path: Path) -> None:
+@pytest.mark.parametrize("others", [(1, 3, 5, 7, 9, 11), (0,)])
+def test_scans_of_changing_beams_are_laid_on_most(tmp_path: Path, others: tuple[int, ...]) -> None:
+    """Where neither are more, on the first."""
+
     def place(number: int, ranges: Any) -> Any:
-        return scan(ranges) if number % 2 == 0 else scan(np.repeat(ranges, 2), angle_min=-math.pi - math.pi / 16)
+        twice = scan(np.repeat(ranges, 2), angle_min=-math.pi - math.pi / 16)
+        return twice if number in others else scan(ranges)
 
     found = bag(write_bag(tmp_path / "b", drive(mount=mounted(0.2, 0.0, 0.0), place=place)))
     assert np.array_equal(found.ranges, np.tile(np.arange(1.0, 9.0) / 2.0, (12, 1)))
+
+
+def test_a_reference_of_a_file_is_moved_as_one_of_a_topic_is(tmp_path: Path) -> None:
+    """Poses are of the point behind a lidar that is off the middle line."""
+    messages = list(drive(mount=mounted(0.2, 0.15, 0.0)))
+    truth = [("/truth", *rest) for topic, *rest in messages if topic == "/odom"]
+    path = write_bag(tmp_path / "b", [*messages, *truth])
+    of_topic, middle = (
+        bag(path, reference="/truth"),
+        bag(write_bag(tmp_path / "m", drive(mount=mounted(0.2, 0.0, 0.0)))),
+    )
+    lines = [
+        f"FLASER 2 1.0 1.0 {x:.9f} {y:.9f} {theta:.9f} 0 0 0 {stamp:.6f} host 0"
+        for (x, y, theta), stamp in zip(middle.odometry_poses, middle.stamps, strict=True)
+    ]
+    (file := tmp_path / "truth.log").write_text("\n".join(lines) + "\n")
+    of_file = with_reference(bag(path), file)
+    assert np.allclose(of_file.reference_poses, of_topic.reference_poses, atol=1e-6)
 
 
 def test_which_topics_there_are_is_said(log: ScanLog, tmp_path: Path) -> None:

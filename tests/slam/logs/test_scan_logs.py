@@ -134,14 +134,17 @@ def test_predict_composes_to_the_odometry(tmp_path):
     assert now == log.duration_s == pytest.approx(29 * SECONDS)
 
 
-def test_a_laser_mounted_ahead_is_followed_and_not_taken_for_a_correction(tmp_path):
+@pytest.mark.parametrize("decimals", [9, 2])
+def test_a_laser_mounted_ahead_is_followed_and_not_taken_for_a_correction(tmp_path, decimals):
     true, _ = drive(10)
     ahead = np.array([0.3, 0.0, 0.0])
     lines = []
     for i, pose in enumerate(true):
-        lines += [odom(pose, float(i)), flaser(room_ranges(pose, 180), compose(pose, ahead), pose, float(i))]
+        robot, laser = np.round(pose, decimals), np.round(compose(pose, ahead), decimals)
+        lines += [odom(robot, float(i)), flaser(room_ranges(pose, 180), laser, robot, float(i))]
     log = scan_log(put_lines(tmp_path / "a.log", lines))
-    assert np.allclose(log.odometry_poses, [compose(pose, ahead) for pose in true], atol=1e-7)
+    least = max(1e-7, 2.0 * 10.0**-decimals)
+    assert np.allclose(log.odometry_poses, [compose(pose, ahead) for pose in true], atol=least)
 
 
 def test_a_corrected_laser_pose_beside_odometry_is_left_to_the_reference(tmp_path):
@@ -186,6 +189,19 @@ def test_codes_for_no_return():
     assert reach == 25.4 and math.isnan(ranges[0, 1]) and ranges[0, 2:].tolist() == [8.183, 25.38]
     ranges, reach = without_returns(np.array([[81.83, 0.0]]))
     assert np.isnan(ranges).all() and reach > 0
+
+
+@pytest.mark.parametrize(("farthest", "taken_as"), [(5.6, math.inf), (8.0, math.inf), (30.0, math.nan)])
+def test_the_farthest_of_another_laser_is_no_wall(farthest, taken_as):
+    rng = np.random.default_rng(0)
+    measured = np.round(rng.uniform(0.5, 0.9 * farthest, (40, 181)), 3)
+    open_ = rng.random((40, 181)) < 0.02
+    ranges, reach = without_returns(np.where(open_, farthest, measured))
+    assert np.array_equal(ranges[~open_], measured[~open_]) and reach <= farthest
+    np.testing.assert_equal(ranges[open_], np.full(open_.sum(), taken_as))
+    # A wall that a robot stands before is as far at few bearings.
+    wall = np.where(np.abs(np.arange(181) - 90) < 3, farthest, measured)
+    assert np.array_equal(without_returns(wall)[0], wall)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.4, math.pi])
