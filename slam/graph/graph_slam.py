@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
 from slam.backend import SurfaceBackend
 from slam.geometry import about_z, compose, relative, wrap
@@ -32,6 +33,9 @@ _KNOWN, _SOONER = 0.7, 0.4  # share of a scan that is known, below which the nex
 _STILL = 10.0  # how much more the model's error counts, at most, where the robot has hardly moved
 _EXACT = 1e-9  # [m², rad²] added to a motion's covariance, so that it has an inverse
 _ALIGNED = np.diag([1e-5, 1e-5, 1e-6])  # covariance of where the scan before was aligned, as far as a guess goes
+
+# BLAS adds up in another order with each number of threads; one seed is the same on any number of cores.
+_ONE_THREAD = ThreadpoolController().select(user_api="blas").wrap(limits=1)
 
 
 class GraphSlam(SurfaceBackend):
@@ -78,6 +82,7 @@ class GraphSlam(SurfaceBackend):
         self._mean, rows = self.atlas.window.ahead(self._motion.mean, self._motion_cov())
         self._cov = rows[:, :3]
 
+    @_ONE_THREAD
     def _update(self, scan: Scan) -> None:
         """Align the scan with the patches in reach; where the robot has moved on, make it a key scan."""
         config, atlas = self.config, self.atlas

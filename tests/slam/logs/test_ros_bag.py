@@ -190,6 +190,12 @@ def test_a_lidar_that_looks_back_sideways_and_upside_down(base: str, tmp_path: P
     beside = relative(straight.odometry_poses, found.odometry_poses)
     assert np.allclose(beside, [0.0, 0.3, 0.0], atol=1e-9), "poses are of the point behind the lidar"
     assert found.settings["lidar_offset_m"] == pytest.approx(0.1)
+    # So are those of a reference, which are of the robot's frame.
+    rows = np.column_stack([straight.odometry_poses, straight.stamps])
+    lines = ["FLASER 2 1 1 {:.9f} {:.9f} {:.9f} 0 0 0 {:.6f} host 0".format(*row) for row in rows]
+    (tmp_path / "truth.log").write_text("\n".join(lines) + "\n")
+    moved = with_reference(found, tmp_path / "truth.log").reference_poses
+    assert np.allclose(moved, found.odometry_poses, atol=1e-6)
 
 
 def test_messages_in_any_order_and_twice_are_the_same_log(tmp_path: Path) -> None:
@@ -269,24 +275,6 @@ def test_scans_of_changing_beams_are_laid_on_most(tmp_path: Path, others: tuple[
 
     found = bag(write_bag(tmp_path / "b", drive(mount=mounted(0.2, 0.0, 0.0), place=place)))
     assert np.array_equal(found.ranges, np.tile(np.arange(1.0, 9.0) / 2.0, (12, 1)))
-
-
-def test_a_reference_of_a_file_is_moved_as_one_of_a_topic_is(tmp_path: Path) -> None:
-    """Poses are of the point behind a lidar that is off the middle line."""
-    messages = list(drive(mount=mounted(0.2, 0.15, 0.0)))
-    truth = [("/truth", *rest) for topic, *rest in messages if topic == "/odom"]
-    path = write_bag(tmp_path / "b", [*messages, *truth])
-    of_topic, middle = (
-        bag(path, reference="/truth"),
-        bag(write_bag(tmp_path / "m", drive(mount=mounted(0.2, 0.0, 0.0)))),
-    )
-    lines = [
-        f"FLASER 2 1.0 1.0 {x:.9f} {y:.9f} {theta:.9f} 0 0 0 {stamp:.6f} host 0"
-        for (x, y, theta), stamp in zip(middle.odometry_poses, middle.stamps, strict=True)
-    ]
-    (file := tmp_path / "truth.log").write_text("\n".join(lines) + "\n")
-    of_file = with_reference(bag(path), file)
-    assert np.allclose(of_file.reference_poses, of_topic.reference_poses, atol=1e-6)
 
 
 def test_which_topics_there_are_is_said(log: ScanLog, tmp_path: Path) -> None:
