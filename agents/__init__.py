@@ -16,7 +16,7 @@ from slam.settings import check_name
 if TYPE_CHECKING:
     from mecanum_env.config import LidarConfig, RobotConfig
 
-__all__ = ["Agent", "Goal", "check", "is_policy", "make", "names"]
+__all__ = ["Agent", "Goal", "check", "entry_point", "is_policy", "make", "names"]
 
 # Entry points as text: naming an agent loads nothing, making one loads only what that agent needs.
 _REGISTRY = {
@@ -70,6 +70,11 @@ def check(name: str, *others: str) -> None:
         check_name("agent", name, (*names(), *others))
 
 
+def entry_point(name: str) -> str:
+    """Return ``module:attribute`` of what makes an agent, of a name or policy that :func:`check` takes."""
+    return _installed()[_reader(_file_of(name)) if is_policy(name) else name]
+
+
 def is_policy(name: str) -> bool:
     """Tell whether an agent's name means a trained policy, in a file or on a hub."""
     return name.endswith(".safetensors") or name.startswith("hf://")
@@ -118,15 +123,20 @@ def make(
     Raises
     ------
     ValueError
-        For a name or key that is not known; the message lists the valid ones.
+        For a name or key that is not known, with the valid ones; for an agent that cannot be loaded or made.
     """
     check(name)
+    module, _, attribute = entry_point(name).partition(":")
     if is_policy(name):
         if not isinstance(config, Mapping | None):
             raise ValueError(f"config: with a policy's file {name} it must be a mapping, got {quoted(config)}")
-        policy = _file_of(name)
-        config = {**(config or {}), "policy": policy}
-        name = _reader(policy)
-    module, _, attribute = _installed()[name].partition(":")
-    agent: Agent = getattr(import_module(module), attribute)(config, robot=robot, lidar=lidar, step_s=step_s)
+        config = {**(config or {}), "policy": _file_of(name)}
+    try:
+        made = getattr(import_module(module), attribute)
+        agent: Agent = made(config, robot=robot, lidar=lidar, step_s=step_s)
+    except (ImportError, AttributeError, TypeError) as error:  # another package's, or what it needs is not there
+        raise ValueError(
+            f"cannot load agent {name} ({' '.join(str(error).split())}); install or mend what it needs, "
+            "or leave it out"
+        ) from error
     return agent

@@ -91,7 +91,10 @@ class EpisodeRecord:
         return self._rows[:, _HEALTH]
 
     def metrics(self, truth: GroundTruth, backend: Backend) -> dict[str, float | int | None]:
-        """Return ``episode_metrics``: plain numbers, deterministic, ``None`` where not reached or not defined."""
+        """Return ``episode_metrics``: plain numbers, deterministic, ``None`` where not reached or not defined.
+
+        NEES is infinite where an error was ruled out.
+        """
         rows = self._rows
         times, coverage = rows[:, _TIME], rows[:, _COVERAGE]
         belief = backend.belief
@@ -99,8 +102,7 @@ class EpisodeRecord:
         end = rows[-1]
         heading = metrics.heading_errors(end[None, _TRUE], end[None, _ESTIMATE])
         # The start is known by definition: NEES counts from the first step on.
-        nees = rows[1:, _NEES]
-        nees = nees[np.isfinite(nees)]
+        anees = float(metrics.anees(rows[1:, _NEES]))
         return {
             "coverage": float(coverage[-1]),
             "time_s": round(float(times[-1]), 6),
@@ -117,7 +119,7 @@ class EpisodeRecord:
             "ate_rmse_m": metrics.ate(rows[:, _TRUE], rows[:, _ESTIMATE]),
             "final_position_error_m": float(np.hypot(end[0] - end[3], end[1] - end[4])),
             "final_heading_error_rad": abs(float(heading[0])),
-            "anees": float(nees.mean() / 3.0) if len(nees) else None,
+            "anees": None if math.isnan(anees) else anees,
             "health_mean": float(rows[:, _HEALTH].mean()),
             "lost_s": round(float(rows[:, _LOST] @ np.diff(times, prepend=times[0])), 6),
             "relocalisations": self.relocalisations,

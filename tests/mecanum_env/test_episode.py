@@ -79,3 +79,12 @@ def test_the_walls_of_a_map_that_is_right_match_in_cells_of_any_size(cell_m):
 def test_what_is_not_defined_is_none():
     nothing = wall_metrics(MapScore(math.nan, math.nan, 0.5))
     assert nothing == {"map_iou": None, "map_precision": None, "map_recall": 0.5}
+
+
+def test_an_error_that_the_covariance_rules_out_is_in_the_mean():
+    env = driven("odometry", steps=5)
+    last = tuple(env.truth.record._rows[-1])
+    for nees, mean in ((math.nan, env.episode_metrics()["anees"]), (math.inf, math.inf)):
+        env.truth.record.append((*last[:8], nees, *last[9:]))
+        assert env.episode_metrics()["anees"] == mean
+    assert math.isfinite(driven("truth", steps=5).episode_metrics()["anees"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -89,6 +90,7 @@ class EpisodeFailure:
     """An episode that an error ended; there is no row of it."""
 
     message: str
+    trace: str = ""  # where in the code, for whoever mends it
 
 
 def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
@@ -101,8 +103,9 @@ def run_job(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
     """
     try:
         return job.run()
-    except Exception as error:
-        return EpisodeFailure(message=f"{type(error).__name__}: {one_line(error)}")
+    except (Exception, SystemExit) as error:  # an agent that calls sys.exit() ends its own episode alone
+        message = f"{type(error).__name__}: {one_line(error) or 'no message'}"
+        return EpisodeFailure(message=message, trace=traceback.format_exc())
 
 
 def resampled(values: Array, along: Array) -> Curve:

@@ -128,7 +128,10 @@ class Group:
 
     def values(self, metric: Metric) -> Array:
         """Return every episode's value ``(n,)``, nan where it has none."""
-        return np.array([metric.value(row.metrics) for row in self.rows], np.float64)
+        values = np.array([metric.value(row.metrics) for row in self.rows], np.float64)
+        if metric.key == "anees":  # JSON has no infinity: it is what a mean of defined values lacks
+            values[np.isnan(values) & [not np.isnan(row.nees).all() for row in self.rows]] = np.inf
+        return values
 
 
 @dataclass(frozen=True)
@@ -222,7 +225,7 @@ def _figure(metric: Metric, group: Group) -> Figure:
     if metric.may_be_missed:
         averages = estimate(_at_limit(values, rows), strata, for_median=_at_infinity(values))
     else:
-        known = np.flatnonzero(np.isfinite(values))
+        known = np.flatnonzero(~np.isnan(values))
         averages = estimate(values[known], [strata[k] for k in known.tolist()])
     if metric.centre == "iqm":
         return Figure(averages.iqm, averages)

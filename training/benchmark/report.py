@@ -134,7 +134,9 @@ def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None
         f"<h3>{name_html(f'Against {baseline}, {where}')}</h3>"
         '<p class="soft">Change of the interquartile mean, of several plans within each, the plans counting the '
         "same, with its interval, coloured where that excludes no change; below, in what share of the episodes it "
-        "did better, ties counted half.</p>" + tables.html(tables.against_table(found, baseline))
+        "did better, ties counted half, and n, where it is of other episodes than the time: a path is compared "
+        "where both reached 95 %, an error where both have one.</p>"
+        + tables.html(tables.against_table(found, baseline))
     )
 
 
@@ -187,7 +189,7 @@ def _consistency_table(entries: Sequence[Entry]) -> str:
     for entry in entries:
         found = entry.group.consistency()
         mean, (low, high) = found["nees_over_3_mean"], found["nees_band_95"]
-        average = "–" if mean is None or not math.isfinite(mean) else f"{mean:.2f}"
+        average = tables.shown(tables.BY_KEY["anees"], math.nan if mean is None else mean)
         share = f"{100 * found['fraction_in_band']:.0f} %"
         rows[entry.name] = [average, f"{low:.2f} … {high:.2f}", share]
     head = ["agent", "NEES / 3, average of all seconds", "band of a consistent filter (95 %)", "seconds within it"]

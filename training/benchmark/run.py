@@ -11,7 +11,6 @@ from typing import Any
 import tomli_w
 
 import agents
-import slam
 from mecanum_env.arguments import make_config
 from mecanum_env.team.config import TeamConfig
 from slam.formats import atomic_write
@@ -28,8 +27,8 @@ from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import refuse_bounds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.config_files import read_config
-from training.runs.errors import BadInput, bad_input, one_line
-from training.runs.provenance import code_digest, short_digest
+from training.runs.errors import BadInput, bad_input
+from training.runs.provenance import behind_agent, code_digest, modules_of_backend, short_digest
 from training.runs.running import versions
 from training.runs.typed import parts_of
 from training.truth.known_map import KNOWN_MAPS, KnownMap
@@ -40,6 +39,7 @@ DEFAULT_BASELINE = "nearest-frontier"
 _MOST_SEEDS = 10_000
 _EPISODE = "training.benchmark.episode"  # the code that makes a row, with all that it imports
 _TEAM_EPISODE = "training.benchmark.team_episode"
+_BOUND = (KnownMap.__module__,)
 
 
 class EpisodesFailed(Exception):
@@ -150,19 +150,20 @@ class BenchmarkPlan:
         Raises
         ------
         BadInput
-            For an agent that cannot be made without settings of its own.
+            For an agent that cannot be made without settings of its own, or code whose source is not found.
         """
-        made = {name: _behind_agent(name) for name in self.agents}
-        modules_of_backends = {name: type(slam.make(name)).__module__ for name in self.backends}
+        made = {name: (_BOUND, "") if name in KNOWN_MAPS else behind_agent(name) for name in self.agents}
+        modules_of_backends = {name: modules_of_backend(name) for name in self.backends}
         common = json.dumps(self.settings(), sort_keys=True)
         places = {(suite.name, place.name): place for suite in self.suites for place in suite.places}
         configs = {(s.name, b): self._config_text(s, b) for s in self.suites for b in self.backends}
 
         @cache
         def digest(suite: str, place: str, agent: str, backend: str, team: TeamConfig | None) -> str:
-            module, policy = made[agent]
-            code = code_digest(_EPISODE if team is None else _TEAM_EPISODE, module, modules_of_backends[backend])
-            parts = (code, policy, common, configs[suite, backend], place, places[suite, place].digest)
+            modules, told = made[agent]
+            episode = _EPISODE if team is None else _TEAM_EPISODE
+            code = code_digest(episode, *modules, *modules_of_backends[backend])
+            parts = (code, told, common, configs[suite, backend], place, places[suite, place].digest)
             extra = () if team is None else (json.dumps(to_mapping(team), sort_keys=True),)
             return short_digest(part.encode() for part in (*parts, *extra))
 
@@ -219,14 +220,14 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
     """
     made_by = plan.made_by()
     keep_settings(out, plan.settings(), FILES)
-    failures: list[tuple[EpisodeJob, str]] = []
+    failures: list[tuple[EpisodeJob, EpisodeFailure]] = []
     with benchmark_store.Store(out / benchmark_store.FILE) as store:
         missing = _missing(plan, store, made_by, out)
         atomic_write(out / "config.toml", plan.config_text())
 
         def keep(job: EpisodeJob, result: EpisodeRow | EpisodeFailure) -> None:
             if isinstance(result, EpisodeFailure):
-                failures.append((job, result.message))
+                failures.append((job, result))
             else:
                 store.add(job, result, made_by=made_by[job.key])
 
@@ -238,12 +239,14 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
     write_tables(out, report)
     atomic_write(out / "tables.md", markdown(report))
     if failures:
-        job, message = failures[0]
-        raise EpisodesFailed(
+        job, first = failures[0]
+        failed = EpisodesFailed(
             f"{len(failures)} of {len(missing)} episodes failed, the first on {job.suite} ({job.place}) with seed "
-            f"{job.seed}, {job.agent}, {job.slam}: {message}; the others are kept in {out}",
+            f"{job.seed}, {job.agent}, {job.slam}: {first.message}; the others are kept in {out}",
             report,
         )
+        failed.add_note(first.trace)  # a traceback of this error shows that one, too
+        raise failed
     return report
 
 
@@ -278,19 +281,3 @@ def _agent_names(text: str) -> tuple[str, ...]:
     for name in chosen:
         agents.check(name, *KNOWN_MAPS)
     return chosen
-
-
-def _behind_agent(name: str) -> tuple[str, str]:
-    """Return an agent's module, and a digest of the trained policy that it reads, if it does."""
-    if name in KNOWN_MAPS:
-        return KnownMap.__module__, ""
-    try:
-        with bad_input():
-            agent = agents.make(name)
-    except (ImportError, AttributeError) as error:  # another package's, or one that needs what is not installed
-        raise BadInput(
-            f"cannot load agent {name} ({one_line(error)}); install what it needs, or leave it out"
-        ) from error
-    policy: Path | None = getattr(agent, "policy_path", None)
-    files = [] if policy is None else [policy, policy.with_suffix(".json")]
-    return type(agent).__module__, short_digest(file.read_bytes() for file in files)

@@ -77,7 +77,9 @@ class Store:
 
     def add(self, job: EpisodeJob, row: EpisodeRow, *, made_by: str) -> None:
         """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same."""
-        metrics = json.dumps(row.metrics, ensure_ascii=False, allow_nan=False)
+        # What is beyond all bounds, such as the NEES of a covariance next to zero, is null as infinity is.
+        told = {k: None if isinstance(v, float) and abs(v) >= _LARGEST else v for k, v in row.metrics.items()}
+        metrics = json.dumps(told, ensure_ascii=False, allow_nan=False)
         curves = [np.asarray(getattr(row, name), "<f4").tobytes() for name in _CURVES]
         values = (*job.key, made_by, metrics, *curves, row.thumbnail)
         marks = ", ".join("?" * len(values))

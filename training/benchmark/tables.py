@@ -153,8 +153,9 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
         cells = []
         for key in AGAINST:
             share = against[key].probability
-            note = "" if math.isnan(share.value) else _plain(_share(share))
-            cell = change(BY_KEY[key], against[key].ratio, note)
+            notes = [] if math.isnan(share.value) else [_plain(_share(share))]
+            notes += [f"n {against[key].n}"] if against[key].n != against[_TIME].n else []
+            cell = change(BY_KEY[key], against[key].ratio, ", ".join(notes))
             cells.append(cell if against[key].n >= _FEWEST else replace(cell, tone=""))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from slam.metrics.measures import anees
 from training.benchmark.figures import Group, Metric, comparisons, figures
-from training.benchmark.tables import BY_KEY, Cell, Table, change, figure
+from training.benchmark.tables import BY_KEY, Cell, Table, change, figure, shown
 from training.figures.statistics import NONE, Interval, ratio_of_sums
 from training.runs.running import plain
 
 __all__ = ["Scaling", "scaling_of", "scaling_table", "scalings_as_json"]
 
 _TIME = "time_to_95_s"
+_NEES = BY_KEY["anees"]
 _TOUCHING = Metric(key="robot_collisions_per_100_m", label="robots touching", unit="/100 m")
 _SHOWN = ("reached_95", "ate_rmse_m")
 
@@ -74,8 +77,8 @@ def _scaling(agent: str, communication: str, line: Sequence[Group]) -> Scaling:
 
 
 def _nees_each(group: Group) -> tuple[float, ...]:
-    every = np.hstack([row.nees.reshape(group.robots, -1) for row in group.rows]).astype(np.float64)
-    return tuple(float(own[np.isfinite(own)].mean()) / 3.0 if np.isfinite(own).any() else np.nan for own in every)
+    every = np.hstack([row.nees.reshape(group.robots, -1) for row in group.rows])
+    return tuple(anees(every, axis=1).tolist())
 
 
 def _touching(group: Group) -> Interval:
@@ -102,8 +105,8 @@ def scaling_table(scalings: Sequence[Scaling]) -> Table:
                 change(BY_KEY[_TIME], s.ratio[k]),
                 *(figure(BY_KEY[key], s.others[k][key]) for key in _SHOWN),
                 figure(_TOUCHING, s.touching[k]),
-                Cell("–" if nees is None else f"{nees:.2f}"),
-                Cell(", ".join("–" if np.isnan(own) else f"{own:.2f}" for own in s.nees_each[k])),
+                Cell(shown(_NEES, math.nan if nees is None else nees)),
+                Cell(", ".join(shown(_NEES, own) for own in s.nees_each[k])),
             )))  # fmt: skip
     head = (
         "agent × robots", "episodes", "time to 95 % [s]", "against one robot", "reached 95 % [%]", "ATE [cm]",

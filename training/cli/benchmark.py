@@ -124,10 +124,11 @@ def benchmark(
         names = [name for name in parts_of(agents) if name]
         if not names:
             raise BadInput("--agents names none; give some, separated by commas")
-        summary = dungeons.run_dungeons(
-            maps, names, out=out, workers=who, scan="way-points" if scan is None else scan,
-            sensor="public" if sensor is None else sensor,
-        )  # fmt: skip
+        with opt.json_alone(as_json):
+            summary = dungeons.run_dungeons(
+                maps, names, out=out, workers=who, scan="way-points" if scan is None else scan,
+                sensor="public" if sensor is None else sensor,
+            )  # fmt: skip
         print(json.dumps(summary, ensure_ascii=False) if as_json else dungeons.table(summary))
         return
     if split is not None and seeds is not None:
@@ -160,7 +161,8 @@ def benchmark(
             write_parquet(out, result)
 
     try:
-        result = task.benchmark(plan, out=out, workers=who)
+        with opt.json_alone(as_json):
+            result = task.benchmark(plan, out=out, workers=who)
     except task.EpisodesFailed as failed:
         write(failed.report)
         raise

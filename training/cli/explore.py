@@ -98,10 +98,11 @@ def explore(
             raise BadInput(f"{name} is for one robot; leave it out")
     check_extras(extras)
     kind = kind_of(team)
-    episode, recorder = kind.prepare(**given), kind.recorder()
+    with opt.json_alone(as_json):
+        episode, recorder = kind.prepare(**given), kind.recorder()
     spare_the_plan(episode)
     # Held until all is written: an episode that is over is not lost to a Ctrl-C. A second one ends it all.
-    with interrupt_flag() as late, ExitStack() as stack:
+    with interrupt_flag() as late, opt.json_alone(as_json), ExitStack() as stack:
         witnesses: list[Any] = [recorder, Saver(episode, lambda: kind.write(episode, recorder.recording()))]
         film = None
         if "video" in extras:
@@ -128,7 +129,7 @@ def explore(
             of_all = [several.LANDMARKS] if (out / several.LANDMARKS).exists() else []  # not of every backend
             files = [*several.FILES, *of_all, *made, *several.files_of(0)]
         written = f"{out}/: {', '.join(files)}" + ("" if alone else ", … of each robot")
-        print(_summary(metrics, written, single.ENDINGS[metrics["end"]]))
+        print(_summary(metrics, written, single.meaning(metrics["end"])))
     if film is not None and film.failure is not None:
         raise OSError(f"{one_line(film.failure)}; all but the film is in {out}")
     if episode.interrupted or late.is_set():

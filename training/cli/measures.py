@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from training.runs.errors import bad_input
-from training.runs.options import Backends, Json, Out, Ray, RoomSeed, Workers, workers_of
+from training.runs.options import Backends, Json, Out, Ray, RoomSeed, Workers, json_alone, workers_of
 
 __all__ = ["complexity", "consistency", "speed"]
 
@@ -82,10 +82,11 @@ def consistency(
     """  # noqa: D301
     from training.studies import consistency as study
 
-    result = study.consistency(
-        backends=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0, out=out,
-        workers=workers_of(workers, ray),
-    )  # fmt: skip
+    who = workers_of(workers, ray)
+    with json_alone(as_json):
+        result = study.consistency(
+            backends=slam, rooms=rooms, runs=runs, steps=steps, noise=noise, seed0=seed0, out=out, workers=who
+        )
     print(json.dumps(result) if as_json else study.table(result))
 
 
@@ -110,5 +111,6 @@ def complexity(
     """  # noqa: D301
     from training.studies.costs import complexity as study
 
-    result = study.complexity(backends=slam, landmarks=landmarks, steps=steps, out=out)
+    with json_alone(as_json):
+        result = study.complexity(backends=slam, landmarks=landmarks, steps=steps, out=out)
     print(json.dumps(result) if as_json else study.table(result))

@@ -79,15 +79,16 @@ def replay(
     from training.replay import report as replay_report
     from training.replay import run as task
 
-    prepared = task.prepare(
-        log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
-        limit_s=limit_s, config=config, scan_topic=scan_topic, odom_topic=odom_topic,
-        reference_topic=reference_topic, mount=mount,
-    )  # fmt: skip
-    whole_s = prepared.log.duration_s
-    with Progress("replaying", whole_s) as progress:
-        task.run(prepared, lambda time_s: progress.show(time_s, f"{time_s:.0f} of {whole_s:.0f} s"))
-    metrics = replay_report.write(prepared)
+    with opt.json_alone(as_json):
+        prepared = task.prepare(
+            log, out=out, robot=robot, reference=reference, slam=slam, association=association, seed=seed,
+            limit_s=limit_s, config=config, scan_topic=scan_topic, odom_topic=odom_topic,
+            reference_topic=reference_topic, mount=mount,
+        )  # fmt: skip
+        whole_s = prepared.log.duration_s
+        with Progress("replaying", whole_s) as progress:
+            task.run(prepared, lambda time_s: progress.show(time_s, f"{time_s:.0f} of {whole_s:.0f} s"))
+        metrics = replay_report.write(prepared)
     print(
         json.dumps(metrics, ensure_ascii=False) if as_json else replay_report.summary(metrics, out, prepared.files)
     )

@@ -81,7 +81,8 @@ def run_dungeons(
     digests = {path: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in paths}
     # A map that cannot be used is found before any work is lost.
     layouts = {path: hashlib.sha256(layout(load(path))).hexdigest()[:8] for path in paths}
-    settings = {"protocol": "dungeons", "sensor": sensor, "scan": scan, **made_by(*agent_names)}
+    registered = [name for name in agent_names if name not in (NEAREST, NEAREST_VIEW, *BOUNDS)]
+    settings = {"protocol": "dungeons", "sensor": sensor, "scan": scan, **made_by(agents=registered)}
     if (out / _STORE).is_file() and (out / _STORE).read_bytes()[:1] == b"{":
         raise BadInput(f"{out / _STORE} is of an earlier version; remove it, or choose another --out")
     keep_settings(out, settings, [_STORE, _CSV, _SUMMARY])

@@ -28,8 +28,7 @@ from training.truth.known_map import KNOWN_MAPS, KnownMap
 
 __all__ = [
     "AGENT_DONE_AFTER_S", "ENDINGS", "EXTRAS", "FILES", "Course", "Episode", "Progress", "Witness", "asked_for",
-    "done", "make_agent", "prepare", "read_run_table", "run",
-    "run_whole",
+    "done", "make_agent", "meaning", "prepare", "read_run_table", "run", "run_whole",
 ]  # fmt: skip
 
 FILES = (
@@ -52,6 +51,7 @@ ENDINGS = {
     "running": "it goes on: written on the way",
 }
 """Why an episode ended: the word in ``metrics.json``, and what it means."""
+
 
 AGENT_DONE_AFTER_S = 2.0
 """An agent that says it has ended, and had no goal for so long, has nothing left to do."""
@@ -81,7 +81,7 @@ class Course:
     config: EnvConfig  # with the coverage that counts as success
     run: dict[str, Any]  # agent, seed, … as config.toml's [run] has them
     out: Path
-    end: str = "time"  # a word of ENDINGS
+    end: str = "time"  # a word of ENDINGS, or the agent's own
     interrupted: bool = False
     wall_time_s: float = 0.0
     decisions_ms: list[float] = field(default_factory=list)
@@ -124,6 +124,11 @@ class Episode(Course):
         metrics["success"] = bool(metrics["coverage"] >= self.config.coverage_target)
         metrics |= self.about()
         return {key: plain(value) for key, value in metrics.items()}
+
+
+def meaning(end: str) -> str:
+    """Return what a word for an ending, or for an agent's status, means; an agent may have words of its own."""
+    return ENDINGS.get(end, "a word of the agent's own")
 
 
 # ---- before --------------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ class Recorder:
         self._map.follow(env.map_changes)
         if goal is not self._goal or step == 0:
             self._goal = goal
-            self._goals[step] = np.zeros((0, 2), np.float32) if goal is None else goal.path.astype(np.float32)
+            self._goals[step] = np.asarray(() if goal is None else goal.path, np.float32).reshape(-1, 2)
         if step % _SCAN_EVERY == 0:
             self._scans[step] = env.truth.scan.ranges.astype(np.float32)
         if step % _MAP_EVERY == 0:

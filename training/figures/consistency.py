@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from slam.metrics.measures import anees, nees_band
 from slam.types import Array
-from training.runs.running import plain
 
 __all__ = ["consistency_figures", "step_averages"]
 
@@ -34,13 +33,14 @@ def step_averages(profiles: Sequence[ArrayLike]) -> tuple[Array, Array, Array]:
 def consistency_figures(profiles: Sequence[ArrayLike]) -> dict[str, Any]:
     """Return the mean NEES / 3 over all steps of runs, each a profile ``(steps,)``, and how it lies in its band.
 
-    The band is that of the average over so many runs, step by step (:func:`step_averages`).
+    The mean is infinite where a covariance ruled an error out, ``None`` where nothing is defined. The band is that
+    of the average over so many runs, step by step (:func:`step_averages`).
     """
     averages, lows, highs = step_averages(profiles)
     inside = np.count_nonzero((averages >= lows) & (averages <= highs))
     steps = np.concatenate([np.asarray(profile, np.float64) for profile in profiles])
     return {
-        "nees_over_3_mean": plain(float(np.nanmean(steps)) / 3) if not np.isnan(steps).all() else None,
+        "nees_over_3_mean": float(np.nanmean(steps)) / 3 if not np.isnan(steps).all() else None,
         "nees_band_95": list(nees_band(3, len(profiles))),
         "fraction_in_band": float(inside / max(len(averages), 1)),
     }

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 import agents
 import slam
-from agents.base import ENDINGS, Agent
+from agents.base import Agent
 from mecanum_env import rooms as room_registry
 from mecanum_env.arguments import make_config
 from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.views.render import render_frame
 from slam.files import plain_name
-from training.episodes.explore import make_agent
+from training.episodes.explore import make_agent, meaning
 from training.play.controls import Command
 from training.runs.errors import bad_input, one_line
 from training.runs.typed import LAST_SEED
@@ -95,7 +95,7 @@ class Session:
         if self.agent is None:
             return f"Space: let {self._short_name} drive"
         status = self.agent.status
-        return f"{status}: {ENDINGS[status]}" if self.agent.ended else f"{status} (Space: take the wheel)"
+        return f"{status}: {meaning(status)}" if self.agent.ended else f"{status} (Space: take the wheel)"
 
     @property
     def planned_path(self) -> NDArray[np.float64] | None:

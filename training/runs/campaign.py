@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,7 +19,7 @@ from training.runs.cluster import Cluster, RayPool, ray_pool
 from training.runs.errors import BadInput, Interrupted, bad_input, check_writable
 from training.runs.processes import ProcessPool, process_pool
 from training.runs.progress import Progress
-from training.runs.provenance import project_digest, short_digest
+from training.runs.provenance import own_code, policy_digest, project_digest, short_digest
 from training.runs.running import versions, write_json
 from training.runs.typed import parts_of
 
@@ -34,6 +35,7 @@ Pool = ProcessPool | RayPool
 """An executor of work, with a ``channel`` for what is said meanwhile."""
 
 SETTINGS = "settings.json"
+_OWN = "own code"
 
 
 # ---- what was asked for ----------------------------------------------------------------------------------------
@@ -54,24 +56,31 @@ def backend_names(text: str, *, without: Mapping[str, str] | None = None) -> lis
     return chosen
 
 
-def made_by(*names: str | Path) -> dict[str, Any]:
+def made_by(*files: str | Path, agents: Iterable[str] = (), backends: Iterable[str] = ()) -> dict[str, Any]:
     """Return what results depend on besides what is asked for: the code, and what files of these names hold.
 
-    Names of no file, such as those of agents and of generators of rooms, are the code's. A ROS map counts with its
-    image, a policy with the JSON beside it that says how its driver is set.
+    Names of no file, such as those of generators of rooms, are the code's. A ROS map counts with its image, a
+    policy with the JSON beside it that says how its driver is set, an agent or a backend of one's own with its
+    source.
     """
-    files = {str(name): _digest(Path(name)) for name in names if Path(name).is_file()}
-    version = versions().get("mecanum-slam", "not installed")
-    return {"version": version, "code": project_digest(), **({"files": files} if files else {})}
+    agents = list(agents)
+    found = {str(name): _digest(Path(name)) for name in (*files, *agents) if Path(name).is_file()}
+    own = own_code(agents, backends)
+    return {
+        "version": versions().get("mecanum-slam", "not installed"),
+        "code": project_digest(),
+        **({"files": found} if found else {}),
+        **({_OWN: own} if own else {}),
+    }
 
 
 def _digest(path: Path) -> str:
+    if path.suffix == ".safetensors":
+        return policy_digest(path)
     files = [path]
     with bad_input():
         if path.suffix.lower() in MAP_SUFFIXES:
             files.append(image_of(path))
-    if path.suffix == ".safetensors":
-        files.append(path.with_suffix(".json"))
     return short_digest(each.read_bytes() for each in files)
 
 
@@ -92,18 +101,22 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
         before = read_json(path, nan=True) if path.exists() else now
     except ValueError as error:
         raise BadInput(f"{error}; choose another --out, or remove that one") from error
+    if isinstance(before, dict) and isinstance(kept := before.get(_OWN, {}), dict) and (kept or _OWN in now):
+        # Agents and backends may be added to those that are there.
+        asked = now.get(_OWN, {})
+        before[_OWN], now[_OWN] = asked | kept, kept | asked
     if before != now:
         old = before if isinstance(before, dict) else {}
         keys = [key for key in (*now, *old) if now.get(key) != old.get(key)]
         key = keys[0] if keys else "other settings"
-        if key == "code":
+        if key in ("code", _OWN):
             raise BadInput(f"{out} holds runs of other code; go back to it, or choose another --out")
         raise BadInput(
             f"{out} holds runs with {quoted(key)[1:-1]} = {_told(old.get(key))}, not {_told(now.get(key))}; "
             "choose another --out, or give the same to go on"
         )
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / SETTINGS, settings)
+    write_json(out / SETTINGS, now)
 
 
 def _told(value: Any) -> str:
@@ -137,6 +150,8 @@ def run_all(
     ------
     Interrupted
         On Ctrl-C; what was kept until then stays.
+    RuntimeError
+        Where a worker process dies; the same holds.
     """
     done, total = 0, len(jobs)
     if not total:
@@ -152,6 +167,11 @@ def run_all(
         raise Interrupted(
             f"interrupted after {done} of {total} {what}; run the same command again to go on"
         ) from None
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            f"a worker process died (out of memory?) after {done} of {total} {what}, which are kept; "
+            "run the same command again to go on"
+        ) from error
 
 
 def _results(

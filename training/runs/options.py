@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import sys
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Backends", "Command", "Communication", "ConfigFile", "FloorPlanFile", "JointBelief", "Json", "MaxSteps",
     "Noise", "Out", "Range", "Ray", "Robot", "RoomSeed", "RoomSeedOrNone", "Rooms", "Seed", "Seeds", "Slam",
-    "Starts", "UnknownStarts", "Workers", "workers_of",
+    "Starts", "UnknownStarts", "Workers", "json_alone", "workers_of",
 ]  # fmt: skip
 
 Backends = Annotated[str, typer.Option(help="SLAM backends, separated by commas.")]
@@ -81,9 +83,12 @@ class Command(TyperCommand):
     """
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command."""
-        with compiling_shown():
-            return super().invoke(ctx)
+        """Run the command; where an agent or a backend calls ``sys.exit()``, that is no success of it."""
+        try:
+            with compiling_shown():
+                return super().invoke(ctx)
+        except SystemExit as error:
+            raise RuntimeError("sys.exit() was called amid the work, by an agent or a backend") from error
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Put in the address that is meant, then parse."""
@@ -111,6 +116,11 @@ def _given(words: list[str], option: Any) -> str:
     after = [next_ for word, next_ in pairwise(words) if word in names]
     joined = [word.partition("=")[2] for word in words if word.partition("=")[0] in names and "=" in word]
     return repr([*after, *joined][-1][:60]) if after or joined else "nothing"
+
+
+def json_alone(as_json: bool) -> AbstractContextManager[Any]:
+    """Send what agents and backends print to standard error, where standard output is for JSON alone."""
+    return redirect_stdout(sys.stderr) if as_json else nullcontext()
 
 
 def workers_of(workers: int | None, ray: str | None) -> Whose:

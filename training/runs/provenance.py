@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import sys
 from collections.abc import Iterable
 from functools import cache
+from importlib.metadata import packages_distributions
 from importlib.util import find_spec, resolve_name
 from pathlib import Path
 
-__all__ = ["code_digest", "modules_behind", "project_digest", "short_digest"]
+import agents
+import slam
+from training.runs.errors import BadInput, bad_input
+
+__all__ = [
+    "behind_agent", "code_digest", "modules_behind", "modules_of_backend", "own_code", "policy_digest",
+    "project_digest", "short_digest",
+]  # fmt: skip
 
 _PROJECT = ("slam", "mecanum_env", "agents", "training")
 _READ = frozenset({".py", ".safetensors", ".json", ".toml"})
@@ -44,20 +53,28 @@ def project_digest() -> str:
     return short_digest(part for name, path in kept for part in (name.encode(), path.read_bytes()))
 
 
+def _is_own(module: str) -> bool:
+    """Tell whether a module is a user's own, and not the project's."""
+    return module.partition(".")[0] not in _PROJECT
+
+
 def modules_behind(*modules: str) -> dict[str, Path]:
     """Return the modules that ``modules`` import, themselves included, as name → file; read, not run.
 
-    Imports inside of functions count. Followed are the project's own packages and those that ``modules`` are of;
-    left out are the registry of the agents and the planner that knows the map, unless it is one of ``modules``.
+    Imports inside of functions count. Followed are the project's own packages, those that ``modules`` are of, and
+    what lies beside the latter, unless another distribution brought it; left out are the registry of the agents
+    and the planner that knows the map, unless it is one of ``modules``.
     """
     roots = {*_PROJECT, *(name.partition(".")[0] for name in modules)}
+    own = frozenset(filter(_is_own, roots))
     found: dict[str, Path] = {}
     open_names = list(modules)
     while open_names:
         name = open_names.pop()
         if name in _ONLY_IF_ASKED and name not in modules:
             continue
-        if name in found or name.partition(".")[0] not in roots:
+        top = name.partition(".")[0]
+        if name in found or not (top in roots or (own and _beside(top, own))):
             continue
         path = _file(name)
         if path is None:  # something within a module, or not written in Python
@@ -69,18 +86,47 @@ def modules_behind(*modules: str) -> dict[str, Path]:
 
 
 @cache
+def _beside(top: str, own: frozenset[str]) -> bool:
+    """Whether a package lies where one of ``own`` does, and came with it: site-packages holds everybody's."""
+    if not set(_folders(top)) & {folder for name in own for folder in _folders(name)}:
+        return False
+    brought = _distributions()
+    theirs = set(brought.get(top, ()))
+    return not theirs or any(theirs & set(brought.get(name, ())) for name in own)
+
+
+_distributions = cache(packages_distributions)
+
+
+def _folders(top: str) -> list[Path]:
+    origin, places = _found(top)
+    return [place.parent for place in places or ([origin] if origin is not None else [])]
+
+
+@cache
+def _found(top: str) -> tuple[Path | None, tuple[Path, ...]]:
+    """Return the file of what is imported as ``top``, and the folders of what is within it."""
+    try:
+        spec = find_spec(top)
+    except ValueError:  # of the script that runs, or of what was made at run time
+        file = getattr(sys.modules.get(top), "__file__", None)
+        return (None if file is None else Path(file).absolute()), ()
+    if spec is None:
+        return None, ()
+    places = tuple(map(Path, spec.submodule_search_locations or ()))
+    return (None if spec.origin is None else Path(spec.origin)), places
+
+
+@cache
 def _file(name: str) -> Path | None:
-    top, _, rest = name.partition(".")
-    spec = find_spec(top)
-    if spec is None or spec.origin is None:
-        return None
-    path = Path(spec.origin)
+    top, *rest = name.split(".")
+    origin, places = _found(top)
     if rest:
-        if spec.submodule_search_locations is None:
-            return None
-        path = path.parent.joinpath(*rest.split("."))
-        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    return path if path.suffix == ".py" and path.is_file() else None
+        inner = [place.joinpath(*rest) for place in places]
+        files = [file for path in inner for file in (path / "__init__.py", path.with_suffix(".py"))]
+    else:
+        files = [] if origin is None else [origin]
+    return next((file for file in files if file.suffix == ".py" and file.is_file()), None)
 
 
 @cache
@@ -96,3 +142,60 @@ def _imports(module: str, path: Path) -> tuple[str, ...]:
                 base = resolve_name("." * node.level + base, package)
             names += [base, *(f"{base}.{alias.name}" for alias in node.names)]
     return tuple(names)
+
+
+# ---- behind a name --------------------------------------------------------------------------------------------
+
+
+def behind_agent(name: str) -> tuple[tuple[str, ...], str]:
+    """Return an agent's modules, and a digest of what makes it and of the file that it names ``policy_path``.
+
+    Raises
+    ------
+    BadInput
+        For an agent that cannot be made without settings of its own, or whose source is not found.
+    """
+    with bad_input():
+        entry, agent = agents.entry_point(name), agents.make(name)
+        modules = _with_source(f"agent {name}", entry.partition(":")[0], type(agent).__module__)
+    policy: str | Path | None = getattr(agent, "policy_path", None)
+    return modules, short_digest([entry.encode(), b"" if policy is None else policy_digest(Path(policy)).encode()])
+
+
+def modules_of_backend(name: str) -> tuple[str, ...]:
+    """Return a backend's modules: its own and that of its configuration; ``BadInput`` where there is no source."""
+    with bad_input():
+        kinds = type(slam.make(name)), slam.config_type(name)
+    return _with_source(f"backend {name}", *(kind.__module__ for kind in kinds))
+
+
+def own_code(agent_names: Iterable[str], backends: Iterable[str]) -> dict[str, str]:
+    """Return a digest of each agent and backend that is a user's own, by its name."""
+    found = {}
+    for name in agent_names:
+        if _is_own(agents.entry_point(name)):
+            modules, told = behind_agent(name)
+            found[f"agent {name}"] = short_digest([code_digest(*modules).encode(), told.encode()])
+    for name in backends:
+        modules = modules_of_backend(name)
+        if any(map(_is_own, modules)):
+            found[f"backend {name}"] = code_digest(*modules)
+    return found
+
+
+def policy_digest(path: Path) -> str:
+    """Return a digest of a file that an agent reads, and of the JSON beside it, if any, that describes it."""
+    with bad_input():
+        if not path.is_file():
+            raise ValueError(f"no such file: {path}, which is an agent's policy_path")
+    files = [path, path.with_suffix(".json")]
+    return short_digest(file.read_bytes() for file in dict.fromkeys(files) if file.is_file())
+
+
+def _with_source(what: str, *modules: str) -> tuple[str, ...]:
+    if not any(module in modules_behind(module) for module in modules):
+        raise BadInput(
+            f"{what} has no source file by which its results could be told from others'; "
+            "put it in a module of its own"
+        )
+    return modules

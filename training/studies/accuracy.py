@@ -26,7 +26,7 @@ from training.runs.campaign import keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
 from training.runs.rows import resume
-from training.runs.running import versions, write_json
+from training.runs.running import plain, versions, write_json
 from training.runs.typed import parts_of
 
 __all__ = ["study", "summarise"]
@@ -83,7 +83,8 @@ def summarise(rows: list[Row], seeds: str) -> list[Row]:
             "return_error_m_median": statistics.median(back) if back else None,
             "return_error_m_max": max(back) if back else None,
         }
-        summary |= consistency_figures([r["nees_each_s"] for r in group])
+        found = consistency_figures([r["nees_each_s"] for r in group])
+        summary |= {key: plain(value) for key, value in found.items()}
         out.append(summary)
     return out
 
@@ -133,7 +134,7 @@ def study(
                 make_config(rooms=kind, slam=backend, noise=noise)
         jobs = [(r, b, s, agent, noise) for s in parse_seeds(seeds) for r in kinds for b in backends]
     who = workers_of(workers, ray)
-    keep_settings(out, made_by(agent), FILES)
+    keep_settings(out, made_by(agents=[agent], backends=backends), FILES)
     every = resume(out / STORE, jobs, run_job, workers=who, what="episodes")
     rows = [every[job] for job in sorted(set(jobs))]
     summaries = summarise(rows, seeds)

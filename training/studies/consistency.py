@@ -126,7 +126,7 @@ def consistency(
             where = {"agent": AGENT, "noise_config": dataclasses.asdict(scaled_noise(noise))}
     if steps is None:
         steps = world.steps if world is not None else MAX_EPISODE_STEPS
-    settings = {**made_by(), "rooms": rooms, "steps": steps, "noise": noise, **where}
+    settings = {**made_by(backends=names), "rooms": rooms, "steps": steps, "noise": noise, **where}
     keep_settings(out, settings, FILES)
     # All backends on one seed before the next seed.
     jobs = [(name, rooms, seed, steps, noise) for seed in range(seed0, seed0 + runs) for name in names]

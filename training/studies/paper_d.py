@@ -110,7 +110,7 @@ def study(
         backends = backend_names(slam)
         chosen = parse_seeds(seeds)
     who = workers_of(workers, ray)
-    settings = {**made_by(), "max_steps": MAX_STEPS}
+    settings = {**made_by(backends=backends), "max_steps": MAX_STEPS}
     keep_settings(out, settings, FILES)
     jobs = [(m, b, s) for m in PAPER_MEAN_MAX_M for b in backends for s in chosen]
     rows = resume(out / "episodes.jsonl", jobs, run_job, workers=who, what="episodes")

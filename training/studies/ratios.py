@@ -29,9 +29,6 @@ COLUMNS = {
 }
 
 
-_VARIANTS = {"slam": "@{}", "robots": "×{}", "communication": "{}"}
-
-
 def ratio(ours: Array, theirs: Array) -> Interval:
     """Return mean(ours) / mean(theirs) of pairs ``(n,)`` with its 95 % interval, pairs resampled together."""
     return interval(lambda at: ours[at].mean(axis=-1) / theirs[at].mean(axis=-1), ["all"] * len(ours))
@@ -73,21 +70,28 @@ def table(episodes: Path, suite: str, agent: str) -> str:
 def _read(episodes: Path, suite: str) -> dict[str, dict[tuple[str, int], list[float]]]:
     """Return the columns' values by agent and episode; a time that was not reached is the limit.
 
-    Where there are several backends or teams, their names stand behind the agent's.
+    Agents are called what the benchmark's tables call them.
     """
     values: dict[str, dict[tuple[str, int], list[float]]] = {}
     try:
         with episodes.open(encoding="utf-8", newline="") as file:
-            rows = [row for row in csv.DictReader(file) if row["suite"] == suite]
-        several = [key for key in _VARIANTS if len({row.get(key) for row in rows}) > 1]
-        for row in rows:
+            rows = list(csv.DictReader(file))
+        several = [
+            key for key in ("slam", "communication") if len({row.get(key) or None for row in rows} - {None}) > 1
+        ]
+        for row in (row for row in rows if row["suite"] == suite):
             found = [float(row[key] or "nan") for key in COLUMNS]
             found[0] = float(row["limit_s"]) if np.isnan(found[0]) else found[0]
-            agent = " ".join([row["agent"], *(_VARIANTS[key].format(row[key]) for key in several if row[key])])
-            values.setdefault(agent, {})[row["place"], int(row["seed"])] = found
+            values.setdefault(_name(row, several), {})[row["place"], int(row["seed"])] = found
     except (OSError, KeyError, ValueError) as error:
         raise BadInput(f"cannot read {episodes}: {error}; give the folder of a mecanum benchmark") from error
     return values
+
+
+def _name(row: dict[str, str], several: list[str]) -> str:
+    name = f"{row['agent']}@{row['slam']}" if "slam" in several else row["agent"]
+    name += f" ×{row['robots']}" if row.get("robots", "1") not in ("", "1") else ""
+    return f"{name} {row['communication']}" if "communication" in several and row["communication"] else name
 
 
 def study(

@@ -21,10 +21,9 @@ from slam.formats import atomic_write
 from training.episodes.explore import run_whole
 from training.episodes.room_pictures import parse_seeds
 from training.figures.tables import csv_table, markdown_table
-from training.runs.campaign import backend_names, keep_settings
+from training.runs.campaign import backend_names, keep_settings, made_by
 from training.runs.errors import bad_input
 from training.runs.options import Backends, Out, Ray, Seeds, Workers, workers_of
-from training.runs.provenance import project_digest
 from training.runs.rows import resume
 from training.runs.running import versions, write_json
 
@@ -140,7 +139,7 @@ def study(
         asked = backend_names(slam, without={"truth": "knows where it is; there is nothing to ask"})
         jobs = [(seed, backend) for backend in asked for seed in parse_seeds(seeds)]
     who = workers_of(workers, ray)
-    settings = {"code": project_digest(), **versions()}
+    settings = {**made_by(backends=asked), **versions()}
     keep_settings(out, settings, ["worlds.jsonl", "worlds.csv", "summary.json"])
     rows = resume(out / "worlds.jsonl", jobs, run_job, workers=who, what="worlds")
     atomic_write(out / "worlds.csv", csv_table([{"seed": s, "slam": b} | row for (s, b), row in rows.items()]))

@@ -17,7 +17,7 @@ from slam.accounts.landmarks import write_landmarks
 from slam.files import plain_name
 from slam.formats import atomic_write, write_map_server, write_tum
 from slam.settings import to_mapping
-from training.episodes.explore import ENDINGS, EXTRAS, FILES, Course, Episode
+from training.episodes.explore import EXTRAS, FILES, Course, Episode, meaning
 from training.episodes.recording import Recording
 from training.episodes.team import FILES as TEAM_FILES
 from training.episodes.team import ROBOT_FILE, TeamEpisode
@@ -147,7 +147,7 @@ def _write_into(folder: Path, episode: Episode, recording: Recording, extras: Co
     atomic_write(folder / "config.toml", config)
     page = episode_page(
         env, recording, title=f"{where}: {who} on {episode.config.slam}",
-        metrics=metrics, ending=f"{episode.end}: {ENDINGS[episode.end]}", config=config,
+        metrics=metrics, ending=f"{episode.end}: {meaning(episode.end)}", config=config,
         target=episode.config.coverage_target,
     )  # fmt: skip
     atomic_write(folder / "report.html", page)

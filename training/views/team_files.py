@@ -17,7 +17,7 @@ from slam.formats import atomic_write, write_map_server, write_tum
 from slam.landmarks.database import write_landmark_map
 from training.episodes import explore as single
 from training.episodes import team as several
-from training.episodes.explore import ENDINGS
+from training.episodes.explore import meaning
 from training.episodes.recording import Recorder, Recording, TeamRecorder
 from training.episodes.team import FILES, LANDMARKS, TeamEpisode, files_of
 from training.episodes.team_log import team_landmarks, team_map
@@ -84,7 +84,7 @@ def _write_into(folder: Path, episode: TeamEpisode, recordings: Sequence[Recordi
     page = team_page(
         episode, recordings, metrics=metrics, config=config,
         title=f"{place_of(episode)}: {team.team.robots} robots, {who} on {episode.config.slam}",
-        ending=f"{episode.end}: {ENDINGS[episode.end]}",
+        ending=f"{episode.end}: {meaning(episode.end)}",
     )  # fmt: skip
     atomic_write(folder / "report.html", page)
     write_json(folder / "metrics.json", metrics)

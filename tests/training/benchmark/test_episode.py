@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.training.benchmark.small import STEPS, without_clock
-from training.benchmark.episode import EpisodeJob, EpisodeRow, resampled, run_job
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, resampled, run_job
 from training.benchmark.store import FILE, Store
 
 
@@ -27,6 +28,17 @@ def test_ctrl_c_in_an_episode_leaves_no_row(monkeypatch: pytest.MonkeyPatch) -> 
             suite="rooms", place="rectangular", rooms="rectangular", seed=0, agent="random", slam="odometry",
             noise="nominal",
         ))  # fmt: skip
+
+
+def test_an_agent_that_exits_fails_its_episode_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    def leaves(self: EpisodeJob) -> EpisodeRow:
+        sys.exit()
+
+    monkeypatch.setattr(EpisodeJob, "run", leaves)
+    job = EpisodeJob(suite="s", place="p", rooms="cave", seed=0, agent="a", slam="ekf", noise=None)
+    failed = run_job(job)
+    assert isinstance(failed, EpisodeFailure) and failed.message == "SystemExit: no message"
+    assert "sys.exit()" in failed.trace
 
 
 def test_a_curve_holds_until_the_next_row() -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.training.benchmark.small import made_up_group
 from training.benchmark.figures import comparisons, figures, with_regrets
-from training.benchmark.tables import AGAINST, against_table
+from training.benchmark.tables import AGAINST, BY_KEY, against_table, shown
+from training.benchmark.team_figures import _nees_each
 
 
 def test_regret_is_over_the_least_time_in_the_same_room_whoever_had_it() -> None:
@@ -38,8 +40,10 @@ def test_what_was_never_reached_counts_as_the_limit_and_loses() -> None:
 def test_the_way_of_one_that_has_not_explored_is_compared_with_none() -> None:
     group = made_up_group(time_to_95_s=[40.0, None], path_length_m=[20.0, 1.0])
     other = made_up_group("b", time_to_95_s=[40.0, 40.0], path_length_m=[10.0, 10.0])
-    against = comparisons(group, other)["path_length_m"]
-    assert against.n == 1 and against.probability.value == 0.0
+    against = comparisons(group, other)
+    assert against["path_length_m"].n == 1 and against["path_length_m"].probability.value == 0.0
+    cells = dict(zip(AGAINST, against_table({"a": against}, "b").rows[0][1], strict=False))
+    assert cells["path_length_m"].note == "0 %, n 1" and ", n" not in cells["time_to_90_s"].note
 
 
 @pytest.mark.parametrize(("episodes", "tone"), [(9, ""), (10, "better")])
@@ -62,3 +66,13 @@ def test_collisions_are_all_contacts_over_all_the_way() -> None:
     found = figures(made_up_group(collisions=[0, 3, 0], path_length_m=[10.0, 20.0, 70.0]))
     assert found["collisions_per_100_m"].centre.value == pytest.approx(3.0)
     assert found["collided"].centre.value == pytest.approx(1 / 3)
+
+
+def test_a_covariance_that_rules_errors_out_is_no_rosy_figure() -> None:
+    group = made_up_group(anees=[1.0, 1.0, None, None])
+    nees = [np.ones(3), np.ones(3), np.array([1.0, np.inf, 1.0]), np.full(3, np.nan)]
+    group = replace(group, rows=tuple(replace(row, nees=n) for row, n in zip(group.rows, nees, strict=True)))
+    found = figures(group)["anees"]
+    assert found.averages.mean.value == math.inf and found.averages.n == 3, "JSON has null for both"
+    assert shown(BY_KEY["anees"], group.consistency()["nees_over_3_mean"]) == "∞"
+    assert _nees_each(group) == (math.inf,)

@@ -161,8 +161,10 @@ def test_an_episode_that_fails_does_not_stop_the_others(
         inner(self, belief, seed)
 
     monkeypatch.setattr(NearestFrontier, "reset", breaks)
+    monkeypatch.setenv("MECANUM_TRACEBACK", "1")
     assert main(small(tmp_path, "--report")) == 1
-    error = capsys.readouterr().err.splitlines()[-1]
+    *trace, error = capsys.readouterr().err.splitlines()
+    assert any('raise ZeroDivisionError("of' in line for line in trace), "the line that failed"
     assert "1 of 3 episodes failed" in error and "seed 1" in error and "ZeroDivisionError: of all things" in error
     assert {key[2] for key in contents(tmp_path)} == {0, 2}
     assert "nearest-frontier" in (tmp_path / "summary.csv").read_text("utf-8")

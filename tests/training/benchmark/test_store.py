@@ -90,3 +90,11 @@ def test_two_runs_into_one_store_do_not_disturb_each_other(tmp_path: Path) -> No
         other.add(job, episode(job.key, coverage=0.5), made_by="x")
         ((key, row),) = one.rows([job.key, ("rooms", "rectangular", 2, "a", "ekf")])
     assert key == job.key and without_clock(row) == without_clock(episode(key))
+
+
+def test_what_is_beyond_all_bounds_is_null(tmp_path: Path) -> None:
+    job = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
+    with Store(tmp_path / FILE) as store:
+        store.add(job, episode(job.key, anees=1e20), made_by="x")
+        ((_, row),) = store.rows([job.key])
+    assert row.metrics["anees"] is None and row.metrics["coverage"] == 0.99

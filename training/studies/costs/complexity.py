@@ -166,9 +166,10 @@ def complexity(*, backends: str, landmarks: str, steps: int, out: Path) -> dict[
         On Ctrl-C; running it again goes on.
     """
     with bad_input():
-        names = (*backend_names(backends, without=not_observing()), REFERENCE)
+        asked = backend_names(backends, without=not_observing())
+    names = (*asked, REFERENCE)
     sizes = whole_numbers("--landmarks", landmarks, low=SEEN, high=_MOST_LANDMARKS)
-    settings = {**made_by(), "steps": steps, "repeats": REPEATS, "seen": SEEN, "reference": "dsyrk"}
+    settings = {**made_by(backends=asked), "steps": steps, "repeats": REPEATS, "seen": SEEN, "reference": "dsyrk"}
     keep_settings(out, settings, FILES)
     jobs = [(name, n, steps) for n in sizes for name in names]
     points = resume(out / STORE, jobs, run_job, workers=1, what="points", apart=True)

@@ -141,7 +141,7 @@ def study(
             raise BadInput(f"no such file: {plan}; give a ROS map (.yaml) or an image")
         with bad_input():
             load(plan)
-    keep_settings(out, {**made_by(*plans, *names), "seed": seed, "minutes": minutes}, FILES)
+    keep_settings(out, {**made_by(*plans, agents=names), "seed": seed, "minutes": minutes}, FILES)
     jobs: list[Job] = [(str(p), name, seed, minutes, str(out)) for p in plans for name in names]
     for k, job in enumerate(jobs):  # each in a process of its own, so that its memory is
         what = f"exploration {k + 1} of {len(jobs)}, {Path(job[0]).stem}, {job[1]}"

@@ -19,6 +19,7 @@ from mecanum_env.observation import Observation
 from slam.settings import to_mapping
 from training.episodes.explore import make_agent
 from training.figures.tables import text_table
+from training.runs.options import json_alone
 from training.runs.processes import memory_mb
 from training.studies.costs import peers
 from training.studies.exploring import AGENT
@@ -217,7 +218,8 @@ def _beside(peer: str, *, steps: int, rooms: str, slam: str, beams: int, seed: i
 def run(*, steps: int, rooms: str, slam: str, beams: int, seed: int, as_json: bool, peer: str | None) -> None:
     """Measure, and print a table (or one JSON object) on standard output; ``peer`` adds a comparison."""
     print(f"measuring {rooms}, {slam}, {beams} beams, {steps:,} steps …", file=sys.stderr)
-    result = measure(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
+    with json_alone(as_json):
+        result = measure(steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)
     if peer is not None:
         print(f"measuring {peer} in turn with it …", file=sys.stderr)
         result["peer"] = _beside(peer, steps=steps, rooms=rooms, slam=slam, beams=beams, seed=seed)

@@ -66,7 +66,8 @@ def study(
             where: dict[str, Any] = {"floor_plan" if Path(place).suffix else "rooms": place}
             make_config(noise=noise, **where)
         numbers = parse_seeds(seeds, most=_MOST_SEEDS)
-        settings = {**made_by(agent, *places), "agent": agent, "noise": noise, "max_steps": max_steps}
+        made = made_by(*places, agents=[agent], backends=names)
+        settings = {**made, "agent": agent, "noise": noise, "max_steps": max_steps}
     who = workers_of(workers, ray)
     keep_settings(out, settings, FILES)
     jobs: list[Job] = [
