@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from agents.learned.choice import CANDIDATE, STATE, Choice
 from agents.learned.chooser import Chooser, ChooserConfig
 from mecanum_env.arguments import check_arguments
-from mecanum_env.env import ExploreEnv, time_limit_of_caller
+from mecanum_env.env import ExploreEnv
+from mecanum_env.step_clock import StepClock
 from slam.belief import Belief
 from slam.files import quoted
 from slam.settings import Within, argument, checked, from_mapping
@@ -183,10 +184,10 @@ class ExploreFrontierEnv(ChoiceEnv):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: draw the room, place the robot, take the first scan."""
         super().reset(seed=seed)
-        self._decisions = 0
-        self._most_decisions = time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
+        self._decisions = StepClock.of_caller(self)
         self.base.planned_path = None
         self._seen, info = self._limited.reset(seed=seed, options=options)
+        self._np_random = self.base.np_random  # one for both: it draws the next episode, whoever sets it back
         self.agent.reset(self.base.outline, 0 if seed is None else int(seed))
         self._choice = self.agent.survey(self.base.belief)
         return self._observed(), info | {"duration_s": 0.0}
@@ -235,9 +236,8 @@ class ExploreFrontierEnv(ChoiceEnv):
             self._choice = agent.survey(self.base.belief)
         info["reward_terms"] = dict(terms)
         info["duration_s"] = steps * config.step_s
-        self._decisions += 1
-        last = self._most_decisions is not None and self._decisions >= self._most_decisions
-        if terminated or truncated or last:
+        self._decisions.tick()
+        if terminated or truncated or self._decisions.used >= 1.0:
             covered = bool(info.get("is_success", False))
             given_up = agent.status if idle >= patience else "collision"
             info["end"] = "covered" if covered else "time" if truncated or not terminated else given_up

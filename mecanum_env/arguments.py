@@ -29,7 +29,7 @@ from slam.files import plain_name, quoted
 from slam.odometry.filters import make_odometry_filter
 from slam.registry import config_type
 from slam.registry import make as make_slam
-from slam.settings import Within, argument, check_name, checked, from_mapping, require
+from slam.settings import Within, argument, check_name, checked, from_mapping, overlaid, require
 
 __all__ = [
     "Settings", "check_arguments", "make_backend", "make_config", "make_plan", "reset_options", "room_seed_of",
@@ -50,7 +50,7 @@ def make_config(
     lidar: Settings | LidarConfig | None = None,
     noise: Settings | NoiseConfig | None = None,
     reward: Mapping[str, Any] | RewardConfig | None = None,
-    floor_plan: str | Path | None = None,
+    floor_plan: str | Path | FloorPlan | None = None,
     odometry_filter: Settings | None = None,
     **unknown: Any,
 ) -> EnvConfig:
@@ -59,6 +59,7 @@ def make_config(
     A string names a preset, generator, backend or filter; a mapping changes what ``config`` has of it, or what a
     preset or name in it stands for (``{"preset": "youbot", …}``, ``{"name": "apartment", …}``). A robot's name
     stands for its lidar and noise too, where those are not given.
+    A floor plan that is no path is only held against ``rooms``: no file holds it.
     Unknown names, keys and arguments raise ``ValueError`` that lists the valid ones.
     """
     check_arguments(unknown)
@@ -84,7 +85,7 @@ def make_config(
             options = dict(given)
             changes[name] = options.pop("name", getattr(base, name))
             same = changes[name] == getattr(base, name)
-            changes[f"{name}_config"] = {**getattr(base, f"{name}_config"), **options} if same else options
+            changes[f"{name}_config"] = overlaid(getattr(base, f"{name}_config"), options) if same else options
         elif given is not None:
             require(isinstance(given, str), f"{name} must be a name or a mapping, got {quoted(given)}")
             changes[name] = given
@@ -99,7 +100,7 @@ def make_config(
     if reward is not None:
         with argument("reward"):
             changes["reward"] = from_mapping(RewardConfig, reward, base=base.reward)
-    if floor_plan is not None:
+    if floor_plan is not None and not isinstance(floor_plan, FloorPlan):
         require(isinstance(floor_plan, str | Path), f"floor_plan must be a path, got {quoted(floor_plan)}")
         changes["floor_plan"] = str(floor_plan)
     made = dataclasses.replace(base, **changes)
@@ -139,9 +140,18 @@ def reset_options(given: Mapping[str, Any] | None, names: Iterable[str]) -> dict
     return {key: value for key, value in given.items() if value is not None}
 
 
-def room_seed_of(options: Mapping[str, Any], seed: int) -> int:
-    """Return the seed that the room is drawn by: the option ``room_seed`` of a reset, else the episode's."""
-    return int(checked("room_seed", RoomSeed, options["room_seed"])) if "room_seed" in options else seed
+def room_seed_of(options: Mapping[str, Any], seed: int, plan: FloorPlan | None) -> int:
+    """Return the seed that the room is drawn by: the option ``room_seed`` of a reset, else the episode's.
+
+    ``plan`` is the environment's own, if it was given one.
+    """
+    if "room_seed" not in options:
+        return seed
+    require(
+        not isinstance(options.get("floor_plan", plan), FloorPlan),
+        "room_seed draws a room, and there is a floor plan instead; leave out the one or the other",
+    )
+    return int(checked("room_seed", RoomSeed, options["room_seed"]))
 
 
 def make_plan(

@@ -196,10 +196,12 @@ class EnvConfig(Config):
             abs(substeps - round(substeps)) < 1e-6,
             f"EnvConfig.step_s must be a multiple of physics_step_s, {self.physics_step_s}, got {self.step_s}",
         )
+        half = 0.5 * self.robot.length_m
+        fit = [f'{{"preset": "{name}", …}}' for name, it in LIDAR_PRESETS.items() if abs(it.offset_m) <= half]
         require(
-            abs(self.lidar.offset_m) <= 0.5 * self.robot.length_m,
-            f"lidar.offset_m must be at most half of robot.length_m, {0.5 * self.robot.length_m:g}: from beyond "
-            f"its body a robot looks through walls; got {self.lidar.offset_m:g}",
+            abs(self.lidar.offset_m) <= half,
+            f"lidar.offset_m must be at most half of robot.length_m, {half:g}: from beyond its body a robot looks "
+            f"through walls; got {self.lidar.offset_m:g}{'; this body bears ' if fit else ''}{' or '.join(fit)}",
         )
         for name in ("rooms_config", "slam_config", "odometry_filter_config"):
             object.__setattr__(self, name, _plain(getattr(self, name)))

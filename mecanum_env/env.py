@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from pathlib import Path
 from typing import Any, cast
@@ -10,7 +9,6 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.wrappers import TimeLimit
 from numba import njit
 from numpy.typing import NDArray
 
@@ -32,6 +30,7 @@ from mecanum_env.reward import StepOutcome, reward_terms
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.sensing.noise import noise_stream
 from mecanum_env.sensing.sensors import FilteredEncoders, Lidar, WheelEncoders
+from mecanum_env.step_clock import StepClock
 from mecanum_env.views.window import make_viewer
 from slam.belief import Belief
 from slam.dead_reckoning import TruthSlam
@@ -41,7 +40,7 @@ from slam.odometry.filters import make_odometry_filter
 from slam.settings import check_name
 from slam.types import Array, Floats, Odometry, Scan
 
-__all__ = ["ExploreEnv", "time_limit_of_caller"]
+__all__ = ["ExploreEnv"]
 
 ACTIONS = {"twist": 3, "wheels": 4}
 
@@ -92,7 +91,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         if render_mode is not None:
             check_name("render_mode", render_mode, self.metadata["render_modes"])
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
-        self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
+        self.config = make_config(floor_plan=floor_plan, **settings)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.config.step_s)}
         self.render_mode = render_mode
         targets = WheelTargets(self.config.robot)
@@ -118,10 +117,10 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         options = reset_options(options, ("floor_plan", "start_pose", "room_seed"))
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         plan = make_plan(
-            self.config, room_seed_of(options, episode_seed),
+            self.config, room_seed_of(options, episode_seed, self._plan),
             given=options.get("floor_plan", self._plan), start=options.get("start_pose"),
         )  # fmt: skip
-        self._step_limit = time_limit_of_caller(self) or (self.spec.max_episode_steps if self.spec else None)
+        self._clock = StepClock.of_caller(self)
         self._set_up(plan, episode_seed)
         info = self.first_look()
         self._viewer.show(self)
@@ -182,7 +181,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         info = self.perceive(collisions)
         success = info["coverage"] >= config.coverage_target
         terminated = success or (config.terminate_on_collision and world.collisions > 0)
-        if terminated or (self._step_limit is not None and self._steps >= self._step_limit):
+        if terminated or self._clock.used >= 1.0:
             info["is_success"] = bool(success)
             info["episode_metrics"] = self.episode_metrics()
         self._viewer.show(self)
@@ -209,6 +208,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         backend.update(mapped)
         self._pose, self._pose_cov = backend.pose, backend.pose_cov
         self._steps += 1
+        self._clock.tick()
         return self.own_coverage.update(backend.grid)
 
     def _look(self) -> tuple[Scan, Scan]:
@@ -328,7 +328,7 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
 
     def observe(self) -> Observation:
         """Return the observation that the last ``reset`` or ``step`` did."""
-        limit = self._step_limit or self.config.time_limit_s / self.config.step_s
+        limit = self.config.time_limit_s / self.config.step_s
         return observe(
             self.config,
             self.backend,
@@ -337,25 +337,9 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
             pose=self._pose,
             pose_cov=self._pose_cov,
             twist=self._odometry.numbers,
-            time_used=self._steps / limit,
+            time_used=self._clock.used or self._steps / limit,  # of the time, where nothing limits the steps
             out=self.canvas,
         )
-
-
-def time_limit_of_caller(env: gymnasium.Env[Any, Any]) -> int | None:
-    """Return the least step limit of the ``TimeLimit`` wrappers of ``env`` that this very reset came through.
-
-    ``gym.make(…, max_episode_steps=N)`` tells nobody but such a wrapper, yet ``progress`` and the last step's
-    ``episode_metrics`` depend on it; a wrapper of our own to pass it on would rule out ``vector_entry_point``.
-    """
-    limits = set()
-    frame = inspect.currentframe()
-    while frame is not None:
-        wrapper = frame.f_locals.get("self")
-        if isinstance(wrapper, TimeLimit) and wrapper.unwrapped is env:  # else another's, that steps this one
-            limits.add(int(wrapper._max_episode_steps))
-        frame = frame.f_back
-    return min(limits, default=None)
 
 
 @njit(cache=True, nogil=True)

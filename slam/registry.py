@@ -15,7 +15,7 @@ from slam.gaussian.settings import EkfConfig, EkfLinesConfig
 from slam.graph.graph_slam import GraphSlam
 from slam.graph.settings import GraphSlamConfig
 from slam.invariant import InvariantEkfConfig, InvariantEkfSlam
-from slam.settings import argument, check_name, from_mapping
+from slam.settings import argument, check_name, from_mapping, require, same_definitions
 
 __all__ = ["config_type", "make", "names", "register"]
 
@@ -36,13 +36,17 @@ _BACKENDS: dict[str, tuple[type[Backend], type[BackendConfig]]] = {
 def register(name: str, backend: type[Backend], config_type: type[BackendConfig]) -> None:
     """Make a backend known under a name, with the frozen dataclass that configures it.
 
+    A notebook's cell that is run again replaces what it registered.
+
     Raises
     ------
     ValueError
         If another backend has the name.
     """
-    if _BACKENDS.get(name, (backend, config_type)) != (backend, config_type):
-        raise ValueError(f"SLAM backend {name!r} is registered already; choose another name")
+    require(
+        name not in _BACKENDS or same_definitions(_BACKENDS[name], (backend, config_type)),
+        f"SLAM backend {name!r} is registered already; choose another name",
+    )
     _BACKENDS[name] = (backend, config_type)
 
 

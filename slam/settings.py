@@ -38,7 +38,9 @@ __all__ = [
     "check_name",
     "checked",
     "from_mapping",
+    "overlaid",
     "require",
+    "same_definitions",
     "to_mapping",
     "unknown_name",
 ]  # fmt: skip
@@ -57,7 +59,7 @@ class Within:
     @cached_property
     def ends(self) -> tuple[float, float]:
         """The interval's ends, whether or not they belong to it."""
-        low, high = map(float, self.interval[1:-1].split(","))
+        low, high = map(_number_of, self.interval[1:-1].split(","))
         return low, high
 
     def __contains__(self, value: float) -> bool:
@@ -159,6 +161,14 @@ class Config:
                 object.__setattr__(self, name, value)
 
 
+def _number_of(text: str) -> float:
+    """Return a number, one without a point as Python's whole one: no float has all digits of a large one."""
+    try:
+        return int(text)
+    except ValueError:
+        return float(text)
+
+
 def unknown_name(what: str, name: object, valid: Iterable[str]) -> ValueError:
     """Return the error for a name that is not registered: one line that lists the valid ones."""
     names = sorted(valid)
@@ -174,6 +184,12 @@ def check_name(what: str, name: object, valid: Iterable[str]) -> None:
     """Raise the error of :func:`unknown_name` unless the name is a valid one."""
     if not isinstance(name, str) or name not in valid:
         raise unknown_name(what, name, valid)
+
+
+def same_definitions(some: Iterable[object], others: Iterable[object]) -> bool:
+    """Tell whether functions and classes are the same, or made by the same code run again, as in a notebook."""
+    one, other = ([(x.__module__, getattr(x, "__qualname__", x)) for x in those] for those in (some, others))
+    return one == other
 
 
 def require(condition: bool, message: str) -> None:
@@ -245,6 +261,15 @@ def from_mapping(cls: type[T], values: Mapping[str, Any] | T | None, *, base: T 
     missing = [name for name in lacking if base is None and name not in changes]
     require(not missing, f"{cls.__name__} needs {', '.join(missing)}")
     return cls(**changes) if base is None else dataclasses.replace(base, **changes)  # type: ignore[type-var]
+
+
+def overlaid(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings laid over others: a mapping within changes what it names, and leaves the rest."""
+    out = dict(base)
+    for key, value in over.items():
+        inner = out.get(key)
+        out[key] = overlaid(inner, value) if isinstance(inner, Mapping) and isinstance(value, Mapping) else value
+    return out
 
 
 def to_mapping(config: Any) -> dict[str, Any]:

@@ -10,6 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from slam.files import quoted
+
 __all__ = [
     "CONCAVE", "CONVEX", "FARTHEST_M", "LINE", "VIRTUAL", "Array", "Bytes", "Cells", "Flags", "Floats", "Indices",
     "Observations", "Odometry", "Scan", "Sighting",
@@ -52,9 +54,13 @@ class Odometry(NamedTuple):
     def numbers(self) -> tuple[float, float, float]:
         """The twist as three numbers."""
         twist = self.twist
-        if isinstance(twist, tuple):
+        if isinstance(twist, tuple) and len(twist) == 3:
             return twist
-        vx, vy, omega = np.asarray(twist, np.float64).tolist()
+        try:
+            vx, vy, omega = map(float, np.asarray(twist, np.float64).tolist())
+        except (TypeError, ValueError):
+            message = f"the twist of an odometry is three numbers vx, vy, ω, got {quoted(twist)}"
+            raise ValueError(message) from None
         return vx, vy, omega
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol, TypeVar
 
 from mecanum_env.rooms.floor_plan import FloorPlan
-from slam.settings import argument, check_name, from_mapping
+from slam.settings import argument, check_name, from_mapping, require, same_definitions
 
 __all__ = ["Generator", "config_type", "make", "names", "register"]
 
@@ -26,14 +26,17 @@ _GENERATORS: dict[str, tuple[Generator[Any], type[Any]]] = {}
 def register(name: str, generator: Generator[C], config_type: type[C]) -> None:
     """Make a generator known under a name, with the frozen dataclass that configures it.
 
+    A notebook's cell that is run again replaces what it registered.
+
     Raises
     ------
     ValueError
         If another generator has the name.
     """
-    known = _GENERATORS.get(name)
-    if known is not None and known != (generator, config_type):
-        raise ValueError(f"rooms {name!r} is registered already; choose another name")
+    require(
+        name not in _GENERATORS or same_definitions(_GENERATORS[name], (generator, config_type)),
+        f"rooms {name!r} is registered already; choose another name",
+    )
     _GENERATORS[name] = (generator, config_type)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from mecanum_env.config import EnvConfig, NoiseConfig, RobotConfig
 from mecanum_env.sensing.slip import grip_m_s2, patch_friction
 from slam.motion import LastingErrors, OdometryNoise
-from slam.settings import to_mapping
+from slam.settings import overlaid, to_mapping
 
 __all__ = ["backend_settings", "odometry_noise"]
 
@@ -69,12 +69,4 @@ def backend_settings(config: EnvConfig) -> dict[str, Any]:
     whole = {"speed_share", "turn_share_rad_m"}
     if isinstance(given, Mapping) and "lasting" not in given and given.keys() & whole:
         del settings["odometry"]["lasting"]  # these speak of V as a whole
-    return _overlay(settings, config.slam_config)
-
-
-def _overlay(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    out = dict(base)
-    for key, value in over.items():
-        inner = out.get(key)
-        out[key] = _overlay(inner, value) if isinstance(inner, dict) and isinstance(value, Mapping) else value
-    return out
+    return overlaid(settings, config.slam_config)

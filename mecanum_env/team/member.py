@@ -15,6 +15,7 @@ from mecanum_env.ground_truth import Coverage, GroundTruth
 from mecanum_env.observation import Observation
 from mecanum_env.physics.fleet import Fleet
 from mecanum_env.rooms.floor_plan import FloorPlan
+from mecanum_env.step_clock import StepClock
 from mecanum_env.team.config import TeamConfig
 from mecanum_env.team.knowledge import Knowledge
 from slam.backend import Backend
@@ -98,7 +99,7 @@ class Member(ExploreEnv):
         """
         known = first is not None and self._team.known_starts
         self._shared_ground = first.truth.ground if first is not None and known else None
-        self._start_error, self._step_limit, self.sightings = start_error, step_limit, ()
+        self._start_error, self._clock, self.sightings = start_error, StepClock(step_limit), ()
         self._set_up(plan, seed, None if first is None else first.truth.world.floor)
         self._shared_coverage = first.own_coverage if first is not None and self.joint else None  # of the one grid
         self._sighting_rng = np.random.default_rng(np.random.SeedSequence([seed, 1]))

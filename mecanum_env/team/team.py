@@ -88,11 +88,14 @@ class Team:
             given = from_mapping(TeamConfig, team)
         self.team = given if robots is None else replace(given, robots=checked("robots", Robots, robots))
         self._plan = floor_plan if isinstance(floor_plan, FloorPlan) else None
-        self.config = make_config(floor_plan=None if isinstance(floor_plan, FloorPlan) else floor_plan, **settings)
+        self.config = make_config(floor_plan=floor_plan, **settings)
         self.joint: JointEkf | None = None
         """The one filter of a joint belief."""
         if self.team.belief == "joint":
-            if self.config.slam not in (JOINT_SLAM, EnvConfig().slam):  # the default stands for none
+            slam = settings.get("slam")
+            named = slam.get("name") if isinstance(slam, Mapping) else slam
+            default = EnvConfig().slam  # in a configuration it stands for none
+            if self.config.slam not in (JOINT_SLAM, default) or named == default:
                 raise ValueError(
                     f"a joint belief is {JOINT_SLAM} over all robots; slam must be left out or be that"
                 )
@@ -125,7 +128,7 @@ class Team:
         if seed is not None:
             self._rng, _ = np_random(seed)
         seed = int(self._rng.integers(2**31)) if seed is None else int(seed)
-        plans = self._plans(options, seed, room_seed_of(options, seed))
+        plans = self._plans(options, seed, room_seed_of(options, seed, self._plan))
         config, team = self.config, self.team
         drawn = np.random.default_rng(np.random.SeedSequence([seed, 2])).standard_normal((team.robots, 3))
         sigmas = np.array([team.start_sigma_m, team.start_sigma_m, team.start_sigma_rad])

@@ -26,9 +26,10 @@ _PAGES = 4  # a caller that keeps the last observation beside the next needs two
 _NUMBERS = ("coverage", "path_length_m", "time_s", "position_error_m", "heading_error_rad", "nees", "collisions")
 _POSE = "true_pose"
 _TERMS = tuple(reward_terms(RewardConfig(), StepOutcome(0.0, 0.0, 0.0, 0, 0.0, 0.0)))
-_SHARED = {*_NUMBERS, _POSE, "reward_terms"}
-_UNPAID_KEYS = len(_SHARED) - 1
-_numbers_of = itemgetter(*_NUMBERS)
+_TERM_NAMES, _NO_TERMS = {*_TERMS}, dict[str, float]()
+_UNPAID_KEYS = {*_NUMBERS, _POSE}
+_PAID_KEYS = {*_UNPAID_KEYS, "reward_terms"}
+_numbers_of, _terms_of = itemgetter(*_NUMBERS), itemgetter(*_TERMS)
 
 # An environment's numbers are one line of memory, so that one call writes them.
 _LINE = np.dtype(
@@ -100,14 +101,16 @@ class Page:
         """
         if observation is not None:
             self.show(row, observation)
-        terms = info.get("reward_terms")
+        terms = info.get("reward_terms", _NO_TERMS)
+        paid = terms.keys() == _TERM_NAMES  # a wrapper's own have no place
         _pack(
             self._raw, self._first + row * _LINE.itemsize, reward, *_numbers_of(info), *info[_POSE].tolist(),
-            *(_UNPAID if terms is None else terms.values()), terminated, truncated, True, terms is not None,
+            *(_terms_of(terms) if paid else _UNPAID), terminated, truncated, True, paid,
         )  # fmt: skip
-        if len(info) == (_UNPAID_KEYS if terms is None else _UNPAID_KEYS + 1):
+        shared = _PAID_KEYS if paid else _UNPAID_KEYS
+        if len(info) == len(shared):
             return {}
-        return {key: value for key, value in info.items() if key not in _SHARED}
+        return {key: value for key, value in info.items() if key not in shared}
 
     def show(self, row: int, observation: Observation) -> None:
         """Write an environment's observation."""
@@ -149,7 +152,7 @@ class Board:
     """
 
     def __init__(
-        self, context: BaseContext, count: int, observation: spaces.Dict, action: spaces.Box, workers: int
+        self, context: BaseContext, count: int, observation: spaces.Dict, action: spaces.Space[Any], workers: int
     ) -> None:
         memory: dict[str, _Memory] = {}
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy as shallow_copy
 from copy import deepcopy
 from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import gymnasium
 import numpy as np
@@ -30,6 +30,9 @@ from slam.types import Array, Flags, Floats
 __all__ = ["ExploreVectorEnv"]
 
 Observations = dict[str, NDArray[Any]]
+
+_ARRAYS = spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete
+"""Of what lies in shared memory."""
 
 Environments = Annotated[int, Within("[1, 4096]")]
 
@@ -61,6 +64,7 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         How processes are started (``"fork"``, ``"forkserver"``, ``"spawn"``); the platform's way if left out.
     make : callable, optional
         Makes one of them, instead of settings: an environment around an ``ExploreEnv``, that hands on its infos.
+        Observations are a ``Dict`` of one level; they and actions are arrays, or ``Discrete``.
         It is called in the processes, so they must be able to import it.
     **settings
         Those of :class:`mecanum_env.env.ExploreEnv`.
@@ -69,6 +73,11 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
     ------
     ValueError
         For a number of environments or workers below one, and where ``ExploreEnv`` does.
+
+    Attributes
+    ----------
+    wrappers : tuple of type
+        What each environment is wrapped in, the outermost first.
     """
 
     def __init__(
@@ -98,11 +107,13 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
             check_name("autoreset_mode", autoreset_mode, [mode.value for mode in AutoresetMode])
         if make is not None and settings:
             raise ValueError(
-                f"settings are what make gives its environments: {', '.join(settings)} is one too many"
+                f"make takes the place of all settings: leave out {', '.join(settings)}, or make (gym.make_vec "
+                "always gives an action: with make, call ExploreVectorEnv itself)"
             )
-        make = make or partial(_make, settings)
+        make = partial(_limited, make or partial(_make, settings), limit)
         like = make()  # tells what is wrong with the settings before any process is started
-        observation, action = cast("spaces.Dict", like.observation_space), cast("spaces.Box", like.action_space)
+        observation, action = _shareable(like)
+        self.wrappers = tuple(map(type, _layers(like)))[:-1]
         mode = AutoresetMode(autoreset_mode)
         self.num_envs, self.copy = num_envs, copy
         self.metadata = {**like.metadata, "autoreset_mode": mode}
@@ -112,7 +123,6 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         self.action_space = batch_space(action, num_envs)
         like.close()
         processes = multiprocessing.get_context(context)
-        make = partial(_limited, make, limit)
         shares = min(workers, num_envs)
         # The first is the caller's, who has more to do than its share: where they differ, the smaller one.
         edges = [num_envs * k // shares for k in range(shares + 1)]
@@ -159,7 +169,8 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         if np.shape(actions) != board.actions.shape:
             raise ValueError(f"actions must be {board.actions.shape}, got {np.shape(actions)}")
         if not _taken(actions, board.actions):  # before any environment has stepped
-            raise ValueError(f"actions must be finite numbers in [-1, 1], got {quoted(actions)}")
+            what = "finite numbers in [-1, 1]" if board.actions.dtype.kind == "f" else "whole numbers"
+            raise ValueError(f"actions must be {what}, got {quoted(actions)}")
         number = self._turn()
         page, infos = board.pages[number], self._infos(number, self._step(number))
         return (
@@ -250,7 +261,9 @@ class ExploreVectorEnv(VectorEnv[Observations, Floats, Any]):
         return self._board.pages[page].lend(copy=self.copy and page == self._board.spare)
 
     def _infos(self, page: int, rests: list[dict[int, dict[str, Any]]]) -> dict[str, Any]:
-        infos = self._board.pages[page].infos(copy=page == self._board.spare)
+        # Terms of a wrapper's own are added below, and must not be to the board.
+        own = any("reward_terms" in more for rest in rests for more in rest.values())
+        infos = self._board.pages[page].infos(copy=own or page == self._board.spare)
         for rest in rests:
             for row, more in rest.items():
                 infos = self._add_info(infos, more, row)
@@ -262,15 +275,40 @@ def _taken(actions: Any, into: NDArray[Any]) -> bool:
     if np.iscomplexobj(actions):
         return False
     try:
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             into[:] = actions
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         return False
+    if into.dtype.kind != "f":  # whole numbers are not made of others
+        return np.array_equal(into, actions)
     return bool(np.isfinite(into).all())
 
 
 def _make(settings: dict[str, Any]) -> gymnasium.Env[Any, Any]:
     return ExploreEnv(**deepcopy(settings))
+
+
+def _shareable(env: gymnasium.Env[Any, Any]) -> tuple[spaces.Dict, spaces.Space[Any]]:
+    """Return an environment's spaces; ``ValueError`` where the board has no place for what is of them."""
+    observation, action = env.observation_space, env.action_space
+    parts = list(observation.values()) if isinstance(observation, spaces.Dict) else [observation]
+    if not isinstance(observation, spaces.Dict) or not all(isinstance(part, _ARRAYS) for part in [*parts, action]):
+        env.close()
+        names = ", ".join(kind.__name__ for kind in _ARRAYS)
+        raise ValueError(
+            f"make: shared memory holds a one-level Dict of {names}, and actions of these; got observations "
+            f"{quoted(observation)}, actions {quoted(action)}; Gymnasium's SyncVectorEnv takes any "
+            '(vectorization_mode="sync")'
+        )
+    return observation, action
+
+
+def _layers(env: gymnasium.Env[Any, Any]) -> Iterator[gymnasium.Env[Any, Any]]:
+    """Yield the wrappers of an environment, the outermost first, and the environment itself."""
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env
+    yield env
 
 
 def _limited(

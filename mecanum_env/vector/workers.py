@@ -8,6 +8,7 @@ import pickle
 import signal
 import time
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -57,7 +58,7 @@ class _Seat:
     """An environment and its row of the board."""
 
     def __init__(self, row: int, env: gymnasium.Env[Any, Any], board: Board) -> None:
-        self.row, self.env, self.action = row, env, board.actions[row]
+        self.row, self.env = row, env
         self.ended = False
         self.ready: _Ready | None = None
         self.seen: Observation | None = {}  # the last observation; None where it is on the board alone
@@ -104,12 +105,12 @@ class Share:
                     )
                 place = seat.point_at(page)
                 # A copy: a wrapper may keep it, and the board's row is the next step's as well.
-                observation, paid, terminated, truncated, info = seat.env.step(seat.action.copy())
+                action = self._board.actions[seat.row].copy()
+                observation, paid, terminated, truncated, info = seat.env.step(action)
                 reward = float(paid)
                 seat.ended = ended = terminated or truncated
                 if ended and self._mode is AutoresetMode.SAME_STEP:
-                    last = {key: value.copy() for key, value in observation.items()}
-                    more = {"final_obs": last, "final_info": info}
+                    more = {"final_obs": deepcopy(observation), "final_info": info}
                     more |= self._reset(page, seat, None, None, reward, terminated, truncated)
                 else:
                     seat.seen = None if place is not None else observation

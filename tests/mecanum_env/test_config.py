@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +62,41 @@ def test_rooms_given_are_explored_whatever_plan_the_configuration_has(tmp_path: 
         make_config(rooms="maze", floor_plan=str(plan))
 
 
+@pytest.mark.parametrize("make", [partial(gymnasium.make, "mecanum_env/Explore-v0"), mecanum_env.parallel_env])
+def test_what_draws_rooms_is_refused_beside_a_floor_plan(make: Callable[..., Any]) -> None:
+    plan = mecanum_env.rooms.make("rectangular", seed=1)
+    with pytest.raises(ValueError, match="instead of rooms; leave out the one or the other"):
+        make(floor_plan=plan, rooms="maze")
+    for env, more in ((make(floor_plan=plan), {}), (make(rooms="maze"), {"floor_plan": plan})):
+        with pytest.raises(ValueError, match="room_seed draws a room, and there is a floor plan instead"):
+            env.reset(seed=0, options={"room_seed": 5, **more})
+        env.reset(seed=0, options=more)
+
+
+def test_a_mapping_leaves_what_it_does_not_name_however_deep() -> None:
+    base: dict[str, Any] = {"slam": "ekf", "slam_config": {"gate": 9.0, "landmarks": {"confirm_after": 3}}}
+    config = make_config(config=base, slam={"landmarks": {"forget_after": 9}})
+    assert config.slam_config == {"gate": 9.0, "landmarks": {"confirm_after": 3, "forget_after": 9}}
+    other = make_config(config=base, slam={"name": "ekf-lines", "landmarks": {"forget_after": 9}})
+    assert other.slam_config == {"landmarks": {"forget_after": 9}}  # what the base has is another's
+
+
+def test_a_room_s_seed_beyond_its_limit_is_refused() -> None:
+    env = gymnasium.make("mecanum_env/Explore-v0", rooms="rectangular")
+    env.reset(seed=0, options={"room_seed": 2**63 - 1})
+    with pytest.raises(ValueError, match=r"room_seed must be a whole number in \[0, 9223372036854775807\]"):
+        env.reset(seed=0, options={"room_seed": 2**63})
+
+
 def test_a_robot_s_preset_brings_its_lidar_and_no_lidar_lies_beyond_its_body() -> None:
     config = make_config(robot={"preset": "cavity", "mass_kg": 3.0})
     assert (config.lidar, config.noise) == (LIDAR_PRESETS["cavity"], NOISE_PRESETS["cavity"])
     assert make_config(robot={"preset": "cavity"}, lidar="cavity", noise="slippery").noise.slip == 0.1
     with pytest.raises(ValueError, match=r"at most half of robot.length_m, 0.1: .*; got 0.2"):
         make_config(robot={"length_m": 0.2, "width_m": 0.16})
+    with pytest.raises(ValueError, match=r'got 0.2; this body bears {"preset": "cavity", …}$'):
+        make_config(robot="cavity", lidar={"beams": 50})
+    assert make_config(robot="cavity", lidar={"preset": "cavity", "beams": 50}).lidar.beams == 50
 
 
 @pytest.mark.parametrize("name", ["Explore-v0", "ExploreFrontier-v0"])

@@ -262,7 +262,7 @@ def test_options_place_the_robot_and_choose_the_room() -> None:
     for wrong, message in (({"room": 3}, "unknown reset option 'room'"), (5, "options must be a mapping, got 5")):
         with pytest.raises(ValueError, match=message):
             env.reset(seed=0, options=wrong)
-    env = make(floor_plan=plan)
+    env = make(floor_plan=plan, rooms=None)
     env.reset(seed=0, options={"floor_plan": None, "room_seed": None})  # as left out
     assert env.unwrapped.truth.plan is plan
 

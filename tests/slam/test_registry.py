@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import slam
+from slam.dead_reckoning import OdometrySlam
+from slam.gaussian.settings import EkfConfig
 from slam.geometry import compose, exp
 from slam.types import Observations, Odometry, Scan
 from tests.slam.simulated import circle_twist, observe_landmarks, room_scan
@@ -71,6 +73,31 @@ def test_odometry_that_is_no_number_changes_nothing(name: str, twist: Any) -> No
         with pytest.raises(ValueError, match="of an odometry are finite, and no time goes back"):
             backend.predict(odometry)
     assert np.array_equal(backend.pose, pose) and np.array_equal(backend.pose_cov, cov)
+
+
+@pytest.mark.parametrize("name", ["ekf", "graph-slam"])
+@pytest.mark.parametrize("twist", [(0.1, 0.0), (0.1, 0.0, 0.0, 0.0), np.zeros(4), 0.1, np.zeros((3, 1))])
+def test_a_twist_that_is_not_three_numbers_is_refused_in_a_sentence(name: str, twist: Any) -> None:
+    with pytest.raises(ValueError, match="the twist of an odometry is three numbers vx, vy, ω, got"):
+        slam.make(name).predict(Odometry(twist, 0.1))
+
+
+def test_a_cell_that_is_run_again_registers_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slam.registry, "_BACKENDS", dict(slam.registry._BACKENDS))
+
+    def cell() -> tuple[Any, Any]:
+        class MineConfig(EkfConfig): ...
+
+        class Mine(OdometrySlam): ...
+
+        return Mine, MineConfig
+
+    for _ in range(2):
+        backend, config = cell()
+        slam.register("mine", backend, config)
+    assert type(slam.make("mine")) is backend and slam.config_type("mine") is config
+    with pytest.raises(ValueError, match="'mine' is registered already; choose another name"):
+        slam.register("mine", backend, EkfConfig)
 
 
 @pytest.mark.parametrize("name", slam.names())

@@ -42,7 +42,7 @@ class ExploreVecEnv(VecEnv):
         self.envs = ExploreVectorEnv(
             n_envs, autoreset_mode=AutoresetMode.SAME_STEP, max_episode_steps=max_episode_steps, **settings
         )
-        self._actions = np.zeros(self.envs.action_space.shape or (), np.float32)
+        self._actions: NDArray[Any] = np.zeros(self.envs.action_space.shape or (), self.envs.action_space.dtype)
         super().__init__(n_envs, self.envs.single_observation_space, self.envs.single_action_space)
         if seed is not None:
             self.seed(seed)
@@ -58,8 +58,8 @@ class ExploreVecEnv(VecEnv):
         self._reset_options()
         return observations
 
-    def step_async(self, actions: NDArray[np.float32]) -> None:
-        """Take the actions ``(n_envs, a)`` of the next step."""
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the actions of the next step, ``(n_envs, a)`` or ``(n_envs,)``."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -123,8 +123,9 @@ class ExploreVecEnv(VecEnv):
         return [values[k] for k in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return that none is in a wrapper."""
-        return [False for _ in self._get_indices(indices)]
+        """Tell of some environments whether they are in a wrapper of a class; all are made alike."""
+        wrapped = any(issubclass(wrapper, wrapper_class) for wrapper in self.envs.wrappers)
+        return [wrapped for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
         """Return a frame of each environment."""

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from mecanum_env import rooms
+from mecanum_env.rooms import registry
 from mecanum_env.rooms.layout.apartment_layout import ApartmentConfig, draw_layout
 from mecanum_env.rooms.layout.assembly import generator
 from mecanum_env.rooms.outlines.distance import distance_to_zero
@@ -285,6 +286,19 @@ def test_even_the_fullest_rooms_can_be_driven(kind, seed):
     assert np.bincount(missed.ravel())[1:].max(initial=0) * plan.resolution**2 <= 0.25
 
 
+def test_a_cell_that_is_run_again_registers_again(monkeypatch):
+    monkeypatch.setattr(registry, "_GENERATORS", dict(registry._GENERATORS))
+    for k in range(2):
+
+        class MineConfig(RectangularConfig): ...
+
+        def mine(config, /, *, seed, run=k):
+            return rooms.make("rectangular", seed=run)
+
+        rooms.register("mine", mine, MineConfig)
+    assert np.array_equal(rooms.make("mine", seed=7).walls, rooms.make("rectangular", seed=1).walls)
+
+
 def test_the_registry_names_what_there_is():
     assert {"apartment", "cave", "corridors", "maze", "rectangular"} <= set(rooms.names())
     with pytest.raises(ValueError, match=r"unknown rooms 'apartement' .did you mean 'apartment'.*rectangular"):
@@ -293,6 +307,8 @@ def test_the_registry_names_what_there_is():
         rooms.make("apartment", seed=0, config={"dors_m": (1, 2)})
     with pytest.raises(ValueError, match="registered already"):
         rooms.register("apartment", lambda config, *, seed: None, RectangularConfig)
+    with pytest.raises(ValueError, match="registered already"):
+        rooms.register("rectangular", registry._GENERATORS["rectangular"][0], ApartmentConfig)
     wide = rooms.make("rectangular", seed=5, config=RectangularConfig(length_m=(9.0, 9.0)))
     assert round(wide.bounds[2] - wide.bounds[0], 6) == 9.0
 

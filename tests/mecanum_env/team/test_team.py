@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import agents
+from mecanum_env.config import EnvConfig
 from mecanum_env.env import ExploreEnv
 from mecanum_env.rooms import FloorPlan
 from mecanum_env.rooms.files.importers import from_raster
@@ -349,6 +350,8 @@ def test_a_joint_belief_needs_to_hear_all() -> None:
         ({"team": {"belief": "joint", "communication": {"model": "range"}}}, "unlimited"),
         ({"team": {"belief": "joint", "known_starts": False}}, "known_starts"),
         ({"team": {"belief": "joint"}, "slam": "dp-slam"}, "ekf-lines"), ({"team": {"belief": "ours"}}, "joint"),
+        ({"team": {"belief": "joint"}, "slam": EnvConfig().slam}, "slam must be left out"),
+        ({"team": {"belief": "joint"}, "slam": {"name": EnvConfig().slam}}, "slam must be left out"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):
             Team(2, **settings)

@@ -10,9 +10,11 @@ from gymnasium.wrappers import TimeLimit, TransformAction
 pytest.importorskip("stable_baselines3")
 
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from mecanum_env.env import ExploreEnv
+from tests.mecanum_env.vector.test_wrapped import three
 from training.learning.vec_env import ExploreVecEnv
 
 ID = "mecanum_env:mecanum_env/Explore-v0"
@@ -88,8 +90,30 @@ def test_worlds_of_ones_own_are_those_of_stable_baselines_dummy() -> None:
         np.testing.assert_array_equal(rewards, their_rewards)
     for envs in (ours, theirs):
         envs.close()
-    with pytest.raises(ValueError, match="rooms is one too many"):
+    with pytest.raises(ValueError, match="leave out rooms"):
         ExploreVecEnv(3, make=_turned, rooms="maze")
+
+
+def _monitored() -> gymnasium.Env[Any, Any]:
+    return Monitor(three())
+
+
+def test_actions_may_be_numbers_and_a_monitor_is_found() -> None:
+    ours, theirs = (
+        ExploreVecEnv(2, make=_monitored, workers=2, max_episode_steps=None),
+        DummyVecEnv([_monitored] * 2),
+    )
+    for envs in (ours, theirs):
+        assert envs.env_is_wrapped(Monitor) == [True, True]
+        envs.seed(5)
+        envs.reset()
+    for actions in ([1, 2], [2, 0], [0, 1]):
+        (got, *_, infos), (want, *_, their_infos) = ours.step(np.array(actions)), theirs.step(np.array(actions))
+        assert isinstance(got, dict) and isinstance(want, dict)
+        assert all(np.array_equal(got[key], want[key]) for key in want)
+    assert [info["episode"]["l"] for info in infos] == [info["episode"]["l"] for info in their_infos] == [3, 3]
+    ours.close()
+    theirs.close()
 
 
 def test_what_stable_baselines_asks_of_it() -> None:
@@ -97,7 +121,7 @@ def test_what_stable_baselines_asks_of_it() -> None:
     envs.reset()
     assert [config.rooms for config in envs.get_attr("config", [1])] == ["rectangular"]
     assert envs.env_method("episode_metrics", indices=0)[0]["steps"] == 0
-    assert envs.env_is_wrapped(object) == [False, False]
+    assert envs.env_is_wrapped(TimeLimit) == [True, True] and envs.env_is_wrapped(Monitor, [0]) == [False]
     for mark in (3, (4, 5)):
         envs.set_attr("mark", mark)
         assert envs.get_attr("mark") == [mark, mark]
