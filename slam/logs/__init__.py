@@ -140,8 +140,8 @@ def with_reference(log: AnyLog, path: str | Path) -> ScanLog:
 
 _KNOWN = (
     "give Robot1_Odometry.dat[.gz] or its folder (UTIAS), the folder with steering.txt[.gz] (Victoria Park), a "
-    "ROS 2 bag's folder, .mcap or .db3, or a file with FLASER lines (CARMEN) or Odometry and Laser lines "
-    "(DP-SLAM)"
+    "ROS 2 bag's folder, .mcap or .db3, or a file with FLASER or ROBOTLASER1 lines (CARMEN) or Odometry and Laser "
+    "lines (DP-SLAM)"
 )
 
 

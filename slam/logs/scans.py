@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,16 +19,9 @@ from slam.motion import twist_between
 from slam.types import Array, Floats, Indices, Odometry, Scan
 
 __all__ = [
-    "SETTINGS",
-    "ScanLog",
-    "beam_angles",
-    "beside",
-    "chain",
-    "moved_by",
-    "rising",
-    "scan_log",
+    "SETTINGS", "Beams", "ScanLog", "beam_angles", "beside", "chain", "moved_by", "rising", "scan_log",
     "without_returns",
-]
+]  # fmt: skip
 
 # For a two-wheeled robot with a SICK LMS, whose errors are many times those of the simulated robot: shares of the
 # way as measured on the Intel log against its corrected poses, see docs/studies/real-logs.md.
@@ -56,7 +50,7 @@ _NO_RETURN_CM_M = 81.8
 _HIGHEST_MM_M = 8.192
 # Another laser says the farthest that it measures. So many beams, at so many bearings, are no wall: on real logs
 # the highest range is that of 1 beam of 100,000.
-_SATURATED, _SATURATED_BEAMS, _SATURATED_BEARINGS, _SAME_M = 0.005, 10, 0.05, 1e-3
+_SATURATED, _SATURATED_BEAMS, _SATURATED_BEARINGS, _SAME_M = 0.01, 10, 0.05, 1e-6
 
 
 # First bearing and step [°], where the number of beams tells them; GMapping's reader has the same steps.
@@ -150,11 +144,21 @@ class ScanLog(Log):
         )  # fmt: skip
 
 
+class Beams(NamedTuple):
+    """What a log tells of its laser."""
+
+    first_rad: float  # bearing of the first beam
+    step_rad: float
+    farthest_m: float  # that it measures
+
+
 def scan_log(
-    path: Path, ranges: Array, odometry_poses: Array, *, times: Array, stamps: Array, note: str
-) -> ScanLog:
+    path: Path, ranges: Array, odometry_poses: Array, *, times: Array, stamps: Array, note: str,
+    beams: Beams | None = None,
+) -> ScanLog:  # fmt: skip
     """Return a log without a reference, of ranges ``(n, beams)`` [m] as they were recorded."""
-    measured, reach = without_returns(ranges)
+    beams = beams or Beams(*beam_angles(ranges.shape[1]), math.inf)
+    measured, reach = without_returns(ranges, beams.farthest_m)
     if not np.isfinite(measured).any():
         raise ValueError(
             f"{path}: no range is above 0 and below {_NO_RETURN_CM_M} m, so nothing was measured; give ranges in m"
@@ -162,11 +166,10 @@ def scan_log(
     moved = int(np.count_nonzero(np.abs(times - stamps) > 1e-6))
     if moved:
         note += f"; {moved} of {len(stamps)} stamps did not rise, and were put between those that do"
-    angle_min, increment = beam_angles(ranges.shape[1])
     return ScanLog(
         name=plain_name(path.name.split(".")[0]), clock_start_s=float(times[0]),
         times=times - times[0], stamps=stamps,
-        ranges=measured, angle_min=angle_min, angle_increment=increment, range_max=reach,
+        ranges=measured, angle_min=beams.first_rad, angle_increment=beams.step_rad, range_max=reach,
         odometry_poses=odometry_poses, start_pose=odometry_poses[0].copy(), reference_times=np.zeros(0),
         reference_poses=np.zeros((0, 3)), reference_gap_s=30.0, settings=SETTINGS | _UNTOLD, note=note,
     )  # fmt: skip
@@ -230,14 +233,15 @@ def rising(stamps: Array) -> Array:
     return times
 
 
-def without_returns(ranges: Array) -> tuple[Array, float]:
+def without_returns(ranges: Array, farthest_m: float = math.inf) -> tuple[Array, float]:
     """Return ranges ``(n, beams)`` with the codes for "no measurement" taken out, and the laser's reach [m].
 
     A log that goes up to the codes of the millimetre mode is a short-range laser's: nothing returned within
     8.18 m, which is ``inf``. In the centimetre mode, 81.8 m and more, a beam is taken for lost, ``nan``: in a
     building it met glass or a black surface, not 80 m of free space. There the reach is that of the log's
     farthest measurement. A range of 0 is a beam lost, too. Where many beams at many bearings have the highest
-    range of all, that is no measurement either: taken as these codes are, by how far it is.
+    range of all, that is no measurement either: taken as these codes are, by how far it is. So is what lies at
+    ``farthest_m`` or beyond, where a log tells how far its laser measures.
     """
     out = np.where(ranges > 0.0, ranges, math.nan)
     highest = float(np.nanmax(out, initial=0.0))
@@ -245,10 +249,11 @@ def without_returns(ranges: Array) -> tuple[Array, float]:
         out[out >= _NO_RETURN_MM_M] = math.inf
         return out, _NO_RETURN_MM_M
     out[out >= _NO_RETURN_CM_M] = math.nan
-    highest = float(np.nanmax(out, initial=0.0))
+    highest = min(float(np.nanmax(out, initial=0.0)), farthest_m)
     at = out >= highest - _SAME_M
     beams, of = np.count_nonzero(at), np.count_nonzero(np.isfinite(out))
-    if max(_SATURATED * of, _SATURATED_BEAMS) < beams < of and at.any(axis=0).mean() > _SATURATED_BEARINGS:
+    many = max(_SATURATED * of, _SATURATED_BEAMS) < beams < of and at.any(axis=0).mean() > _SATURATED_BEARINGS
+    if many or highest == farthest_m:
         if highest < _NO_RETURN_MM_M:
             out[at] = math.inf
             return out, highest

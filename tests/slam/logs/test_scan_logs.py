@@ -359,7 +359,10 @@ def test_a_bag_of_ros_1_is_told_what_to_do(tmp_path):
 
 
 def test_files_without_a_scan(tmp_path):
-    for lines, words in ((["PARAM a b"], "holds no FLASER line"), (["Odometry 0 0 0"], "holds no Laser line")):
+    for lines, words in (
+        (["PARAM a b"], "holds neither FLASER nor ROBOTLASER1"),
+        (["Odometry 0 0 0"], "holds no Laser line"),
+    ):
         with pytest.raises(ValueError, match=words):
             open_log(put_lines(tmp_path / "none.log", lines))
     whole = put_lines(tmp_path / "cut.log.gz", GOOD, packed=True)

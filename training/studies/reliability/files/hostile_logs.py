@@ -103,7 +103,10 @@ def _lines_with_ranges(name: str, sound: Callable[[], Sound], value: bytes) -> b
 CARMEN: Hostile = {
     **_any("log.clf", b"FLASER 2 1 1 0 0 0 0 0 0 1 host 1"),
     **_scan("log.clf", samples.carmen, 3, 2, {"stamp": -3, "pose": -9, "heading": -7}),
-}
+    # Where beams stand, how far they reach, how many ranges and remissions there are, a pose.
+    **{f"{value[:20]} in place {word} of ROBOTLASER1": _with("log.clf", samples.robotlaser, 3, word, value)
+       for value in _NUMBERS for word in (2, 3, 4, 5, 8, 189, 192)},
+}  # fmt: skip
 DPSLAM: Hostile = {
     **_any("run.log", b"Laser 2 1 1"),
     **_scan("run.log", samples.dpslam, 1, 0, {"last range": -1}),

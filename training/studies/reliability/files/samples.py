@@ -23,7 +23,7 @@ from slam.landmarks.database import write_landmark_map
 
 __all__ = [
     "Files", "Hostile", "Link", "Pipe", "Sound", "as_json", "carmen", "configs", "dpslam", "images", "landmarks",
-    "one", "packed", "park", "policies", "put", "ros_map", "utias",
+    "one", "packed", "park", "policies", "put", "robotlaser", "ros_map", "utias",
 ]  # fmt: skip
 
 
@@ -127,6 +127,18 @@ def carmen() -> Sound:
         lines.append(f"ODOM {_line(*pose)} 0.2 0.2 0 {_line(stamp)} host {_line(stamp)}")
         scan = f"FLASER 180 {_line(*_ranges(k))} {_line(*pose)} {_line(*pose)}"
         lines.append(f"{scan} {_line(stamp)} host {_line(stamp)}")
+    return {"log.clf": _text(lines)}
+
+
+@cache
+def robotlaser() -> Sound:
+    """Return a CARMEN log of a later version."""
+    lines = []
+    for k, pose in enumerate(_circle(12)):
+        laser = "ROBOTLASER1 0 -1.570796 3.141593 0.017453 20 0.01 0"
+        at = f"{_line(*pose)} {_line(*pose)} 0.2 0.2 0 0 0"
+        stamp = _line(1.0e9 + 0.5 * k)
+        lines.append(f"{laser} 180 {_line(*_ranges(k))} 2 0.5 0.5 {at} {stamp} host {stamp}")
     return {"log.clf": _text(lines)}
 
 
