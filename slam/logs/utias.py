@@ -70,10 +70,10 @@ _NEAREST_M = 0.1  # of a range; the log's are above 1 m
 _FULL_TURN_RAD = 6.3
 _WIDEST_RAD = 1.2  # a bearing; the camera's go to 0.6
 _SPEED_SCALE, _HANGS_BACK_M, _TURN_SCALE = 1.038, 0.09, 0.97
-_STRAY_S = 0.12  # zeros that are shorter are the logger's, not a command
+_STRAY_S = 0.115  # zeros that are shorter are the logger's, not a command
 _PULSE_S, _PULSE_LATE_S = 0.21, 0.15
-_BURST_RAD_S, _LONGEST_BURST_S = 0.3, 0.39  # such a turn is driven as a pulse …
-_QUIET_RAD_S, _QUIET_S = 0.08, 0.25  # … if the robot hardly turns for so long on either side
+_BURST_RAD_S, _LONGEST_BURST_S = 0.3, 0.395  # such a turn is driven as a pulse …
+_QUIET_RAD_S, _QUIET_S = 0.08, 0.245  # … if the robot hardly turns for so long on either side
 
 
 def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
@@ -103,7 +103,11 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
     landmark_ids, landmarks = _landmarks(find(folder, "Landmark_Groundtruth.dat"))
     subject_of_code = _codes(find(folder, "Barcodes.dat"))
 
-    begin, end = float(odometry[0, 0]), float(odometry[-1, 0])
+    clock = float(odometry[0, 0])
+    for table in (odometry, measured, truth):
+        # To the microsecond: a clock of seconds since 1970 tells a quarter of one, and spans are compared.
+        table[:, 0] = np.round(table[:, 0] - clock, 6)
+    begin, end = 0.0, float(odometry[-1, 0])
     if not begin < end:
         raise ValueError(f"log of robot {robot} in {folder} has odometry of a single instant; it is cut short")
     subjects = np.array([subject_of_code.get(int(code), 0) for code in measured[:, 1]], np.int64)
@@ -124,13 +128,13 @@ def read(folder: Path, robot: int, *, raw: bool = False) -> RecordedLog:
         raise ValueError(f"log of robot {robot} in {folder}: the ground truth does not cover the first odometry")
     within = (truth[:, 0] >= begin) & (truth[:, 0] <= end)
     twists = np.column_stack([odometry[:, 1], np.zeros(len(odometry)), odometry[:, 2]])
-    odometry_times, twists = split_holds(odometry[:, 0] - begin, twists, longest_s=_LONGEST_HOLD_S)
+    odometry_times, twists = split_holds(odometry[:, 0], twists, longest_s=_LONGEST_HOLD_S)
     note = "reference: Vicon pose of the robot's centre; the start pose is the reference's"
     return RecordedLog(
-        name=f"{plain_name(folder.absolute().name)} robot {robot}", clock_start_s=begin,
+        name=f"{plain_name(folder.absolute().name)} robot {robot}", clock_start_s=clock,
         odometry_times=odometry_times, twists=twists,
         observation_times=times, observation_ends=ends, range_bearing=measured[kept, 2:4], ids=subjects[kept],
-        reference_times=truth[within, 0] - begin,
+        reference_times=truth[within, 0],
         reference_poses=np.column_stack([truth[within, 1:3], wrap(truth[within, 3])]), reference_gap_s=0.5,
         landmark_ids=landmark_ids, landmarks=landmarks, start_pose=start,
         observation_noise=RAW_NOISE if raw else NOISE, settings=RAW_SETTINGS if raw else SETTINGS,

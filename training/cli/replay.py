@@ -24,7 +24,7 @@ def replay(
             help="ROS 2 bag, CARMEN or DP-SLAM log; UTIAS: Robot1_Odometry.dat or folder; Victoria Park: folder.",
         ),
     ],
-    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: ekf]")] = None,
+    slam: Annotated[str | None, typer.Option(help="SLAM backend.  [default: invariant-ekf]")] = None,
     association: Annotated[
         str | None, typer.Option(help="known or unknown landmark ids.  [default: known where the log has them]")
     ] = None,

@@ -48,7 +48,7 @@ class ReplayConfig(Config):
     """A replay's configuration file; the log's own values stand where it says nothing."""
 
     observation: ObservationNoise | None = None  # of a log of scans there is none
-    slam: str = "ekf"
+    slam: str = "invariant-ekf"
     slam_config: Mapping[str, Any] = field(default_factory=dict)
 
 

@@ -101,3 +101,20 @@ def test_a_utias_log_is_calibrated_unless_it_is_another_rigs_or_wanted_raw(tmp_p
     assert log.duration_s == pytest.approx(raw.duration_s + 0.19) and "as recorded" in raw.note
     assert np.all(log.range_bearing[:, 1] == raw.range_bearing[:, 1])
     assert np.all(log.range_bearing[:, 0] != raw.range_bearing[:, 0])
+
+
+def test_a_log_is_the_same_whenever_its_clock_began(tmp_path):
+    """A clock of seconds since 1970 tells a quarter of a microsecond, and commands are held for 20 ms exactly."""
+    logs = []
+    for name, later in (("then", 0.0), ("now", 1.2e9)):
+        write_utias(tmp_path / name, seconds=5.0)
+        for file in ("Odometry", "Measurement", "Groundtruth"):
+            path = tmp_path / name / f"Robot1_{file}.dat"
+            rows = np.loadtxt(path)
+            rows[:, 0] += later
+            np.savetxt(path, rows, fmt="%.6f")
+        logs.append(open_log(tmp_path / name))
+    then, now = logs
+    assert now.clock_start_s == then.clock_start_s + 1.2e9
+    for field in ("odometry_times", "twists", "observation_times", "reference_times", "start_pose"):
+        np.testing.assert_array_equal(getattr(then, field), getattr(now, field))

@@ -62,7 +62,7 @@ def test_a_replay_writes_every_file_of_one_run(
     found = replayed([str(logs / "utias" / "Robot1_Odometry.dat"), "--out", str(out), "--seed", "3"], capsys)
     assert sorted(p.name for p in out.iterdir()) == sorted(task.FILES)
     assert found == json.loads((out / "metrics.json").read_text("utf-8"))
-    assert found["slam"] == "ekf" and found["association"] == "known" and found["seed"] == 3
+    assert found["slam"] == "invariant-ekf" and found["association"] == "known" and found["seed"] == 3
     assert found["log"] == "utias robot 1" and found["end"] == "end of the log" and not found["interrupted"]
     assert found["observations"] == 160 and found["landmarks"] == 4 and found["duration_s"] == pytest.approx(20.0)
     # Nothing was noisy, so nothing is off by more than rounding and the reference's interpolation.
@@ -137,7 +137,7 @@ def test_a_log_without_ids_or_headings(logs: Path, tmp_path: Path, capsys: pytes
     assert found["anees"] is None and found["final_heading_error_rad"] is None and found["landmark_rmse_m"] is None
     assert main(["replay", str(logs / "park"), "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
-    assert "victoria_park with ekf, unknown association" in shown and "metrics.json" in shown
+    assert "victoria_park with invariant-ekf, unknown association" in shown and "metrics.json" in shown
 
 
 @pytest.mark.parametrize("name", [n for n in slam.names() if slam.make(n).observes_landmarks])
