@@ -13,6 +13,7 @@ import numpy as np
 from slam.belief import Belief
 from slam.ekf import EkfSlam
 from slam.gaussian.stacked_update import NO_LIMITS
+from slam.geometry import wrap
 from slam.metrics.measures import nees_pose_invariant
 from slam.types import Array, Indices, Odometry, Scan
 
@@ -77,6 +78,7 @@ class TruthSlam(OdometrySlam):
         if not np.all(np.isfinite(pose)):
             raise ValueError("a given pose must be finite")
         self._x[:3] = pose
+        self._x[2] = wrap(self._x[2])
         self._robot_cov = np.eye(3) * 1e-12
 
     def predict(self, odometry: Odometry) -> None:

@@ -266,7 +266,10 @@ class DpSlam(SurfaceBackend):
         path = np.array([self.sensor_pose(body) for body in bodies]).reshape(-1, 3)
         if largest_shift(path, drawn, self.config.key_scans.lever_m) <= 0.5 * self.grid.resolution:
             return False
-        self.grid.redraw(path, self._key)
+        # What contradicts the map is not drawn, whatever it is drawn from.
+        kept = self.recovery.kept if self._doubtful and self._recovers else None
+        sound = len(self._key) if kept is None else len(kept["_key"])
+        self.grid.redraw(path[:sound], self._key[:sound])
         self._shown = path
         return True
 

@@ -133,10 +133,16 @@ def observation_rows(observations: Observations) -> Array:
     Raises ``ValueError``, before anything has changed, where they are none: see
     :class:`slam.types.Observations`.
     """
-    rb = np.asarray(observations.range_bearing, dtype=np.float64).reshape(-1, 2)
-    cov = np.asarray(observations.cov, dtype=np.float64).reshape(-1, 2, 2)
-    if len(rb) != len(cov) or not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
-        raise ValueError("observations need finite range_bearing (m, 2) and cov (m, 2, 2) of one length")
+    rb = np.asarray(observations.range_bearing, dtype=np.float64)
+    cov = np.asarray(observations.cov, dtype=np.float64)
+    m = len(rb) if rb.size else 0
+    if rb.size + cov.size and (rb.shape, cov.shape) != ((m, 2), (m, 2, 2)):
+        raise ValueError(
+            f"observations need range_bearing (m, 2) and cov (m, 2, 2), got {rb.shape} and {cov.shape}"
+        )
+    rb, cov = rb.reshape(m, 2), cov.reshape(m, 2, 2)
+    if not (np.all(np.isfinite(rb)) and np.all(np.isfinite(cov))):
+        raise ValueError("range_bearing and cov of observations must be finite")
     if np.any(cov[:, 0, 0] <= 0.0) or np.any(cov[:, 0, 0] * cov[:, 1, 1] <= cov[:, 0, 1] ** 2):
         raise ValueError("covariances of observations must be positive definite; what is not known is large")
     if observations.ids is not None:

@@ -80,9 +80,11 @@ class OdometryNoise(Config):
         Raises ``ValueError`` where it is not finite: a belief that has once taken that in has lost everything.
         """
         twist, slip = odometry.numbers, odometry.slip
-        if not (math.isfinite(twist[0] + twist[1] + twist[2] + odometry.dt) and odometry.dt >= 0.0):
+        slipped = 0.0 if slip is None else slip[0] + slip[1]
+        if not (math.isfinite(twist[0] + twist[1] + twist[2] + odometry.dt + slipped) and odometry.dt >= 0.0):
+            told = f"{twist}, {odometry.dt}" if slip is None else f"{twist}, {odometry.dt} and {slip}"
             raise ValueError(
-                f"vx, vy, ω and dt of an odometry are finite, and no time goes back; got {twist} and {odometry.dt}"
+                f"vx, vy, ω, dt and slip of an odometry are finite, and no time goes back; got {told}"
             )
         if slip is None:
             slip, body = self.slip(body, twist, odometry.dt) if odometry.dt > 0.0 else (NO_SLIP, body)

@@ -56,7 +56,7 @@ class HealthConfig(Config):
     # weight, times what the mean logarithm of NIS over its degrees of freedom has above where it begins to tell.
     bias: Finite = 3.5
     nis_weight: Finite = 2.9
-    nis_from: Finite = -2.2
+    nis_from: Finite = 0.0
     memory: Annotated[float, Within("[1, 1e6]")] = 50.0  # updates that the mean is taken over
 
     def __post_init__(self) -> None:

@@ -52,6 +52,7 @@ SETTINGS = {
     "start_sigma_m": 1e-4,
     "start_sigma_rad": 0.01,  # Vicon's: 0.005 to 0.02 rad, by the heading
     "association": "nearest",
+    "health": {"nis_from": -2.2},  # noise is stated large: so low is the logarithm of NIS where all is well
     "known_gate": 18.4,  # 99.99 %: a few bar codes were misread
     "loop_sigma_m": math.inf,  # meant for walls, many in a scan; tubes are seen one by one, and never find company
     "invariant-ekf": {"loop_sigma_m": 0.6},  # it knows how unsure it is; groups of tubes stand metres apart

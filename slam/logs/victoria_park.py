@@ -51,6 +51,7 @@ SETTINGS = {
         "turn_share_rad_m": round(_STEERING_SIGMA / AXLES_M, 5), "slip_share": 0.0,
     },
     "association": "nearest",
+    "health": {"nis_from": -2.2},  # as of UTIAS's logs
     "loop_sigma_m": math.inf,  # meant for walls, which stand nearer to each other than trees
     "landmarks": {"tentative_gate_m": 1.5, "new_distance_m": 3.0, "confirm_after": 5, "forget_after": 50},
 }  # fmt: skip

@@ -69,7 +69,8 @@ def test_odometry_that_is_no_number_changes_nothing(name: str, twist: Any) -> No
     backend = slam.make(name)
     backend.predict(Odometry((0.2, 0.0, 0.1), 0.1))
     pose, cov = backend.pose, backend.pose_cov
-    for odometry in (Odometry(twist, 0.1), Odometry((0.1, 0.0, 0.0), -0.1)):
+    straight = (0.1, 0.0, 0.0)
+    for odometry in (Odometry(twist, 0.1), Odometry(straight, -0.1), Odometry(straight, 0.1, (0.0, math.nan))):
         with pytest.raises(ValueError, match="of an odometry are finite, and no time goes back"):
             backend.predict(odometry)
     assert np.array_equal(backend.pose, pose) and np.array_equal(backend.pose_cov, cov)
@@ -223,6 +224,8 @@ def test_labels_and_what_scans_show_are_kept_apart(name: str) -> None:
         ({"ids": np.array([0.0, 1.0])}, "as many whole numbers"),
         ({"ids": np.array([0, -1])}, r"must be in \[0, 1000000\], got -1 to 0"),
         ({"ids": np.array([0, 2_000_000_000])}, r"must be in \[0, 1000000\]"),
+        ({"range_bearing": np.ones((2, 3))}, r"need range_bearing \(m, 2\) and cov"),
+        ({"range_bearing": np.ones(4)}, r"need range_bearing \(m, 2\) and cov"),
         ({"cov": np.tile(np.diag([1e-3, 0.0]), (2, 1, 1))}, "positive definite"),
         ({"cov": np.tile([[1e-3, 2e-3], [2e-3, 1e-3]], (2, 1, 1))}, "positive definite"),
     ],

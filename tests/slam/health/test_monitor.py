@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import slam
+from slam import Observations, Odometry
+from slam.geometry import compose, exp, rotation
 from slam.health.evidence import Agreement
 from slam.health.monitor import HealthConfig, HealthMonitor
 
@@ -61,7 +65,7 @@ def test_large_innovations_lower_it() -> None:
     monitor = HealthMonitor(CONFIG)
     values = [monitor.health]
     for _ in range(40):
-        monitor.take_innovations(8.0, 4)
+        monitor.take_innovations(40.0, 4)
         values.append(monitor.health)
     assert values[-1] < 0.5 < values[0]
     assert values == sorted(values, reverse=True)
@@ -77,3 +81,25 @@ def test_large_innovations_lower_it() -> None:
 def test_settings_are_checked(wrong: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="HealthConfig"):
         HealthConfig(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant-ekf", "compressed-ekf"])
+def test_a_filter_whose_noise_is_as_stated_is_healthy(name: str) -> None:
+    rng = np.random.default_rng(0)
+    points, cov = rng.uniform(-8.0, 8.0, (30, 2)), np.diag([0.05**2, 0.01**2])
+    backend = slam.make(name, config={"odometry": {"slip_share": 0.0}})
+    backend.reset(pose := np.zeros(3))
+    noise = backend.config.odometry
+    for k in range(150):
+        twist = np.array([0.5, 0.0, 0.3 + 0.2 * math.sin(k / 20.0)])
+        pose = compose(pose, exp(0.1 * twist))
+        linear, turning = noise.variances(*twist)
+        measured = twist + np.sqrt([linear, linear, turning]) * rng.standard_normal(3)
+        backend.predict(Odometry(tuple(measured.tolist()), 0.1))
+        sensor = compose(pose, np.array([0.2, 0.0, 0.0]))
+        seen = (points - sensor[:2]) @ rotation(sensor[2])
+        ids = np.flatnonzero(np.hypot(*seen.T) < 6.0)
+        polar = np.column_stack([np.hypot(*seen[ids].T), np.arctan2(*seen[ids, ::-1].T)])
+        polar += rng.standard_normal(polar.shape) @ np.sqrt(cov)
+        backend.observe(Observations(polar, np.tile(cov, (len(ids), 1, 1)), ids))
+    assert backend.pose_nees(pose) < 14.16 and backend.health > 0.9
