@@ -56,6 +56,16 @@ def test_carried_off_and_found(name: str) -> None:
     assert metrics["map_precision"] > walls - 0.02  # no wall stands twice
 
 
+def test_carried_off_and_turning() -> None:
+    """So its particles follow the scan, and the map is redrawn: not with what contradicts it."""
+    env = driven("dp-slam", 60, seed=2)
+    assert FAULTS["teleport"]().begin(env, np.random.default_rng(0))
+    for _ in range(60):
+        env.step(np.array([0.0, 0.0, 0.5], np.float32))
+    assert env.backend.recovery.times_lost == env.backend.recovery.relocalisations == 1
+    assert np.hypot(*(env.backend.pose - env.truth.pose)[:2]) < 0.08
+
+
 @pytest.mark.parametrize("sigma_rad", [0.05, 0.15])
 @pytest.mark.parametrize("name", ["invariant-ekf", "fastslam2", "graph-slam"])
 def test_who_is_unsure_of_the_start_is_found_as_well(name: str, sigma_rad: float) -> None:
