@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,12 @@ class Explored:
 
     metrics: dict[str, Any]  # the contents of metrics.json
     out: Path  # where its files are, report.html among them
+    _pictures: dict[str, str] = field(init=False, repr=False)  # as they are now: the next episode has others there
+
+    def __post_init__(self) -> None:
+        found = {what: self.out / file for file, what in _PICTURES.items()}
+        pictures = {what: _data_uri(path) for what, path in found.items() if path.exists()}
+        object.__setattr__(self, "_pictures", pictures)
 
     def _repr_html_(self) -> str:
         rows = "".join(
@@ -50,10 +56,9 @@ class Explored:
         )
         pictures = "".join(
             f"<figure style='display:inline-block;margin:0 1% 0 0;width:48%'>"
-            f"<img src='{_data_uri(self.out / file)}' alt='{what}' style='width:100%'>"
+            f"<img src='{uri}' alt='{what}' style='width:100%'>"
             f"<figcaption>{what}</figcaption></figure>"
-            for file, what in _PICTURES.items()
-            if (self.out / file).exists()
+            for what, uri in self._pictures.items()
         )
         report = html.escape(str(self.out / "report.html"))
         return f"<div>{pictures}<table>{rows}</table><p>Replayed in <code>{report}</code></p></div>"

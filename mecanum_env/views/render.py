@@ -219,7 +219,7 @@ def _write_caption(frame: Image, env: Shown, *, coverage: float, time_s: float, 
         ("path", f"{env.truth.record.path_length_m:.1f} m", 352),
         ("collisions", f"{env.truth.record.collisions}", 505),
         ("position error", error, 632),
-        ("landmarks", f"{len(env.belief.landmarks) + len(env.belief.lines)}", 1100),
+        ("landmarks", f"{len(env.belief.landmarks)}", 1100),
     )
     write_readouts(frame, entries, coverage=coverage, colour=TRUE_PATH)
 

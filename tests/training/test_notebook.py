@@ -25,6 +25,8 @@ def test_it_is_the_command_s_episode_and_shows_its_figures(tmp_path: Path) -> No
     assert "a &lt;b&gt;" in page and "a <b>" not in page
     assert f"{100 * result.metrics['coverage']:.3g} %" in page
     assert "95 % covered at</th><td>–" in page, "not reached"
+    training.explore(rooms="rectangular", seed=5, max_steps=5, out=result.out)
+    assert result._repr_html_() == page, "its own pictures, whatever is there by now"
 
 
 def test_long_episodes_are_shown_in_seconds_and_metres(tmp_path: Path) -> None:

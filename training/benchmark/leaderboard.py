@@ -104,6 +104,9 @@ def study(
     """Put a benchmark's figures into a page, between its two marks."""
     with bad_input():
         summary, before = read_json(results / "summary.json"), read_bytes(page, what="page")
+    protocol = summary.get("settings", {}).get("protocol") if isinstance(summary, dict) else None
+    if protocol is not None:
+        raise BadInput(f"{results} is a benchmark of --protocol {quoted(protocol)}; give one of suites")
     try:
         text = update(before.decode("utf-8"), tables(summary))
     except BadInput as error:

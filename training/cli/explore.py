@@ -167,10 +167,11 @@ def _summary(metrics: dict[str, Any], files: str, ending: str) -> str:
         ("coverage", f"{shown('coverage', '%', 1, 100.0)} ({verdict}); 95 % at {shown('time_to_95_s', 's', 1)}"),
     ]
     if robots is None:
+        corners = f", corners {shown('corner_mean_m', 'cm', 1, 100.0)} off on average"
         heading = shown("final_heading_error_rad", "°", 2, 180.0 / math.pi)
         rows += [
             ("path", f"{path}, {metrics['collisions']} collisions"),
-            ("map", f"wall IoU {iou}, corners {shown('corner_mean_m', 'cm', 1, 100.0)} off on average"),
+            ("map", f"wall IoU {iou}{'' if metrics['corner_mean_m'] is None else corners}"),
             ("final error", f"{shown('final_position_error_m', 'cm', 1, 100.0)}, {heading}"),
         ]
     else:

@@ -241,6 +241,8 @@ def study(
     atomic_write(out / "belief.png", _draw_course(witness, step_s))
     if witness.moments:
         atomic_write(out / "innovations.png", _draw_innovations(witness.shown(), episode.env, step_s))
+    else:
+        (out / "innovations.png").unlink(missing_ok=True)  # another run's
     write_json(out / "belief.json", found)
     print(_told(found))
     if episode.interrupted:

@@ -44,6 +44,8 @@ def test_the_figures_are_those_of_the_episode(tmp_path: Path) -> None:
 @pytest.mark.parametrize("backend", ["invariant-ekf", "fastslam2"])
 def test_the_command_leaves_its_files(backend: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "belief"
+    out.mkdir()
+    (out / "innovations.png").touch()  # another run's
     given = ["--rooms", "rectangular", "--slam", backend, "--max-steps", "25", "--out", str(out)]
     assert main(["study", "belief", *given]) == 0
     found = json.loads((out / "belief.json").read_text())
