@@ -67,7 +67,7 @@ class GivingWay:
         found, least = None, within_m
         for mate in belief.teammates:
             away = math.hypot(float(mate.pose[0]) - x, float(mate.pose[1]) - y)
-            if mate.age_s <= 1.0 and away < least:
+            if not mate.ended and mate.age_s <= 1.0 and away < least:
                 found, least = mate, away
         return found
 

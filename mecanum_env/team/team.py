@@ -202,6 +202,7 @@ class Team:
                 infos.append(member.perceive(before[member.number]))
             else:  # its episode is over, its sensors are on: it may still be rolling, or be pushed
                 member.believe()
+                member.truth.record.collisions = member.truth.world.collisions
         self._steps += 1
         late = self._steps >= self.max_steps
         self._communicate()

@@ -218,6 +218,27 @@ def test_the_covariance_is_true_within_a_factor_of_three() -> None:
     assert 0.2 < np.mean(nees) < 3
 
 
+@pytest.mark.parametrize("turn", [0.3, -0.3])
+def test_a_narrow_view_does_not_lag_behind_turns(turn: float) -> None:
+    """Walls end where the view did: they would draw the beams beyond back. The wheels are exact."""
+    lags = []
+    for seed in range(3):
+        backend, rng = small(), np.random.default_rng(seed)
+        start = pose = np.array([3.0, 1.5 if turn > 0.0 else 3.5, 0.0])
+        backend.reset(seed=seed)
+        for _ in range(100):
+            twist = np.array([0.3, 0.0, turn])
+            pose = compose(pose, exp(0.1 * twist))
+            backend.predict(Odometry(tuple(twist.tolist()), 0.1))
+            whole = room_scan(compose(pose, np.array([OFFSET, 0.0, 0.0])), rng)
+            bearings = whole.angle_min + whole.angle_increment * np.arange(len(whole.ranges))
+            ahead = np.flatnonzero(np.abs(bearings) <= math.radians(45.0))
+            first = float(bearings[ahead[0]])
+            backend.update(Scan(whole.ranges[ahead], first, whole.angle_increment, whole.range_max))
+        lags.append(float(wrap(pose[2] - start[2] - backend.pose[2])) * math.copysign(1.0, turn))
+    assert np.mean(lags) < 0.015
+
+
 def test_shared_and_copied_maps_give_the_same_filter() -> None:
     """Poses, weights and maps bit for bit, with much resampling."""
     often = {"resampling": {"when": "every_k", "every": 2}, "particles": 6}

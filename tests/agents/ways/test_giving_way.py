@@ -82,6 +82,13 @@ def test_one_that_is_not_heard_is_let_past_as_long_as_it_moves(robot, speed, aft
     assert 7.0 < x < 8.6 and y > 1.2  # in the bay: it will come by here
 
 
+def test_nobody_gives_way_to_one_that_has_ended():
+    """It will not pass: it is an obstacle."""
+    giving, belief = GivingWay(GivingWayConfig(), ROBOT), meeting((5.0, 0.6), (4.0, 0.6), (9.4, 0.6))
+    ended = replace(belief, teammates=(belief.teammates[0]._replace(ended=True),))
+    assert not any(giving.asked(ended, 0.0, 0.1) for _ in range(60))
+
+
 def test_ways_lead_round_another_and_are_as_before_when_it_has_gone():
     alone = belief_of(room(6.0, 6.0), (1.0, 3.0, 0.0))
     among = replace(alone, teammates=(Teammate(1, np.array([2.5, 3.0, 0.0]), 0.0),))

@@ -34,6 +34,18 @@ def test_one_that_has_ended_goes_on_to_sense_and_believe(belief: str) -> None:
     assert ages[1] == pytest.approx(0.0) and other.belief.teammates[0].age_s == pytest.approx(0.0)
 
 
+def test_what_touches_one_that_has_ended_is_counted() -> None:
+    team = Team(2, config=TOUCHED, max_steps=300)
+    team.reset(seed=2, options={"floor_plan": _hall(), "start_poses": [(11.5, 3.0, 0.0), (6.0, 3.5, 0.0)]})
+    ahead, still = np.array([0.6, 0.0, 0.0], np.float32), np.zeros(3, np.float32)
+    while 0 in team.active:
+        team.step({0: ahead, 1: still})
+    ended = team.members[0].truth
+    ended.world.collisions += 1
+    team.step({1: still})
+    assert ended.record.collisions == ended.world.collisions == 2
+
+
 @pytest.mark.parametrize("belief", ["own", "joint"])
 def test_one_that_has_ended_is_told_to_have_no_goal_and_to_be_done(belief: str) -> None:
     team = Team(2, team={"belief": belief}, config=TOUCHED, max_steps=300)
