@@ -41,8 +41,8 @@ class ParticleMatcher:
         """Move ``pose`` ``(3,)``, known to ``info`` ``(3, 3)``, to where the scan and that agree best.
 
         A beam that came through the unknown ends on what nobody has seen. The wall that it may be on ends where
-        the map does, and would draw it back there: with a narrow view, against every turn. It only counts in the
-        likelihood.
+        the map does, and would draw it back there: with a narrow view, against every turn. So it counts in a first
+        fit, which tells which beams these are, and in the likelihood.
 
         Parameters
         ----------
@@ -59,8 +59,9 @@ class ParticleMatcher:
         config, cell = self.config, self.config.cell_m
         count, row, col, x0, y0 = self._draw(grids, particle, points, pose)
         best, curvature = pose.copy(), np.zeros((3, 3))
+        climb(self._values, x0, y0, cell, points, best, pose, info, config.gain, config.iterations, curvature)
         held = np.zeros(points.shape)
-        held = held[: through_known(self._plane, x0, y0, cell, points, pose, held)]
+        held = held[: through_known(self._plane, x0, y0, cell, points, best, held)]
         climb(self._values, x0, y0, cell, held, best, pose, info, config.gain, config.iterations, curvature)
         log_likelihood = weigh(
             self._values, self._plane, x0, y0, cell, points, best, pose, info, config.beam_weight, unknown, free
@@ -187,7 +188,11 @@ def through_known(plane: Bytes, x0: float, y0: float, cell: float, points: Array
         x, y = share * points[k, 0], share * points[k, 1]
         j = math.floor((pose[0] + c * x - s * y - x0) / cell + 0.5)
         i = math.floor((pose[1] + s * x + c * y - y0) / cell + 0.5)
-        if 0 <= i < plane.shape[0] and 0 <= j < plane.shape[1] and plane[i, j] == _KNOWN:
+        known = False
+        for v in range(max(i - 1, 0), min(i + 2, plane.shape[0])):  # beams leave cells out between them
+            for u in range(max(j - 1, 0), min(j + 2, plane.shape[1])):
+                known = known or plane[v, u] == _KNOWN
+        if known:
             held[n, 0], held[n, 1] = points[k, 0], points[k, 1]
             n += 1
     return n
