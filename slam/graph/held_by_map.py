@@ -32,7 +32,7 @@ class HeldByMap(GaussianBackend):
     nis_dof: int
     _places: Places
     _beside: Companions
-    _held: tuple[Array, Array, Array] | None
+    _held: tuple[Array, Array, Array, Array, Indices] | None
     """Of a robot that was given up, when scans agreed last: pose, covariance, and that with the states beside."""
 
     @abc.abstractmethod
@@ -68,17 +68,20 @@ class HeldByMap(GaussianBackend):
         jump, back = joint.jump_jacobian(before, pose), joint.jump_jacobian(pose, before)
         grown, axes = np.linalg.eigh(pose_cov - jump @ cov @ jump.T)
         self._place(pose, (axes * np.maximum(grown, 1e-8)) @ axes.T)
-        self._held = before, cov, self._beside.cross[:, :3] @ back.T
+        shared = back @ self._p[:3, 3 : self._n]  # with the landmarks
+        self._held = before, cov, self._beside.cross[:, :3] @ back.T, shared, self._book.ids.copy()
 
     def _find(self, pose: Array, pose_cov: Array) -> None:
         """Go on from a pose ``(3,)`` on the map, as though it were carried there from where it was lost.
 
         So what it shares with the map is that of then, and what the wheels have claimed since is forgotten.
         """
-        if self._held is not None:
-            before, cov, cross = self._held
+        if self._held is not None and np.array_equal(self._held[-1], self._book.ids):
+            before, cov, cross, shared, _ = self._held
             jump = joint.jump_jacobian(before, self._x)
             self._p[:3, :3] = np.triu(jump @ cov @ jump.T)
+            # Wheels whose lasting errors landmarks tell of share more and more with them while they are believed.
+            self._p[:3, 3 : self._n] = jump @ shared
             self._beside.cross[:, :3] = cross @ jump.T
         self._place(pose, pose_cov)
 

@@ -16,7 +16,7 @@ from slam.health.monitor import HealthConfig
 from slam.health.recovery import Recovery
 from slam.health.relocalisation import RelocalisationConfig, Relocaliser
 from slam.landmarks.book import LAST_SEEN
-from slam.types import Scan
+from slam.types import Odometry, Scan
 from training.studies.recovery.faults import FAULTS
 
 ESTIMATORS = [name for name in slam.names() if name not in ("odometry", "truth")]
@@ -54,6 +54,18 @@ def test_carried_off_and_found(name: str) -> None:
     assert 0.0 < metrics["lost_s"] < 4.0
     assert 0.2 < metrics["health_mean"] < 1.0
     assert metrics["map_precision"] > walls - 0.02  # no wall stands twice
+
+
+@pytest.mark.parametrize("name", ["ekf", "invariant-ekf", "compressed-ekf"])
+def test_found_after_long_its_covariance_is_one(name: str) -> None:
+    """Lasting errors of wheels, which landmarks tell of, have the lost robot share ever more with these."""
+    backend = driven(name, 150).backend
+    backend._carry_on(backend.pose, backend.pose_cov)
+    for _ in range(2000):
+        backend.predict(Odometry((0.4, 0.3, -0.1), 0.1))
+    backend._find(backend.pose, np.diag([1e-2, 1e-2, 1e-3]))
+    eigenvalues = np.linalg.eigvalsh(backend.belief.joint_cov)
+    assert eigenvalues[0] > -1e-12 * eigenvalues[-1]
 
 
 def test_carried_off_and_turning() -> None:
