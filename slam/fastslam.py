@@ -84,7 +84,7 @@ class FastSlam(LandmarkBackend):
         self._inherited = InheritedError(pose_cov)
         self._maps = ParticleMaps(n)
         self._begin(self.config.landmarks)
-        self._match = np.zeros((n, MAX_OBSERVATIONS), np.int64)
+        self._match = np.zeros(n * MAX_OBSERVATIONS, np.int64)
         self._ancestors = np.zeros(n, np.int64)
         self._updates = 0  # since the last resampling
         self.n_eff = float(n)
@@ -182,9 +182,10 @@ class FastSlam(LandmarkBackend):
         self._book.drop(row)
 
     def _match_buffer(self, observations: int) -> Indices:
-        if self._match.shape[1] < observations:
-            self._match = np.zeros((len(self._match), observations), np.int64)
-        return self._match[:, :observations]
+        size = self.config.particles * observations
+        if len(self._match) < size:
+            self._match = np.zeros(size, np.int64)
+        return self._match[:size].reshape(self.config.particles, observations)
 
     def _associate(self, z: Array) -> tuple[Indices, int]:
         """Return the landmark of every observation in every particle, and the particle that matches most."""
@@ -345,7 +346,8 @@ class FastSlam(LandmarkBackend):
         """Pose covariance ``(3, 3)``."""
         if self._cov is None:
             self._cov = self._spread.copy()
-            beyond(self._inherited.cov[None, :3, :3], self._cov[None], common_descent(self._origin, self._weights))
+            inherited = self._inherited.cov[:3, :3].copy()
+            beyond(inherited[None], self._cov[None], common_descent(self._origin, self._weights))
         return self._cov.copy()
 
     def near_landmarks(self, out: Floats) -> None:

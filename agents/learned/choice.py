@@ -135,8 +135,8 @@ def describe(
     ])  # fmt: skip
     patches = np.zeros((len(index), 4, config.patch_cells, config.patch_cells), dtype=np.uint8)
     frame = np.array([*cost_map.origin, cost_map.resolution])
-    for side_m, channels in ((config.patch_m, patches[:, :2]), (config.wide_m, patches[:, 2:])):
-        _cut_patches(cost_map.classes, frame, targets, normals, side_m, config.beyond_m, pose[:2], channels)
+    for first, side_m in ((0, config.patch_m), (2, config.wide_m)):
+        _cut_patches(cost_map.classes, frame, targets, normals, side_m, config.beyond_m, pose[:2], patches, first)
     places = np.vstack([np.asarray(cost_map.start)[None], cells])
     distances = between(cost_map, found.travel, places, searched=0)[1:, 1:] / 10.0
     known = float((cost_map.classes == FREE).sum()) * cost_map.resolution**2
@@ -253,9 +253,12 @@ def _direction(vectors: Array, heading: float) -> Array:
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cut_patches(
     classes: NDArray[np.int8], frame: Array, targets: Array, normals: Array, cell_m: float, beyond_m: float,
-    robot: Array, out: Bytes,
+    robot: Array, out: Bytes, first: int,
 ) -> None:  # fmt: skip
-    """Sample what is around each frontier, its normal along +x of the patch: nine points a cell."""
+    """Sample what is around each frontier, its normal along +x of the patch: nine points a cell.
+
+    Free and occupied are written to two of the channels of ``out`` ``(n, channels, size, size)``.
+    """
     rows, cols = classes.shape
     size = out.shape[2]
     for i in range(len(targets)):
@@ -277,5 +280,5 @@ def _cut_patches(
                     if 0 <= row < rows and 0 <= col < cols:
                         free += classes[row, col] == FREE
                         occupied += classes[row, col] == OCCUPIED
-                out[i, 0, r, c] = free * 28
-                out[i, 1, r, c] = min(occupied * 85, 255)
+                out[i, first, r, c] = free * 28
+                out[i, first + 1, r, c] = min(occupied * 85, 255)

@@ -118,7 +118,7 @@ class MapMemory:
         here, distance = self._away(x, y, _HERE_M)
         goal[here] = np.where(distance < _HERE_M, np.float32(1e6), goal[here])
         price = np.exp(self._log_price[self._window])
-        self._best, self._parent = distances(node_prices(price, self._cell), goal[self._window])
+        self._best, self._parent = distances(node_prices(price, self._cell), goal[self._window].copy())
         self._cost_then = float(self._best[self._pixel(pose)])
 
     def _stalled_for(self, pose: Array) -> float:

@@ -166,7 +166,7 @@ def survey(
     """
     r0, c0 = first[0] % STRIDE, first[1] % STRIDE
     picked = known[r0::STRIDE, c0::STRIDE] == _FREE
-    own = np.argwhere(picked)
+    own = np.ascontiguousarray(np.argwhere(picked))
     index = np.full(picked.shape, -1, dtype=np.int64)
     cells = np.empty_like(own)
     for i in range(len(own)):
@@ -211,7 +211,7 @@ def tour(found: Survey, luck: Array) -> Cells:
     It leaves nothing behind that would make a station worth a visit. A single piece is no reason for one.
     """
     weight = np.zeros(len(found.places))
-    order, _ = best_tour(found.sight, found.distance, weight, luck[:, : len(found.places)])
+    order, _ = best_tour(found.sight, found.distance, weight, luck[:, : len(found.places)].copy())
     return _spared(found, order)
 
 

@@ -42,7 +42,8 @@ class Shared(Explorer):
         """Return the crew's columns that fall to this robot: the tour that does when all are shared out."""
         config = self._sharing()
         near = np.argsort(crew.costs.min(axis=0), kind="stable")[: config.most]
-        starts, cells = np.minimum(crew.held(config.hold_m)[:, near], FAR_M), crew.cells[near]
+        starts = np.ascontiguousarray(np.minimum(crew.held(config.hold_m)[:, near], FAR_M), np.float64)
+        cells = crew.cells[near]
         distance = np.full((len(cells), len(cells)), FAR_M)
         for travel in crew.travels:  # what the first cannot get to, another can
             if (distance < FAR_M).all():

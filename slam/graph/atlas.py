@@ -21,6 +21,8 @@ __all__ = ["Atlas"]
 
 _LEAST_HELD = 5  # beams on a patch, for their surface to be the patch's
 _PROBES = 6  # old patches by which it is asked whether those in reach are surely known
+_HALF = 0.5  # of a closing's information counts: the same beams link the scan to what is in the window, too
+_WITNESSES = 3  # patches that tell where a robot was found
 _NEAR_M = 0.1  # 1σ of the pose up to which old patches in sight are known by being near what is seen
 _PATIENCE = 3.0  # how much rarer it looks, at most, where it looks in vain
 
@@ -82,9 +84,34 @@ class Atlas:
         self._extend_patches(ends, found, unexplained)
         self._add_patches(ends, unexplained)
         self._way += math.hypot(motion[0], motion[1])
-        window.keep(self._distances(window.nodes) <= reach_m + self.config.beyond_m)
+        window.keep(self._distances(window.nodes, window.pose) <= reach_m + self.config.beyond_m)
         self._look_back(ends, reach_m)
         self.chart()
+
+    def found_at(self, pose: Array, cov: Array, reach_m: float) -> bool:
+        """Make a key scan of where the robot was found, whatever led it there; tell whether patches are near.
+
+        ``cov`` ``(3, 3)`` is of the pose as seen from what is mapped around. The nearest patches tell where that
+        is, each with as many times the covariance as there are of them: they all err with the one pose.
+        """
+        graph, nodes = self.graph, np.fromiter(self._patches, np.int64, len(self._patches))
+        distance = self._distances(nodes, pose)
+        nodes = nodes[np.argsort(distance, kind="stable")][: np.count_nonzero(distance <= reach_m)]
+        if not len(nodes):
+            return False
+        self.key = graph.add_node(pose)
+        told_by = nodes[:_WITNESSES]
+        for node in told_by.tolist():
+            frame = graph.poses[node]
+            turn = about_z(-float(frame[2]))
+            info = np.asarray(np.linalg.inv(len(told_by) * turn @ cov @ turn.T), np.float64)
+            graph.add_link(node, self.key, relative(frame[None], pose[None])[0], info)
+        graph.solve()
+        self.solutions += 1
+        self.window.replace(graph.poses[self.key], graph.poses[nodes], nodes, graph.covariance([self.key, *nodes]))
+        self._candidates.clear()
+        self.chart()
+        return True
 
     def _add_patches(self, ends: BeamEnds, unexplained: Flags) -> None:
         for patch in new_patches(ends, unexplained, self._model):
@@ -140,12 +167,12 @@ class Atlas:
         rows = np.array([self._patches[node].extent for node in nodes.tolist()]).reshape(-1, 3)
         return rows[:, :2], rows[:, 2]
 
-    def _distances(self, nodes: Indices) -> Array:
-        """Return how far from the robot patches begin ``(k,)`` [m]."""
+    def _distances(self, nodes: Indices, pose: Array) -> Array:
+        """Return how far from a pose ``(3,)`` patches begin ``(k,)`` [m]."""
         frames, (centres, radii) = self.graph.poses[nodes], self._extents(nodes)
         c, s = np.cos(frames[:, 2]), np.sin(frames[:, 2])
-        x = frames[:, 0] + c * centres[:, 0] - s * centres[:, 1] - self.window.pose[0]
-        y = frames[:, 1] + s * centres[:, 0] + c * centres[:, 1] - self.window.pose[1]
+        x = frames[:, 0] + c * centres[:, 0] - s * centres[:, 1] - pose[0]
+        y = frames[:, 1] + s * centres[:, 0] + c * centres[:, 1] - pose[1]
         return np.asarray(np.hypot(x, y) - radii, np.float64)
 
     # ---- old places ----------------------------------------------------------------------------------------
@@ -157,7 +184,7 @@ class Atlas:
             return
         patches = np.fromiter(self._patches, np.int64, len(self._patches))
         away = np.setdiff1d(patches, window.nodes)
-        distance = self._distances(away)
+        distance = self._distances(away, window.pose)
         order = np.argsort(distance, kind="stable")
         away = away[order[distance[order] <= reach_m]]
         if not len(away):
@@ -193,8 +220,7 @@ class Atlas:
     def _solve(self) -> None:
         self.graph.solve()
         self.solutions += 1
-        self.window.pose = self.graph.poses[self.key].copy()
-        self.window.frames = self.graph.poses[self.window.nodes]
+        self.window.moved_to(self.graph.poses[self.key], self.graph.poses[self.window.nodes])
 
     def _seen(self, nodes: Indices, cov: Array) -> tuple[Array, Array]:
         """Return how well the middle of patches is known as seen from the robot ``(k,)``: the largest 1σ [m].
@@ -239,14 +265,12 @@ class Atlas:
         before = graph.poses.copy()
         for member in group:
             for k, p in enumerate(member.links.patches.tolist()):
-                # Half of it: the same beams link the scan to what is in the window, too.
                 graph.add_link(
-                    int(member.nodes[p]), member.node, member.links.relative[k], 0.5 * member.links.info[k],
-                    0.5 * member.links.gradient[k], closing=self.closings,
+                    int(member.nodes[p]), member.node, member.links.relative[k], _HALF * member.links.info[k],
+                    _HALF * member.links.gradient[k], closing=self.closings,
                 )  # fmt: skip
         self._solve()
-        loss, count = graph.closing_loss(self.closings)
-        if loss > config.closing.loss * 2.0 * count:
+        if graph.closing_loss(self.closings) > _HALF * config.closing.loss:
             graph.drop_closing(self.closings)
             graph.poses[:] = before
             self._solve()

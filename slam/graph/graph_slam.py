@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from slam.backend import SurfaceBackend
+from slam.backend import SurfaceBackend, found_cov
 from slam.geometry import about_z, compose, relative, wrap
 from slam.graph.atlas import Atlas
 from slam.graph.lasting import LastingStates, Motion
@@ -22,6 +22,7 @@ from slam.graph.matching import Alignment, Links, align, lasting, links
 from slam.graph.pose_graph import PoseGraph
 from slam.graph.settings import GraphSlamConfig
 from slam.graph.surfaces import BeamEnds, beam_ends
+from slam.graph.window import carried
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import LikelihoodField, search
 from slam.types import Array, Odometry, Scan
@@ -174,7 +175,8 @@ class GraphSlam(SurfaceBackend):
             self._mean, self._cov = window.corrected(found.pose, seen, pose, rows)
             change = self._mean - pose
             change[2] = float(wrap(change[2]))
-            if float(change @ np.linalg.solve(rows[:, :3] - self._cov + _EXACT * np.eye(3), change)) <= _SPUN:
+            left = carried(self._cov, -change[None, :2])
+            if float(change @ np.linalg.solve(rows[:, :3] - left + _EXACT * np.eye(3), change)) <= _SPUN:
                 break
             self._motion.doubt(self._spun())
 
@@ -246,6 +248,16 @@ class GraphSlam(SurfaceBackend):
         back = about_z(float(-pose[2]))
         self._step = Motion(np.zeros(3), back @ pose_cov @ back.T)
         self._last, self._mean, self._cov = pose.copy(), pose.copy(), pose_cov.copy()
+
+    def _relocate(self, pose: Array, cov: Array, scan: Scan) -> None:
+        if not self.atlas.found_at(pose, cov + found_cov(), min(scan.range_max, self.config.reach_m)):
+            super()._relocate(pose, cov, scan)
+            return
+        window = self.atlas.window
+        self._motion, self._step = Motion(), Motion()
+        self._claimed, self._blind = (0.0, 0.0), (0.0, 0.0)
+        self._last, self._mean, self._cov = window.pose.copy(), window.pose.copy(), window.cov[:3, :3].copy()
+        self._update(scan)
 
     def _redraw_kept(self, poses: Array) -> None:
         super()._redraw_kept(poses)

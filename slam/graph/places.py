@@ -40,9 +40,10 @@ _MODEL = ModelError(straight_m=0.0003, rough_m=0.01, ledge_m=0.1)  # … what su
 _LASTS_M, _LASTS_RAD, _STILL = 0.4, 0.5, 20.0  # … as far as it is the same, and how often it counts at most
 _GATE_M = 0.3
 _SHARE, _IN_SIGHT = 0.3, 0.8  # of beams that lie on the place's surfaces; of those that are near them, at least
-_LEAST_M, _LEAST_RAD = 0.3, 0.1  # 1σ: a scan that shows less exactly where it was taken makes no place …
-_GROW_M, _GROW_RAD = 0.04, 0.02  # … and one that fits less exactly adds nothing to one
-_PRIOR = np.diag([0.5**-2, 0.5**-2, 0.2**-2])  # keeps an alignment along a single wall from running away
+_GROW_M, _GROW_RAD = 0.04, 0.02  # 1σ: a scan that fits less exactly adds nothing to a place
+_LOOSE = np.array([0.5, 0.5, 0.2])  # 1σ: keeps an alignment along a single wall from running away …
+_PRIOR = np.diag(_LOOSE**-2)
+_NOTHING = 1e-4  # … and what a scan tells so little of it tells next to nothing of, as a share of that
 _FEWEST_NEW = 5  # beams on surfaces that a place does not have
 
 
@@ -123,8 +124,8 @@ class Places:
             return None, away
         common = self._lasting(x[:3]) * place.common_var
         told = links(place.surfaces, ends, found, np.zeros((len(common), 3)), common)
-        cov = np.linalg.inv(told.info.sum(axis=0) + _PRIOR)
-        at = found.pose - cov @ told.gradient.sum(axis=0)
+        step, cov = _told(told.gradient.sum(axis=0), told.info.sum(axis=0))
+        at = found.pose + step
         if cov[0, 0] + cov[1, 1] < _GROW_M**2 and cov[2, 2] < _GROW_RAD**2:
             self._grow(number, ends, found.beside < 0, at)
         turn = about_z(float(frame[2]))
@@ -138,12 +139,13 @@ class Places:
     def make(self, number: int, ends: BeamEnds) -> Array:
         """Remember what a scan shows; return observation rows ``(2, 12)`` of the points that stand for the place.
 
-        None where the scan shows too little. ``number`` is the id that the first of the points will have.
+        None where the scan shows no surface. ``number`` is the id that the first of the points will have. Along a
+        single wall the place is where the robot believed to be: nothing is ever held against it there.
         """
         patches = new_patches(ends, np.ones(len(ends), np.bool_), _MODEL)
-        cov = np.linalg.inv(np.sum([np.eye(3) * 1e-6, *(patch.info for patch in patches)], axis=0))
-        if cov[0, 0] + cov[1, 1] > _LEAST_M**2 or cov[2, 2] > _LEAST_RAD**2:
+        if not patches:
             return np.zeros((0, 12))
+        cov = np.linalg.inv(np.sum([patch.info for patch in patches], axis=0))
         self._places[number] = _with_patches(None, patches, np.zeros(3))
         return _rows_of(cov, number, self._offset_m)
 
@@ -180,6 +182,20 @@ class Places:
         """Add to a place what these beams ``(n,)`` of a scan from ``at`` ``(3,)`` in its frame show besides."""
         if np.count_nonzero(new) >= _FEWEST_NEW and (patches := new_patches(ends, new, _MODEL)):
             self._places[number] = _with_patches(self._places[number], patches, at)
+
+
+def _told(gradient: Array, info: Array) -> tuple[Array, Array]:
+    """Return how far from its alignment ``(3,)`` a scan puts the robot, and to what covariance ``(3, 3)``.
+
+    Where it tells less than the prior of the alignment does, that prior would decide on the step: nothing is told
+    there, as along a corridor (Zhang, Kaess and Singh, "On degeneracy of optimization-based state estimation
+    problems", ICRA 2016).
+    """
+    values, axes = np.linalg.eigh(_LOOSE[:, None] * info * _LOOSE)
+    told = values >= 1.0
+    axes = _LOOSE[:, None] * axes
+    step = -axes @ np.where(told, axes.T @ gradient / np.where(told, values, 1.0), 0.0)
+    return step, axes @ np.diag(1.0 / np.where(told, values, _NOTHING)) @ axes.T
 
 
 def _rows_of(cov: Array, number: int, offset: float) -> Array:

@@ -32,7 +32,7 @@ def relative_jacobians(first: Array, second: Array) -> tuple[Array, Array, Array
     return d, by_first, by_second
 
 
-_PHI = 9.0  # of a closing's chi-square, from which it counts less and less
+_PHI = 3.0  # of a closing's chi-square a degree of freedom, from which it counts less and less
 
 
 class PoseGraph:
@@ -125,26 +125,27 @@ class PoseGraph:
         closing = self._closing[: self.links]
         rows = np.flatnonzero(closing >= 0)
         if len(rows):
-            excess = np.maximum(self._loss(rows, off[rows]), 0.0)
-            chi2 = np.bincount(closing[rows], excess)
-            scale = np.minimum(1.0, 2.0 * _PHI / (_PHI + np.maximum(chi2, 1e-12)))
+            excess, rank = self._loss(rows, off[rows])
+            chi2 = np.bincount(closing[rows], excess) / np.maximum(np.bincount(closing[rows], rank), 1.0)
+            scale = np.minimum(1.0, 2.0 * _PHI / (_PHI + chi2))
             weight[rows] = scale[closing[rows]] ** 2
         return weight
 
-    def _loss(self, rows: Indices, off: Array) -> Array:
-        """Return twice what links lose against their own best fit ``(r,)``."""
+    def _loss(self, rows: Indices, off: Array) -> tuple[Array, Array]:
+        """Return twice what links lose against their own best fit ``(r,)``, and of how many degrees of freedom."""
         h, g = self._h[rows] + 1e-6 * np.eye(3), self._g[rows]
         best = -np.linalg.solve(h, g[..., None])[..., 0]
         rest = off - best
-        return np.asarray(np.einsum("ka,kab,kb->k", rest, h, rest), np.float64)
+        return np.einsum("ka,kab,kb->k", rest, h, rest), np.linalg.matrix_rank(h, tol=1.0, hermitian=True)
 
-    def closing_loss(self, closing: int) -> tuple[float, int]:
-        """Return chi-square of a loop closing's links at the present poses, and their number."""
+    def closing_loss(self, closing: int) -> float:
+        """Return chi-square a degree of freedom of a loop closing's links at the present poses."""
         rows = np.flatnonzero(self._closing[: self.links] == closing)
         i, j = self._ends[rows].T
         off = relative(self._poses[i], self._poses[j]) - self._z[rows]
         off[:, 2] = wrap(off[:, 2])
-        return float(self._loss(rows, off).sum()), len(rows)
+        loss, rank = self._loss(rows, off)
+        return float(loss.sum() / max(rank.sum(), 1))
 
     def solve(self, *, iterations: int = 6, tolerance: float = 1e-5) -> None:
         """Move the nodes to the least squares solution."""

@@ -1,7 +1,10 @@
 """What is in reach: the joint Gaussian of the last key scan and the patches around, corrected scan by scan.
 
 Between two solutions of the whole graph this is the same least squares problem, solved incrementally and without
-what lies far away (a Kalman filter over the patches in reach).
+what lies far away (a Kalman filter over the patches in reach). No scan says which way the whole is turned, but a
+filter whose covariance stays where it is while its means move would learn it, linearised here and there. So the
+covariance is carried along (:func:`carried`), which makes this an invariant filter (Barrau and Bonnabel, "An
+EKF-SLAM algorithm with consistency properties", arXiv:1510.06263).
 """
 
 from __future__ import annotations
@@ -10,12 +13,12 @@ import math
 
 import numpy as np
 
-from slam.geometry import compose, wrap
+from slam.geometry import compose, exp, log, wrap
 from slam.graph.matching import Links
 from slam.graph.pose_graph import relative_jacobians
 from slam.types import Array, Flags, Indices
 
-__all__ = ["Window", "moved"]
+__all__ = ["Window", "carried", "moved"]
 
 
 def moved(pose: Array, motion: Array) -> tuple[Array, Array, Array]:
@@ -25,6 +28,34 @@ def moved(pose: Array, motion: Array) -> tuple[Array, Array, Array]:
     by_pose = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     by_motion = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     return compose(pose, motion), by_pose, by_motion
+
+
+def carried(cov: Array, by: Array) -> Array:
+    """Return the covariance ``(3k, 3k)`` of poses whose means have moved by so much ``(k, 2)`` [m].
+
+    An error that turns them all turns them about the same point as before: G P Gᵀ, where a pose that has moved by
+    (dx, dy) errs by δθ (-dy, dx) more.
+    """
+    out = cov.copy()
+    out[0::3] -= by[:, 1:] * cov[2::3]
+    out[1::3] += by[:, :1] * cov[2::3]
+    turned = out[:, 2::3].copy()
+    out[:, 0::3] -= by[:, 1] * turned
+    out[:, 1::3] += by[:, 0] * turned
+    return out
+
+
+def _retracted(poses: Array, change: Array) -> Array:
+    """Return poses ``(k, 3)`` after a change ``(k, 3)`` of their errors, along the exponential: p + V(δθ) δp."""
+    return np.array([
+        [*(pose[:2] + step[:2]), float(wrap(pose[2] + delta[2]))]
+        for pose, delta, step in zip(poses, change, map(exp, change), strict=True)
+    ])  # fmt: skip
+
+
+def _change(to: Array, at: Array) -> Array:
+    """Return the change ``(3,)`` by which a pose ``at`` becomes another: what :func:`_retracted` undoes."""
+    return log(np.array([*(to[:2] - at[:2]), float(wrap(to[2] - at[2]))]))
 
 
 class Window:
@@ -57,35 +88,40 @@ class Window:
         p = self.cov[np.ix_(part, part)]
         p[:3] = rows[:, part]
         p[3:, :3] = p[:3, 3:].T
-        info, gain = self._normal(at, links, pose)
-        # P - P (I + Λ P)⁻¹ Λ P
-        m = np.linalg.solve(np.eye(len(part)) + info @ p, np.column_stack([gain, info @ p[:, :3]]))
-        mean = pose - p[:3] @ m[:, 0]
-        mean[2] = float(wrap(mean[2]))
-        cov = p[:3, :3] - p[:3] @ m[:, 1:]
-        return mean, 0.5 * (cov + cov.T)
+        poses = np.vstack([pose, self.frames[links.patches]])
+        mean, cov = self._updated(poses, p, np.arange(len(part)), at, links)
+        return mean[0], cov[:3, :3]
 
     def correct(self, at: Array, links: Links) -> None:
         """Correct everything by a scan from the pose that stands in the key scan's place, aligned at ``at``."""
         if not len(links.patches):
             return
-        part = self._part(links)
-        rows = self.cov[part]  # (k, all)
-        info, gain = self._normal(at, links, self.pose)
+        poses = np.vstack([self.pose, self.frames])
+        mean, self.cov = self._updated(poses, self.cov, self._part(links), at, links)
+        self.pose, self.frames = mean[0], mean[1:]
+
+    def _updated(self, poses: Array, cov: Array, part: Indices, at: Array, links: Links) -> tuple[Array, Array]:
+        """Return mean ``(k, 3)`` and covariance of the robot and patches after a scan that is aligned ``at``.
+
+        ``part`` are the rows of ``cov`` that the links are between. The robot is linearised where the scan lies.
+        """
+        around, off = poses.copy(), np.zeros(3 * len(poses))
+        around[0], off[:3] = at, _change(poses[0], at)
+        cov = carried(cov, around[:, :2] - poses[:, :2])
+        info, gradient = self._normal(at, links)
+        rows = cov[part]  # (linked, all)
+        # P - P (I + Λ P)⁻¹ Λ P
+        gain = gradient + info @ off[part]
         m = np.linalg.solve(np.eye(len(part)) + info @ rows[:, part], np.column_stack([gain, info @ rows]))
-        change = -(rows.T @ m[:, 0]).reshape(-1, 3)
-        self.pose = self.pose + change[0]
-        self.pose[2] = float(wrap(self.pose[2]))
-        self.frames = self.frames + change[1:]
-        self.frames[:, 2] = wrap(self.frames[:, 2])
-        cov = self.cov - rows.T @ m[:, 1:]
-        self.cov = 0.5 * (cov + cov.T)
+        mean = _retracted(around, (off - rows.T @ m[:, 0]).reshape(-1, 3))
+        cov = carried(cov - rows.T @ m[:, 1:], mean[:, :2] - around[:, :2])
+        return mean, 0.5 * (cov + cov.T)
 
     def _part(self, links: Links) -> Indices:
         return np.concatenate([np.arange(3), (3 + 3 * links.patches[:, None] + np.arange(3)).ravel()])
 
-    def _normal(self, at: Array, links: Links, pose: Array) -> tuple[Array, Array]:
-        """Return information Λ and its gradient at the prior mean, of the robot and the linked patches."""
+    def _normal(self, at: Array, links: Links) -> tuple[Array, Array]:
+        """Return information Λ and gradient ``at`` the aligned scan, of the robot and the linked patches."""
         frames = self.frames[links.patches]
         _, by_frame, by_pose = relative_jacobians(frames, np.tile(at, (len(frames), 1)))
         k = len(frames)
@@ -95,11 +131,7 @@ class Window:
             j[g, :, 3 + 3 * g : 6 + 3 * g] = by_frame[g]
         flat = j.reshape(3 * k, -1)
         weighted = (links.info @ j).reshape(3 * k, -1)
-        info = flat.T @ weighted
-        off = np.zeros(3 + 3 * k)
-        off[:3] = pose - at
-        off[2] = float(wrap(off[2]))
-        return info, flat.T @ links.gradient.ravel() + info @ off
+        return flat.T @ weighted, flat.T @ links.gradient.ravel()
 
     def add(self, node: int, info: Array) -> None:
         """Add a patch of the key scan: its frame is the key scan's, known to an information ``(3, 3)``."""
@@ -119,6 +151,11 @@ class Window:
         part = np.concatenate([np.ones(3, bool), np.repeat(rows, 3)])
         self.cov = self.cov[np.ix_(part, part)]
         self.frames, self.nodes = self.frames[rows], self.nodes[rows]
+
+    def moved_to(self, pose: Array, frames: Array) -> None:
+        """Take over means of the graph's solution; the covariance is known as well as it was."""
+        by = np.vstack([pose - self.pose, frames - self.frames])[:, :2]
+        self.pose, self.frames, self.cov = pose.copy(), frames.copy(), carried(self.cov, by)
 
     def replace(self, pose: Array, frames: Array, nodes: Indices, cov: Array) -> None:
         """Take over the graph's solution: the key scan's pose, the patches' frames and their joint covariance."""

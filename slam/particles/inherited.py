@@ -73,6 +73,7 @@ class InheritedError:
         drawn : float
             Share of the drawn pose's covariance that stays as an error: 1/N_eff of the particles' mean.
         """
+        points, covs = np.ascontiguousarray(points), np.ascontiguousarray(covs)  # one kernel, not one a layout
         _correct(self._p, self._size, self.motion, pose, points, covs, z, match, offset, drawn)
 
     def add(self, pose: Array, z: Array, offset: float) -> None:
@@ -187,7 +188,7 @@ def _correct(
         back = sigma @ h[k].T
         s = h[k] @ back + by_point @ own @ by_point.T + r[k]
         gain = back @ np.linalg.inv(s)
-        _apply(map_of, 0, gain, h[k], by_point, slot[i], used + 2 * k)
+        _apply(map_of, rows[0], gain, h[k], by_point, slot[i], used + 2 * k)
         sigma -= gain @ back.T
     for a in range(3):
         map_of[a, used + 2 * m + a] = 1.0

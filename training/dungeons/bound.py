@@ -62,7 +62,8 @@ def _shortest(
         return 0.0
     places = reached[useful]
     distance = np.array([ways(lattice.cells, lattice.joined, int(i))[0][places] for i in places]) * CELL_M
-    _, cost = best_tour(sight[useful], distance, np.zeros(len(places)), draw_luck(tries, len(places)))
+    sight = np.ascontiguousarray(sight[useful])
+    _, cost = best_tour(sight, distance, np.zeros(len(places)), draw_luck(tries, len(places)))
     assert math.isfinite(cost)
     return float(cost)
 

@@ -93,7 +93,8 @@ class Tiles:
         start = np.floor(np.array([0.0, lidar.offset_m]) / cell).astype(np.int64) - corner[::-1]
         nodes[tuple(start)] = True
         reached = np.isfinite(_distances(nodes, start[None]))
-        self.places = np.vstack([start[None], np.argwhere(reached[::_VIEW, ::_VIEW]) * _VIEW])
+        others = np.ascontiguousarray(np.argwhere(reached[::_VIEW, ::_VIEW]))
+        self.places = np.vstack([start[None], others * _VIEW])
         cells = cells_per_tile(ground.mappable, _TILE).ravel()
         eye = Eye(ground, lidar)
         eyes = (self.places[:, ::-1] + 0.5 + corner) * cell

@@ -80,7 +80,7 @@ class Sights:
         self.eye_of = _spread(view_of, _LEAD).ravel()
         self.board = Board(
             stops=self._cells @ np.array([reached.shape[1], 1]),
-            near=np.argsort(apart, axis=1, kind="stable")[:, 1 : _NEAR + 1],
+            near=np.argsort(apart, axis=1, kind="stable")[:, 1 : _NEAR + 1].copy(),
             steps=np.array([travel.step.ravel() for travel in self._travels]),
             cols=reached.shape[1],
             price=self.map.weight.ravel() * np.float32(self.map.resolution),

@@ -121,7 +121,7 @@ def _straighten(corners: Array, first: Indices) -> tuple[Array, Indices]:
     path = np.empty((2 * longest + 1, 2), np.float64)
     role = np.empty(2 * longest + 1, np.int64)
     stair = np.empty(longest, np.bool_)
-    n = 0
+    n = first[0]
     for loop in range(first.shape[0] - 1):
         out_first[loop] = n
         n = _straighten_loop(corners[first[loop] : first[loop + 1]], out, n, path, role, stair)

@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from agents.view_points.frontiers import FrontierConfig, _borders_a_large_pocket, _clusters, find
 from agents.view_points.sight import Watch, first_in_good_sight, in_good_sight
 from agents.ways import cost_map as cost_maps
+from agents.ways.boxes import Box
 from agents.ways.coarsening import FAR_M, Blocks, fill_blocks, known_extent, to_walls
 from agents.ways.cost_map import CostMap, PlannerConfig
 from agents.ways.planning import travel_costs
@@ -71,8 +72,8 @@ def test_blocks_against_their_definition(seed, factor, walls):
     size = [-(-(side + pad) // factor) + 2 for side, pad in zip(log_odds.shape, pads, strict=True)]
     found = Blocks.blank(*size)
     fill_blocks(
-        log_odds, visited, to_walls(log_odds), (0, 0, *log_odds.shape), (1, 1, size[0] - 1, size[1] - 1), 0.05,
-        factor, *pads, found.classes, found.clearance, found.suspect,
+        log_odds, visited, to_walls(log_odds), Box(0, 0, *log_odds.shape), Box(1, 1, size[0] - 1, size[1] - 1),
+        0.05, factor, *pads, found.classes, found.clearance, found.suspect,
     )  # fmt: skip
     fine = CLASS_OF[log_odds.view(np.uint8)]
     fine[(fine == UNKNOWN) & (visited != 0)] = FREE

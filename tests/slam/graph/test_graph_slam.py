@@ -100,6 +100,22 @@ def test_a_loop_closes_and_the_covariance_holds() -> None:
     assert path.shape == (len(true), 3) and np.abs((path - np.array(true))[:, :2]).max() < 0.06
 
 
+def test_where_it_is_found_says_nothing_of_the_way_there() -> None:
+    """Carried back to the start: nothing that was mapped on the way is moved, nor is more known of it."""
+    backend, rng = GraphSlam(config()), np.random.default_rng(1)
+    true, _ = drive(backend, ring(), LOOP[:3], 0)
+    graph, far = backend.atlas.graph, backend.atlas.key
+    graph.solve()
+    before, cov_before = graph.poses[: far + 1].copy(), graph.covariance([0, far])
+    home = true[0] + np.array([0.3, 0.2, 0.4])
+    backend._relocate(home, np.diag([1e-4, 1e-4, 1e-5]), scan_of(ring(), home, rng))
+    assert np.hypot(*(backend.pose - home)[:2]) < 0.03
+    assert math.sqrt(np.trace(backend.pose_cov[:2, :2])) < 0.02, "it is as sure of the start as the map there is"
+    graph.solve()
+    np.testing.assert_allclose(graph.poses[: far + 1], before, atol=2e-3)
+    np.testing.assert_allclose(graph.covariance([0, far]), cov_before, rtol=0.02, atol=1e-7)
+
+
 class Watched(GraphSlam):
     """One whose path somebody looks at after every scan."""
 

@@ -32,11 +32,24 @@ def hollow() -> Array:
     return np.ascontiguousarray(np.column_stack([points[:-1], points[1:]]))
 
 
-def scan_from(body: Array, rng: np.random.Generator, *, beams: int = BEAMS, view: float = 2.0 * math.pi) -> Scan:
+def corridor(heading: float) -> Array:
+    """Two walls along a heading, a metre to the left and to the right of the origin: nothing else."""
+    along, left = (
+        np.array([math.cos(heading), math.sin(heading)]),
+        np.array([-math.sin(heading), math.cos(heading)]),
+    )
+    return np.array([[*(side * left - 40.0 * along), *(side * left + 40.0 * along)] for side in (-1.0, 1.0)])
+
+
+def scan_from(
+    body: Array, rng: np.random.Generator, walls: Array | None = None, *, beams: int = BEAMS,
+    view: float = 2.0 * math.pi,
+) -> Scan:  # fmt: skip
     increment, first, out = view / beams, -0.5 * view, np.empty(beams)
+    walls = hollow() if walls is None else walls
     x, y, theta = compose(body, np.array([OFFSET, 0.0, 0.0]))
     directions = beam_directions(beams, first, increment)
-    cast_rays(hollow(), np.zeros((0, 3)), x, y, theta, directions, first, increment, REACH, out)
+    cast_rays(walls, np.zeros((0, 3)), x, y, theta, directions, first, increment, REACH, out)
     out += SIGMA * rng.standard_normal(beams)
     return Scan(np.where(out > REACH, np.inf, out), first, increment, REACH)
 
@@ -128,6 +141,27 @@ def test_the_points_say_no_more_than_the_scan() -> None:
         assert np.linalg.matrix_rank(information(part, state), tol=1e-6) == 2
     both = information(seen[0], state)
     assert np.linalg.eigvalsh(both).min() > 0.0, "two points say all three of the pose"
+
+
+@pytest.mark.parametrize("name", ["ekf-lines", "invariant-ekf"])
+def test_a_corridor_does_not_tell_how_far_along_it_one_is(name: str) -> None:
+    """Wheels have spun by 0.3 m, as the filter knows. Then the robot stands: no scan says by how much they did."""
+    heading, rng = 0.5, np.random.default_rng(6)
+    walls, pose, ahead = corridor(heading), np.array([0.0, 0.0, heading]), np.array([math.cos(0.5), math.sin(0.5)])
+    backend = slam.make(name, config={"lidar_offset_m": OFFSET})
+    assert isinstance(backend, EkfSlam)
+    backend.reset(pose)
+    for speed in [0.02] * 30 + [0.0] * 100:
+        if speed == 0.0 and pose[0] < 0.1:  # 6 cm driven
+            pose[:2] += 0.3 * ahead
+            backend._p[:2, :2] += np.triu(0.3**2 * np.outer(ahead, ahead))
+        backend.predict(Odometry((speed, 0.0, 0.0), 0.1, (0.0, 0.0)))
+        pose = compose(pose, exp(np.array([speed * 0.1, 0.0, 0.0])))
+        backend.update(scan_from(pose, rng, walls))
+    cov, across = backend.pose_cov[:2, :2], np.array([-ahead[1], ahead[0]])
+    assert np.count_nonzero(backend._book.marks[:, 0] == VIRTUAL), "it holds on to places"
+    assert math.sqrt(ahead @ cov @ ahead) > 0.29
+    assert abs(across @ (backend.pose - pose)[:2]) < 0.02 and math.sqrt(across @ cov @ across) < 0.01
 
 
 def test_a_scan_of_elsewhere_does_not_fit() -> None:

@@ -18,7 +18,7 @@ from training.learning.hindsight import _price
 def price(seen, distance, cells, place, spare=0.0):
     seen = np.ascontiguousarray(np.asarray(seen, dtype=bool).T)
     cells, distance = np.array(cells, dtype=float), np.asarray(distance, dtype=float)
-    return _price(seen, distance, cells, cells @ seen, place, spare)
+    return _price(seen, distance, cells, cells @ seen, place, float(spare))
 
 
 def test_on_a_line_by_hand():
