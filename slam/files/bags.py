@@ -45,7 +45,7 @@ def is_bag(path: Path) -> bool:
     """Tell whether a path is a ROS 2 bag by its name: a file of one, or a folder with such files."""
     if path.is_dir():
         return bool(_files(path) or list(path.glob("*.zstd")))
-    return path.suffix in _SUFFIXES or _packed_whole(path)
+    return path.suffix.lower() in _SUFFIXES or _packed_whole(path)
 
 
 def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str]) -> Iterator[BagMessage]:
@@ -74,7 +74,7 @@ def bag_messages(path: Path, datatypes: Collection[str], topics: dict[str, str])
         check_file(file, what="bag")
         if _packed_whole(file):
             raise ValueError(f"bag {shown_path(file)} is packed; unpack it by zstd -d {shown_path(file)}")
-        read = _of_mcap if file.suffix == ".mcap" else _of_sqlite
+        read = _of_mcap if file.suffix.lower() == ".mcap" else _of_sqlite
         try:
             yield from read(file, datatypes, topics)
         except _Refused as error:
@@ -95,13 +95,13 @@ class _Refused(Exception):
 
 def _files(folder: Path) -> list[Path]:
     """Return a bag's files in the order in which they were recorded: they are numbered, without zeros in front."""
-    found = [path for path in folder.iterdir() if path.suffix in _SUFFIXES]
+    found = [path for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
     # Words and numbers by turns, so that like is compared with like.
     return sorted(found, key=lambda path: [int(w) if k % 2 else w for k, w in enumerate(_NUMBER.split(path.name))])
 
 
 def _packed_whole(path: Path) -> bool:
-    return path.suffix in (".zstd", ".zst") and Path(path.stem).suffix in _SUFFIXES
+    return path.suffix.lower() in (".zstd", ".zst") and Path(path.stem).suffix.lower() in _SUFFIXES
 
 
 def _words(error: Exception) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,11 @@ __all__ = ["BagTopics", "parse_mount", "read"]
 _SCAN, _ODOMETRY, _TF = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 _POSES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TYPES = (_SCAN, _ODOMETRY, _TF, *_POSES)
+_NEEDED = {  # by option: types of topics to choose from, and what to record where there is none
+    "scan": ((_SCAN,), "a sensor_msgs/LaserScan"),
+    "odom": ((_ODOMETRY,), "a nav_msgs/Odometry, or the transform odom → base in /tf"),
+    "reference": ((_ODOMETRY, *_POSES), "a nav_msgs/Odometry, PoseStamped or PoseWithCovarianceStamped"),
+}
 
 _MOST_RANGES = 2**28  # of all scans together: a gibibyte
 _REFERENCE_GAP_S = 0.5  # that a reference is interpolated over
@@ -35,7 +40,9 @@ _GAP_SCANS = 2.0  # intervals of scans, across which it is one line: scans may b
 _LONGEST_JUMP_M = 1e3  # from one odometry to the next
 _FASTEST_M_S, _FASTEST_RAD_S = 25.0, 20.0  # beyond is no motion, but odometry that began anew …
 _LEAST_S = 0.04  # … where not just two stamps lie too close together
+_LONGEST_NOTE = 600  # in characters
 _MOST_TOPICS = 12  # that an error lists
+_MOST_ODD = 0.1  # of a topic's messages that are left out: more are no chance, but a driver's fault
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +85,16 @@ class _Found:
     tracks: dict[str, _Track] = field(default_factory=dict)  # of Odometry and poses, by topic; of odom in /tf
     frames: Frames = field(default_factory=Frames)
     hanging: dict[str, dict[str, _Track]] = field(default_factory=dict)  # from odom, by topic of /tf and frame
-    wrong: dict[str, str] = field(default_factory=dict)  # what is wrong on a topic, by its first odd message
+    wrong: dict[str, str] = field(default_factory=dict)  # what is wrong on a topic as a whole
+    messages: Counter[str] = field(default_factory=Counter)  # how many, by topic, odd ones too
+    odd: Counter[str] = field(default_factory=Counter)  # how many of them are invalid …
+    first_odd: dict[str, str] = field(default_factory=dict)  # … and why the first one is
     ranges: int = 0
+
+    def left_out(self, *topics: str) -> str:
+        """Say in a note how many messages of some topics are left out."""
+        odd = ", ".join(f"{self.odd[topic]} of {topic}" for topic in topics if topic in self.odd)
+        return f"; invalid messages that are left out: {odd}" if odd else ""
 
 
 def parse_mount(text: str) -> Mount:
@@ -101,7 +116,7 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
 
     Scans before the first odometry and after the last are left out; at the others the odometry is interpolated.
     Where that jumps, as when its driver was started again, it goes on from where it was. Messages may lie in any
-    order; their stamps tell.
+    order; their stamps tell. A few that are invalid are left out, and counted in the note.
     Scans whose beams lie otherwise than most scans' take, at each of those bearings, the nearest beam.
 
     Raises
@@ -113,6 +128,9 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     found = _gather(path, topics)
     where = f"bag {path}"
     scan_topic = _choose(found, found.scans, topics.scan, "/scan", "scan", where)
+    if topics.reference is not None:
+        held = [topic for topic in found.tracks if found.topics[topic] != _TF]  # there it is odometry, no truth
+        _choose(found, held, topics.reference, "", "reference", where)
     odom_topic = _odometry_topic(found, topics, where)
     track = found.tracks[odom_topic]
     if odom_topic in found.hanging:
@@ -123,7 +141,9 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
     if jump > _LONGEST_JUMP_M:
         raise ValueError(f"{where}: the odometry on {odom_topic} jumps by {jump:.4g} m; correct the log")
     odometry, jumps = _without_jumps(odometry_times, odometry)
-    left_out = f"; jumps of the odometry that are left out: {jumps}" if jumps else ""
+    used = f"; scans of {scan_topic}, odometry of {odom_topic}"
+    used += f"; jumps of the odometry that are left out: {jumps}" if jumps else ""
+    used += found.left_out(scan_topic, odom_topic)
     scans = _in_order(found.scans[scan_topic])
     stamps = np.array([stamp for stamp, _ in scans])
     covered = np.flatnonzero((stamps >= odometry_times[0]) & (stamps <= odometry_times[-1]))
@@ -149,18 +169,18 @@ def read(path: Path, topics: BagTopics) -> ScanLog:
         reference_times=np.zeros(0),
         reference_poses=np.zeros((0, 3)), reference_gap_s=gap_s,
         settings=SETTINGS | {"lidar_offset_m": mount.x_m},
-        note=f"no reference; give one with --reference-topic{left_out}",
+        note=plain_name(f"no reference; give one with --reference-topic{used}", _LONGEST_NOTE),
     )  # fmt: skip
     if topics.reference is None:
         return log
-    _choose(found, found.tracks, topics.reference, "", "reference", where)
     reference_times, reference = found.tracks[topics.reference].sorted()
     rows = _bracketed(stamps, reference_times)
     if not len(rows):
         raise ValueError(f"{where}: {topics.reference} has no pose within {_REFERENCE_GAP_S} s of a scan")
-    note = f"reference: {topics.reference}; the start pose is the reference's{left_out}"
+    note = f"reference: {topics.reference}; the start pose is the reference's{used}"
+    note += found.left_out(topics.reference)
     at = beside(_at(stamps[rows], reference_times, reference), mount.y_m)
-    return log.with_reference(rows, at, plain_name(note))
+    return log.with_reference(rows, at, plain_name(note, _LONGEST_NOTE))
 
 
 # ---- reading ---------------------------------------------------------------------------------------------------
@@ -184,10 +204,16 @@ def _gather(path: Path, topics: BagTopics) -> _Found:
             raise ValueError(
                 f"bag {path}: a message of {quoted(message.topic)} is damaged; mend the bag"
             ) from error
+        found.messages[message.topic] += 1
         try:
             _take(found, message, decoded)
-        except ValueError as error:  # it matters where the topic is used
-            found.wrong.setdefault(message.topic, str(error))
+        except ValueError as error:  # it matters where the topic is used, and there are many
+            found.odd[message.topic] += 1
+            found.first_odd.setdefault(message.topic, f"{error} (at stamp {stamp_of(decoded):.3f} s")
+    for topic, odd in found.odd.items():
+        if odd >= _MOST_ODD * found.messages[topic]:
+            share = f"{odd} of {found.messages[topic]} messages are invalid"
+            found.wrong.setdefault(topic, f"{found.first_odd[topic]}; {share})")
     return found
 
 
@@ -207,11 +233,13 @@ def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
         scan = scan_of(decoded)
         found.ranges += len(scan.ranges)
         if found.ranges > _MOST_RANGES:
-            raise ValueError(f"has more than {_MOST_RANGES} ranges; cut the bag into shorter ones")
+            found.wrong[topic] = f"has more than {_MOST_RANGES} ranges; cut the bag into shorter ones"
+            return
         frame = decoded.header.frame_id.lstrip("/")
         if found.scan_frames.setdefault(topic, frame) != frame:
             both = f"{quoted(found.scan_frames[topic])} and {quoted(frame)}"
-            raise ValueError(f"has scans in frames {both}; record a topic for each lidar")
+            found.wrong[topic] = f"has scans in frames {both}; record a topic for each lidar"
+            return
         kept = scan._replace(ranges=scan.ranges.astype(np.float32))  # as they were recorded
         found.scans.setdefault(topic, []).append((stamp_of(decoded), kept))
         return
@@ -224,11 +252,15 @@ def _take(found: _Found, message: BagMessage, decoded: Any) -> None:
 # ---- choosing --------------------------------------------------------------------------------------------------
 
 
-def _choose(found: _Found, held: Any, given: str | None, usual: str, what: str, where: str) -> str:
+def _choose(
+    found: _Found, held: Collection[str], given: str | None, usual: str, what: str, where: str
+) -> str:  # fmt: skip
     """Return the topic that is meant: the one given, the usual one, or the only one."""
+    kinds, needed = _NEEDED[what]
     chosen = given if given is not None else usual
-    if given is None and usual not in held and len(held) == 1:
-        chosen = str(next(iter(held)))
+    could = list(held) or [topic for topic in found.wrong if found.topics[topic] in kinds]
+    if given is None and usual not in (*could, *found.wrong) and len(could) == 1:
+        chosen = could[0]
     if chosen in found.wrong:
         raise ValueError(f"{where}: topic {quoted(chosen)} {found.wrong[chosen]}")
     if chosen in held:
@@ -237,14 +269,22 @@ def _choose(found: _Found, held: Any, given: str | None, usual: str, what: str, 
     said = f"{len(held)} topics could be the {word}" if held else f"no topic of {word}"
     if given is not None:
         said = f"no {word} on topic {quoted(given)}"
+    if not held and not any(datatype in kinds for datatype in found.topics.values()):
+        raise ValueError(f"{where}: {said}; record {needed}. Its topics: {_listed(found)}")
     raise ValueError(f"{where}: {said}; choose by --{what}-topic from {_listed(found)}")
 
 
 def _odometry_topic(found: _Found, topics: BagTopics, where: str) -> str:
-    held = [topic for topic in found.tracks if found.topics[topic] == _ODOMETRY and topic != topics.reference]
+    held = [topic for topic in found.tracks if found.topics[topic] == _ODOMETRY]
     if topics.odom is not None or not held:
         held += [topic for topic in found.tracks if found.topics[topic] == _TF]
-    return _choose(found, held, topics.odom, "/odom", "odom", where)
+    if topics.reference not in (topics.odom, "/odom"):  # else it is not meant, where there is another
+        held = [topic for topic in held if topic != topics.reference] or held
+    chosen = _choose(found, held, topics.odom, "/odom", "odom", where)
+    if chosen == topics.reference:
+        raise ValueError(f"{where}: topic {quoted(chosen)} cannot be both odometry and reference; choose another "
+                         f"by --odom-topic or --reference-topic from {_listed(found)}")  # fmt: skip
+    return chosen
 
 
 def _robots_own(found: _Found, topic: str, sensor: str, where: str) -> _Track:
@@ -268,7 +308,7 @@ def _listed(found: _Found) -> str:
         for topic, datatype in sorted(found.topics.items(), key=lambda item: (item[1] not in _TYPES, item[0]))
     ]
     more = f", and {len(shown) - _MOST_TOPICS} more" if len(shown) > _MOST_TOPICS else ""
-    return ", ".join(shown[:_MOST_TOPICS]) + more or "none: the bag has no topics"
+    return ", ".join(shown[:_MOST_TOPICS]) + more or "none"
 
 
 def _mount(found: _Found, base: str, sensor: str, where: str) -> Mount:

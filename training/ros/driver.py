@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import wraps
-from typing import Any, Concatenate, ParamSpec
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +22,15 @@ from mecanum_env.config import EnvConfig, LidarConfig
 from mecanum_env.observation import observe
 from slam.backend import Backend
 from slam.belief import Belief
-from slam.geometry import compose, inverse, wrap_scalar
-from slam.motion import twist_between
+from slam.files import quoted
+from slam.geometry import compose, inverse
+from slam.motion import jacobians, move, twist_between
 from slam.ros import (
     Frames,
     Message,
     Mount,
     grid_message,
+    header,
     mount_of,
     odometry_of,
     pose_with_covariance,
@@ -41,32 +43,17 @@ from slam.ros import (
 )
 from slam.settings import require
 from slam.types import FARTHEST_M, Array, Odometry, Scan
+from training.ros.odometry import OdometryTrack
 
 __all__ = ["Driver", "lidar_of"]
 
 _LOST = 0.1  # health of a belief below which it is no good for driving, as to the agents
-_KEPT = 1000  # odometry messages: seconds of the fastest
 _WAITING = 100  # scans that are newer than all odometry so far: of the fastest lidar, two seconds
-_TOO_FAST = 3.0  # times its limits: no robot's motion, but odometry that began anew
-_LEAST_S = 0.1  # in which so much way is no jump: stamps of single messages may lie closer
 _BESIDE_M = 0.05  # that a lidar may sit off the middle line of the body that the agents drive
 _NARROWEST_RAD = math.radians(30.0)
+_AGAIN_S = 5.0  # after which it says again what it waits for, and what was wrong and has been good since
+_ANOTHER_CLOCK_S = 10.0  # between a message and ROS's clock at first: not late, but stamped by another clock
 _STAND = (0.0, 0.0, 0.0)
-
-_Heard = ParamSpec("_Heard")
-
-
-def _guarded(hear: Callable[Concatenate[Driver, _Heard], None]) -> Callable[Concatenate[Driver, _Heard], None]:
-    """Pass over a message that says what no robot does: where none is good, it will be late, and stand."""
-
-    @wraps(hear)
-    def guarded(self: Driver, /, *heard: _Heard.args, **named: _Heard.kwargs) -> None:
-        try:
-            hear(self, *heard, **named)
-        except ValueError as error:
-            self._complain(f"{hear.__name__.removeprefix('hear_')} {error}")
-
-    return guarded
 
 
 class Driver:
@@ -83,7 +70,7 @@ class Driver:
     seed : int
         Of agents and backends that draw.
     late_s : float
-        After so long without a scan or odometry it stands [s].
+        After so long without a scan or odometry it stands [s]; what is so old by its stamp is none.
     log : callable
         Told in a line what there is to know.
 
@@ -102,95 +89,114 @@ class Driver:
         make_backend(config)  # now, not at the first scan, it is known to fit
         self.config, self._agent_name, self._seed, self._late_s, self.log = config, agent, seed, late_s, log
         self._mount, self._frames = mount, Frames()
-        self._odometry: deque[tuple[float, Array]] = deque(maxlen=_KEPT)
-        self._since_jumps = np.zeros(3)  # what its poses are moved by, for jumps to be no motion
-        self._older_since = math.inf  # when messages began to be older than the last one that was taken
+        self._odometry = OdometryTrack(config.robot, late_s, complain=self._complain, set_back=self._set_back)
         # Scans that odometry has not come up to: it may be later than one by more than a sweep.
-        self._waiting: deque[tuple[float, str, Scan]] = deque(maxlen=_WAITING)
-        self._heard = {"odometry": -math.inf, "scan": -math.inf}
+        self._waiting: deque[tuple[float, Scan]] = deque(maxlen=_WAITING)
+        self._heard = {"odometry": -math.inf, "scan": -math.inf}  # when it last heard what was of use
+        self._came = dict.fromkeys(("odometry", "a scan", *([] if mount else ["/tf_static"])), -math.inf)
+        self._now_s = -math.inf  # when the last message came
+        self._one_clock: bool | None = None  # whether ROS's clock is the robot's; None: nothing came so far
         self._backend: Backend | None = None
         self._agent: Agent
         self._layout: tuple[float, float, int]  # first bearing, step and beams of the scans that are mapped
         self._scan: Scan  # the last, by the bearings of the lidar that the agent knows of
-        self._at: tuple[float, Array]  # time and odometry of the last scan
+        self._at: tuple[float, Array]  # time of the last scan, and odometry, of the point behind the lidar
         self._twist: tuple[float, float, float] = _STAND
-        self._base, self._odom = "base_link", "odom"
-        self._complaint = ""
+        self._base, self._odom, self._lidar = "base_link", "odom", ""  # frames
+        self._wrong: dict[str, float] = {}  # what was wrong, and when last
+        self._said_s = -math.inf  # when it last said what it waits for
         self.status = "waiting for odometry and a scan"
 
     # ---- what it hears -------------------------------------------------------------------------------------
 
-    @_guarded
     def hear_transforms(self, message: Any) -> None:
         """Take a ``tf2_msgs/TFMessage`` of transforms that stand still."""
+        self._came["/tf_static"] = math.inf
         for placed in transforms_of(message):
             self._frames.add(placed)
 
-    @_guarded
-    def hear_odometry(self, message: Any, now_s: float) -> None:
-        """Take a ``nav_msgs/Odometry`` that came at a time of the caller's clock [s]."""
-        at, pose = stamp_of(message), odometry_of(message)
-        if self._odometry and at <= self._odometry[-1][0]:  # out of order
-            self._older_since = min(self._older_since, now_s)
-            if now_s - self._older_since < self._late_s:
-                return
-        if self._odometry and math.isfinite(self._older_since):  # the caller's clock says how old what is kept is
-            back_s = at - (now_s - self._heard["odometry"]) - self._odometry[-1][0]
-            if back_s < -_LEAST_S:
-                self._complain("odometry's clock was set back")
-                self._odometry = deque(((t + back_s, kept) for t, kept in self._odometry), maxlen=_KEPT)
-                self._waiting.clear()
-                if (
-                    self._backend is not None and self._at[0] > self._odometry[-1][0]
-                ):  # else of the clock as it is now
-                    self._at = self._at[0] + back_s, self._at[1]
-        self._older_since = math.inf
-        self._base = message.child_frame_id.lstrip("/") or self._base
-        self._odom = message.header.frame_id.lstrip("/") or self._odom
-        self._odometry.append((at, self._without_jumps(at, pose)))
-        self._heard["odometry"] = now_s
-        self._advance(now_s)
+    def hear_odometry(self, message: Any, now_s: float, ros_s: float = math.nan) -> None:
+        """Take a ``nav_msgs/Odometry``; when it came by the caller's clock, and by ROS's if known [s]."""
+        self._now_s = self._came["odometry"] = now_s
+        with self._passing_over("odometry"):
+            at, pose = stamp_of(message), odometry_of(message)
+            self._compare_clocks(at, ros_s)
+            if self._waiting:
+                self._check_age(at, self._waiting[-1][0], "the scans")
+            if self._odometry.add(at, pose, now_s):
+                self._base = message.child_frame_id.lstrip("/") or self._base
+                self._odom = message.header.frame_id.lstrip("/") or self._odom
+                self._heard["odometry"] = now_s
+        self._advance()
 
-    @_guarded
-    def hear_scan(self, message: Any, now_s: float) -> None:
-        """Take a ``sensor_msgs/LaserScan`` that came at a time of the caller's clock [s]."""
-        self._waiting.append((stamp_of(message), message.header.frame_id.lstrip("/"), scan_of(message)))
-        self._advance(now_s)
+    def hear_scan(self, message: Any, now_s: float, ros_s: float = math.nan) -> None:
+        """Take a ``sensor_msgs/LaserScan``; when it came by the caller's clock, and by ROS's if known [s]."""
+        self._now_s = self._came["a scan"] = now_s
+        with self._passing_over("scan"):
+            at, scan, frame = stamp_of(message), scan_of(message), message.header.frame_id.lstrip("/")
+            self._lidar = self._lidar or frame
+            if frame != self._lidar:
+                both = f"{quoted(self._lidar)} and {quoted(frame)}"
+                raise ValueError(f"has scans in frames {both}; give a topic for each lidar")
+            if np.isnan(scan.ranges).all():
+                raise ValueError("measures nothing, every beam is lost; see whether the lidar turns")
+            self._compare_clocks(at, ros_s)
+            self._waiting.append((at, scan))
+        self._advance()
 
-    def _without_jumps(self, at: float, pose: Array) -> Array:
-        """Return where the odometry would be at a time, had it never jumped; a jump is no motion."""
-        if not self._odometry:
-            return pose
-        (before, last), moved = self._odometry[-1], compose(self._since_jumps, pose)
-        robot, most_s = self.config.robot, _TOO_FAST * max(at - before, _LEAST_S)
-        far = math.hypot(moved[0] - last[0], moved[1] - last[1]) > most_s * robot.max_speed_m_s
-        if far or abs(wrap_scalar(float(moved[2] - last[2]))) > most_s * robot.max_turn_rate_rad_s:
-            self._complain("odometry jumped; the jump is left out")
-            self._since_jumps = compose(last, inverse(pose))
-            return last.copy()
-        return moved
+    @contextmanager
+    def _passing_over(self, what: str) -> Iterator[None]:
+        """Pass over a message that is of no use: where none is good, it will be late, and stand."""
+        try:
+            yield
+        except ValueError as error:
+            self._complain(f"{what} {error}")
+
+    def _compare_clocks(self, at: float, ros_s: float) -> None:
+        """Refuse what is old by ROS's clock, unless the robot has another, as in a simulation.
+
+        The first message tells: by one clock, whatever comes later and later is no simulation's.
+        """
+        if self._one_clock is None:
+            self._one_clock = abs(ros_s - at) < _ANOTHER_CLOCK_S
+        if self._one_clock:
+            self._check_age(at, ros_s, "ROS's clock")
+
+    def _check_age(self, at: float, newest: float, whose: str) -> None:
+        if newest - at > self._late_s:
+            raise ValueError(f"is more than {self._late_s} s behind {whose} by its stamp; see what holds it up, "
+                             "and whether all have one clock")  # fmt: skip
+
+    def _set_back(self, back_s: float) -> None:
+        """Follow odometry's clock, which was set back by so much."""
+        self._complain("odometry's clock was set back")
+        self._waiting.clear()
+        # Else it is of the clock as it is now.
+        if self._backend is not None and self._at[0] > self._odometry.newest_s:
+            self._at = self._at[0] + back_s, self._at[1]
 
     # ---- what it believes ----------------------------------------------------------------------------------
 
-    def _advance(self, now_s: float) -> None:
+    def _advance(self) -> None:
         """Go on to the last scan that odometry has come up to; older ones are left out."""
-        newest = self._odometry[-1][0] if self._odometry else -math.inf
-        due = [k for k, (at, _, _) in enumerate(self._waiting) if at <= newest]
+        newest = self._odometry.newest_s
+        due = [k for k, (at, _) in enumerate(self._waiting) if at <= newest]
         if not due:
             return
-        at, frame, scan = self._waiting[due[-1]]
+        at, scan = self._waiting[due[-1]]
         for _ in range(due[-1] + 1):
             self._waiting.popleft()
-        pose = self._odometry_at(at)
-        if pose is None or (self._backend is not None and at <= self._at[0]):
+        if self._backend is not None and at <= self._at[0]:
             return
-        if self._mount is None:
-            matrix = self._frames.between(self._base, frame)
-            if matrix is None:
-                self.status = f"waiting for a transform from {self._base} to the lidar {frame}"
-                return
-            self._mount = mount_of(matrix)
-        levelled = self._mount.level(scan)
+        with self._passing_over("scan"):
+            self._check_age(at, newest, "the odometry")
+            if (pose := self._odometry.at(at)) is not None:
+                self._take(at, scan, pose)
+
+    def _take(self, at: float, scan: Scan, odometry: Array) -> None:
+        """Move the belief on to a scan, and look at it."""
+        self._mount = self._mount or self._mounted()
+        levelled, pose = self._mount.level(scan), compose(odometry, self._beside)
         if self._backend is None:
             self._begin(levelled)
         else:
@@ -207,45 +213,44 @@ class Driver:
         )
         self._at = at, pose
         self._backend.update(mapped)
-        self._heard["scan"] = now_s  # not before it was of use
+        self._heard["scan"] = self._now_s  # not before it was of use
         if not hasattr(self, "_agent"):
             body: dict[str, Any] = {"robot": self.config.robot, "lidar": lidar, "step_s": self.config.step_s}
             self._agent = agents.make(self._agent_name, **body)
             self._agent.reset(self._backend.belief, self._seed)
 
+    def _mounted(self) -> Mount:
+        """Return where the lidar is by the transforms."""
+        matrix = self._frames.between(self._base, self._lidar)
+        if matrix is None:
+            raise ValueError(f"is waiting for a transform from {self._base} to the lidar {self._lidar}; publish "
+                             "it on /tf_static, or give --mount")  # fmt: skip
+        mount = mount_of(matrix)
+        if abs(mount.y_m) > _BESIDE_M:
+            raise ValueError(
+                f"is of a lidar {mount.y_m:.2f} m to the left of the middle; {_BESIDE_M} m is the most"
+            )
+        return mount
+
+    @property
+    def _beside(self) -> Array:
+        """From the base to the point straight behind the lidar ``(3,)``, whose pose the backend has."""
+        return np.array([0.0, self._mount.y_m if self._mount else 0.0, 0.0])
+
     def _begin(self, scan: Scan) -> None:
-        """Start the backend, now that the lidar is known."""
+        """Start the backend, now that the lidar is known; the map begins where the base is."""
         assert self._mount is not None
-        if abs(self._mount.y_m) > _BESIDE_M:
-            beside, self._mount = self._mount.y_m, None
-            raise ValueError(f"is of a lidar {beside:.2f} m to the left of the middle; {_BESIDE_M} m is the most")
         self.config = replace(self.config, lidar=lidar_of(scan, self._mount.x_m))
         self._layout = scan.angle_min, scan.angle_increment, len(scan.ranges)
         self._backend = make_backend(self.config)
-        self._backend.reset(seed=self._seed)
+        self._backend.reset(self._beside, seed=self._seed)
         lidar = self.config.lidar
         self.log(f"begun: lidar {lidar.offset_m:.2f} m ahead, {lidar.beams} beams over "
                  f"{lidar.field_of_view_deg:.0f}°")  # fmt: skip
 
-    def _odometry_at(self, at: float) -> Array | None:
-        """Return the odometry's pose ``(3,)`` at a time, between two messages; ``None`` before the first kept."""
-        after = next((k for k, (time_s, _) in enumerate(self._odometry) if time_s >= at), None)
-        if after is None or (after == 0 and self._odometry[0][0] > at):
-            return None
-        (t1, pose), (t0, before) = self._odometry[after], self._odometry[max(after - 1, 0)]
-        if t1 == at:
-            return pose
-        share = (at - t0) / (t1 - t0)
-        x, y, theta = before + share * np.array([*(pose - before)[:2], wrap_scalar(float(pose[2] - before[2]))])
-        return np.array([x, y, wrap_scalar(float(theta))])
-
     def _plausible(self, twist: Array) -> tuple[float, float, float]:
         vx, vy, omega = twist.tolist()
-        robot = self.config.robot
-        if max(math.hypot(vx, vy) / robot.max_speed_m_s, abs(omega) / robot.max_turn_rate_rad_s) > _TOO_FAST:
-            self._complain("odometry jumped; the jump is left out")
-            return _STAND
-        return vx, vy, omega
+        return (vx, vy, omega) if self._odometry.is_motion(math.hypot(vx, vy), omega, 1.0) else _STAND
 
     # ---- what it says --------------------------------------------------------------------------------------
 
@@ -254,9 +259,10 @@ class Driver:
 
         ``None`` before it has begun: then others may drive.
         """
-        late = [name for name, at in self._heard.items() if now_s - at > self._late_s]
         if self._backend is None:
+            self._wait(now_s)
             return None
+        late = [name for name, at in self._heard.items() if now_s - at > self._late_s]
         if late:
             self._become(f"standing: no {' and no '.join(late)} for {self._late_s} s")
         elif self._backend.recovery.lost or self._backend.health < _LOST:
@@ -271,13 +277,27 @@ class Driver:
             return twist_message((twist / max(fastest_m_s / robot.max_speed_m_s, 1.0)).tolist())
         return twist_message(list(_STAND))
 
+    def stamped(self, twist: Message) -> Message:
+        """Return a twist as a ``geometry_msgs/TwistStamped`` of the base, by the clock that stamps odometry."""
+        return {"header": header(self._odometry.newest_s, self._base), "twist": twist}
+
+    def _wait(self, now_s: float) -> None:
+        """Say what it waits for before it can begin."""
+        missing = [name for name, came_s in self._came.items() if now_s - came_s > _AGAIN_S]
+        wrong = [text for text, last_s in self._wrong.items() if now_s - last_s < _AGAIN_S]
+        status = wrong[0] if wrong else f"waiting for {' and '.join(missing) or 'a scan and odometry of one time'}"
+        if status != self.status or now_s - self._said_s > _AGAIN_S:
+            self.log(status)
+            self.status, self._said_s = status, now_s
+
     def _belief_now(self) -> Belief:
         """Return the belief of the last scan, its pose moved on by the odometry since."""
         assert self._backend is not None
-        belief, newest = self._backend.belief, self._odometry[-1][1]
-        if newest is self._at[1]:
+        belief = self._backend.belief
+        if self._odometry.newest_s == self._at[0]:
             return belief
-        return replace(belief, pose=compose(belief.pose, compose(inverse(self._at[1]), newest)))
+        since = compose(inverse(self._at[1]), compose(self._odometry.newest, self._beside))
+        return replace(belief, pose=compose(belief.pose, since))
 
     def _observation(self) -> Any:
         backend = self._backend
@@ -298,14 +318,17 @@ class Driver:
         """Return map → odom as a ``geometry_msgs/TransformStamped``, of the time of the newest odometry."""
         if self._backend is None:
             return None
-        at = compose(compose(self._backend.pose, inverse(self._at[1])), self._since_jumps)
-        return transform_message("map", self._odom, self._odometry[-1][0], at)
+        at = compose(compose(self._backend.pose, inverse(self._at[1])), self._odometry.since_jumps)
+        return transform_message("map", self._odom, self._odometry.newest_s, at)
 
     def pose(self) -> Message | None:
-        """Return where it believes to be, as a ``geometry_msgs/PoseWithCovarianceStamped`` of the last scan."""
+        """Return the base's pose at the last scan, as a ``geometry_msgs/PoseWithCovarianceStamped``."""
         if self._backend is None:
             return None
-        return pose_with_covariance(self._at[0], "map", self._backend.pose, self._backend.pose_cov)
+        pose, back = self._backend.pose, -self._beside
+        lever, _ = jacobians(pose, back, 1.0)
+        cov = lever @ self._backend.pose_cov @ lever.T
+        return pose_with_covariance(self._at[0], "map", move(pose, back, 1.0), cov)
 
     @property
     def backend(self) -> Backend | None:
@@ -313,9 +336,11 @@ class Driver:
         return self._backend
 
     def _complain(self, text: str) -> None:
-        if text != self._complaint:
+        """Say what is wrong, once as long as it is; before it has begun that is its status, and said as such."""
+        lately = {old: last_s for old, last_s in self._wrong.items() if self._now_s - last_s < _AGAIN_S}
+        if text not in lately and self._backend is not None:
             self.log(text)
-            self._complaint = text
+        self._wrong = lately | {text: self._now_s}
 
     def _become(self, status: str) -> None:
         if status != self.status:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from slam.formats import write_map_server
-from slam.ros import Message, fill, header
+from slam.ros import Message, fill
 from training.ros.driver import Driver
 from training.runs.errors import BadInput
 from training.runs.signals import interrupt_flag
@@ -92,10 +92,9 @@ class _Wiring:
         self._map = node.create_publisher(OccupancyGrid, topics.map, latched)
         self._pose = node.create_publisher(PoseWithCovarianceStamped, topics.pose, 1)
         # Best effort hears those who offer it, and those who offer more.
-        sensor = qos_profile_sensor_data
-        clock = time.monotonic
-        node.create_subscription(LaserScan, topics.scan, lambda m: driver.hear_scan(m, clock()), sensor)
-        node.create_subscription(Odometry, topics.odom, lambda m: driver.hear_odometry(m, clock()), sensor)
+        sensor, clock, ros = qos_profile_sensor_data, time.monotonic, self._ros_s
+        node.create_subscription(LaserScan, topics.scan, lambda m: driver.hear_scan(m, clock(), ros()), sensor)
+        node.create_subscription(Odometry, topics.odom, lambda m: driver.hear_odometry(m, clock(), ros()), sensor)
         node.create_subscription(TFMessage, "/tf_static", driver.hear_transforms, many)
         node.create_timer(driver.config.step_s, self._drive)
         node.create_timer(_MAP_EVERY_S, self._draw)
@@ -105,11 +104,11 @@ class _Wiring:
         for _ in range(_FAREWELLS if self._driver.backend is not None else 0):
             self._send({})
 
+    def _ros_s(self) -> float:
+        return 1e-9 * float(self._node.get_clock().now().nanoseconds)
+
     def _send(self, twist: Message) -> None:
-        if self._stamped:
-            now = 1e-9 * self._node.get_clock().now().nanoseconds
-            twist = {"header": header(now, "base_link"), "twist": twist}
-        self._cmd.publish(fill(self._twist(), twist))
+        self._cmd.publish(fill(self._twist(), self._driver.stamped(twist) if self._stamped else twist))
 
     def _drive(self) -> None:
         if (twist := self._driver.command(time.monotonic())) is not None:

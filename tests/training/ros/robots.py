@@ -10,6 +10,7 @@ import numpy as np
 
 import mecanum_env  # noqa: F401 - registers the environments
 from mecanum_env.env import ExploreEnv
+from slam.geometry import compose
 from slam.motion import move
 from slam.ros import (
     Message,
@@ -37,26 +38,32 @@ def packed(datatype: str, message: Message) -> Any:
 
 
 class Robot:
-    """The environment's robot behind its topics: its clock began long ago, its odometry somewhere."""
+    """The environment's robot behind its topics: its clock began long ago, its odometry somewhere.
+
+    Its base is ``beside_m`` to the right of the lidar, which is in the middle of the body that drives.
+    """
 
     def __init__(
-        self, *, rooms: str = "rectangular", seed: int = 3, clock_s: float = 1.7e9, **settings: Any
-    ) -> None:
+        self, *, rooms: str = "rectangular", seed: int = 3, clock_s: float = 1.7e9, beside_m: float = 0.0,
+        **settings: Any,
+    ) -> None:  # fmt: skip
         wrapped = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms, disable_env_checker=True, **settings)
         wrapped.reset(seed=seed)
         self.env = cast("ExploreEnv", wrapped.unwrapped)
         self.clock_s, self.odometry_pose = clock_s, np.array([4.0, -2.0, 2.5])
-        self.info: dict[str, Any] = {}
+        self.beside_m, self.info = beside_m, cast("dict[str, Any]", {})
 
     def scan(self) -> Any:
         return packed(SCAN, scan_message(self.clock_s, "laser", self.env.scan))
 
     def odometry(self) -> Any:
         twist = np.asarray(self.env.odometry.twist)
-        return packed(ODOMETRY, odometry_message(self.clock_s, "odom", "base_link", self.odometry_pose, twist))
+        base = compose(self.odometry_pose, np.array([0.0, -self.beside_m, 0.0]))
+        return packed(ODOMETRY, odometry_message(self.clock_s, "odom", "base_link", base, twist))
 
     def mount(self) -> Any:
-        placed = transform_message("base_link", "laser", 0.0, [self.env.config.lidar.offset_m, 0.0, 0.0])
+        at = [self.env.config.lidar.offset_m, self.beside_m, 0.0]
+        placed = transform_message("base_link", "laser", 0.0, at)
         return packed(TF, {"transforms": [placed]})
 
     def drive(self, twist: Message | None) -> None:

@@ -15,43 +15,11 @@ from slam.geometry import compose
 from slam.ros import Mount, pose_of, transform_message, transforms_of
 from slam.types import Scan
 from tests.slam.ros.bags_on_disk import ODOMETRY, TF, scan
+from tests.training.ros.drives import STAND, Drive, begun
 from tests.training.ros.robots import Robot, packed
 from training.ros.driver import Driver, lidar_of
 
 pytest.importorskip("rosbags")
-
-STAND = {"linear": {"x": 0.0, "y": 0.0}, "angular": {"z": 0.0}}
-
-
-class Drive:
-    """A robot and its driver, a step every 0.1 s of a clock."""
-
-    def __init__(self, *, agent: str = "brisk-tour", mount: Mount | None = None, **robot: Any) -> None:
-        self.said: list[str] = []
-        self.robot, self.now_s = Robot(**robot), 0.0
-        self.driver = Driver(make_config(), agent, mount=mount, log=self.said.append)
-
-    def hear(self, *, scans: bool = True, odometry: bool = True) -> None:
-        if odometry:
-            self.driver.hear_odometry(self.robot.odometry(), self.now_s)
-        if scans:
-            self.driver.hear_scan(self.robot.scan(), self.now_s)
-
-    def step(self, **what: bool) -> Any:
-        """Hear, drive, and return the twist."""
-        self.hear(**what)
-        twist = self.driver.command(self.now_s)
-        self.robot.drive(twist)
-        self.now_s += 0.1
-        return twist
-
-
-def begun(steps: int = 20, *, agent: str = "brisk-tour") -> Drive:
-    drive = Drive(agent=agent)
-    drive.driver.hear_transforms(drive.robot.mount())
-    for _ in range(steps):
-        drive.step()
-    return drive
 
 
 def test_it_explores_a_room_by_its_messages_alone() -> None:
