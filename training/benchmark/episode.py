@@ -139,12 +139,11 @@ def way(poses: Array) -> Array:
 
 def row_metrics(episode: Course, metrics: dict[str, Any], aligned_m: float) -> dict[str, Any]:
     """Return an episode's metrics as a row has them: with the ATE after alignment, without what its key says."""
-    decisions = episode.decisions_ms
     # The limit is what an episode that never got there is counted with.
     return {name: value for name, value in metrics.items() if name not in _IN_KEY} | {
         "ate_aligned_rmse_m": plain(aligned_m),
-        "decisions": len(decisions),
-        "decision_ms_p95": float(np.percentile(decisions, 95.0)) if decisions else None,
+        "decisions": len(episode.decisions_ms),
+        "decision_ms_p95": float(np.percentile(episode.timed_ms, 95.0)) if episode.timed_ms else None,
         "limit_s": round(episode.run["max_steps"] * episode.config.step_s, 6),
     }
 

@@ -19,8 +19,8 @@ from training.figures.statistics import (
     Interval,
     compare,
     estimate,
-    mean_interval,
     ratio_of_sums,
+    share_interval,
 )
 
 __all__ = [
@@ -41,8 +41,9 @@ class Metric:
     scale: float = 1.0  # from what is stored to the unit shown
     digits: int = 2  # after the point, as shown
     better: Literal["low", "high", ""] = "low"
-    # What stands in the tables, with its interval: the IQM, the mean (of shares) or the ratio of two sums.
+    # What stands in the tables, with its interval: the IQM, the mean (of shares, too) or the ratio of two sums.
     centre: Literal["iqm", "mean", "ratio"] = "iqm"
+    share: bool = False  # of the episodes: each is 0 or 1
     # Never reached: counted as the episode's time limit in IQM and mean, as infinite in median and ranks.
     may_be_missed: bool = False
     of: Callable[[Row], float | bool | None] | None = None  # None: the stored value of that key
@@ -57,7 +58,7 @@ METRICS: tuple[Metric, ...] = (
     Metric(key="coverage", label="coverage", unit="%", scale=100, better="high"),
     Metric(
         key="reached_95", label="reached 95 %", unit="%", scale=100, digits=0, better="high",
-        centre="mean", of=lambda row: row["time_to_95_s"] is not None,
+        centre="mean", share=True, of=lambda row: row["time_to_95_s"] is not None,
     ),
     *(
         Metric(key=f"time_to_{share}_s", label=f"time to {share} %", unit="s", digits=1, may_be_missed=True)
@@ -74,7 +75,7 @@ METRICS: tuple[Metric, ...] = (
         of=lambda row: 100 * row["collisions"] / row["path_length_m"] if row["path_length_m"] else None,
     ),
     Metric(
-        key="collided", label="episodes with collision", unit="%", scale=100, digits=0, centre="mean",
+        key="collided", label="episodes with collision", unit="%", scale=100, digits=0, centre="mean", share=True,
         of=lambda row: row["collisions"] > 0,
     ),
     Metric(key="map_iou", label="wall IoU", digits=3, better="high"),
@@ -83,7 +84,8 @@ METRICS: tuple[Metric, ...] = (
     Metric(key="ate_aligned_rmse_m", label="ATE, aligned", unit="cm", scale=100),
     Metric(key="final_position_error_m", label="final position error", unit="cm", scale=100),
     Metric(key="final_heading_error_rad", label="heading error", unit="°", scale=180 / math.pi, digits=3),
-    Metric(key="anees", label="NEES / 3", better=""),
+    # χ² is skewed, so that the IQM of a true belief is below 1; and it would leave out the beliefs that go wrong.
+    Metric(key="anees", label="NEES / 3", better="", centre="mean"),
     Metric(key="decision_ms_median", label="decision", unit="ms", digits=1),
     Metric(key="decision_ms_p95", label="decision, 95th percentile", unit="ms", digits=1),
 )  # fmt: skip
@@ -161,7 +163,8 @@ def with_regrets(groups: Sequence[Group]) -> list[Group]:
     """Return the groups with the metrics of :data:`REGRETS` in every episode whose bound is there.
 
     The bound is the least time in the same room under the same seed, on the same backend: that of the planner that
-    knows the map or, where an agent was sooner, that agent's. A time that was never reached counts as the limit.
+    knows the map or, where an agent was sooner, that agent's. A time that was never reached counts as the limit;
+    in a median its regret is infinite, as the time is.
     """
     times: dict[str, dict[tuple[Any, ...], float]] = {name: {} for name in REGRETS}
     known: set[tuple[Any, ...]] = set()
@@ -225,15 +228,18 @@ def _figure(metric: Metric, group: Group) -> Figure:
     if metric.may_be_missed:
         averages = estimate(_at_limit(values, rows), strata, for_median=_at_infinity(values))
     else:
+        time, _ = REGRETS.get(metric.key, (None, None))
+        missed = [time is not None and row[time] is None for row in rows]
         known = np.flatnonzero(~np.isnan(values))
-        averages = estimate(values[known], [strata[k] for k in known.tolist()])
+        for_median = np.where(missed, np.inf, values)[known]
+        averages = estimate(values[known], [strata[k] for k in known.tolist()], for_median=for_median)
     if metric.centre == "iqm":
         return Figure(averages.iqm, averages)
     if metric.centre == "mean":
-        return Figure(mean_interval(values, strata), averages)
+        return Figure(share_interval(values, strata) if metric.share else averages.mean, averages)
     # Many short episodes without contact shall not outvote a long one with many.
     contacts, ways = (np.array([row[name] for row in rows], np.float64) for name in _COLLISIONS)
-    return Figure(ratio_of_sums(100 * contacts, ways, strata), averages)
+    return Figure(ratio_of_sums(contacts, ways, strata, per=100.0), averages)
 
 
 _COLLISIONS = ("collisions", "path_length_m")

@@ -79,7 +79,12 @@ def _figures(agents: Summary) -> dict[str, dict[str, Interval]]:
 
 
 def _interval(figure: Summary) -> Interval:
-    return Interval(*(math.nan if figure.get(key) is None else figure[key] for key in ("value", "low", "high")))
+    """Return a figure with its interval; null is infinite where episodes have a value, as a mean NEES may be."""
+    value, low, high = (figure.get(key) for key in ("value", "low", "high"))
+    beyond = math.inf if figure.get("n") else math.nan
+    return Interval(
+        beyond if value is None else value, math.nan if low is None else low, beyond if high is None else high
+    )
 
 
 def update(page: str, content: str) -> str:

@@ -140,7 +140,7 @@ def as_json(report: Report) -> dict[str, Any]:
     ``teams`` has, where there are some, the figures by the number of robots.
 
     ``low`` and ``high`` are the limits of ``value``, the figure in the tables: the IQM, but the mean for shares
-    and the ratio of two sums for collisions a way. null is what is not defined, or infinite: never reached.
+    and the NEES, and the ratio of two sums for collisions a way. null is what is not defined, or infinite.
     """
     out: dict[str, Any] = {}
     against: dict[str, Any] = {}
@@ -247,7 +247,10 @@ def table(report: Report) -> str:
             parts += [tables.text(tables.against_table(against, report.baseline)), ""]
         if scalings := report.scalings(suite):
             parts += [tables.text(scaling_table(scalings)), ""]
-    parts.append("IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts")
+    parts.append(
+        "IQM [95 % interval]; 95 %: share of episodes that got there; where never, the step limit counts; "
+        "NEES / 3: the mean"
+    )
     return "\n".join(parts)
 
 

@@ -36,8 +36,8 @@ TEAMS = "teams.png"
 
 _CASES = 6  # maps shown of an agent in a suite
 _READING = """<p>Figures are interquartile means over the episodes (the mean of the middle half); shares are means,
-and collisions all contacts over all the way driven. Below each, its 95 % bootstrap interval. An episode that never
-reached a coverage counts with its time limit in means, as infinite in medians. NEES / 3 is ideally 1.</p>"""
+and so is NEES / 3, ideally 1; collisions are all contacts over all the way driven. Below each, its 95 % interval.
+An episode that never reached a coverage counts with its time limit in means, as infinite in medians.</p>"""
 
 _BOUND = f"""<p><b>{" and ".join(KNOWN_MAPS)}</b> are no agents: they know the true map, and drive the fastest way
 that a search found. Regret is what a time is more than the least of all in the same room.</p>"""

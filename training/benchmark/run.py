@@ -13,6 +13,7 @@ import tomli_w
 import agents
 from mecanum_env.arguments import make_config
 from mecanum_env.team.config import TeamConfig
+from mecanum_env.team.team import JOINT_SLAM
 from slam.formats import atomic_write
 from slam.settings import check_name, to_mapping
 from training.benchmark import store as benchmark_store
@@ -27,7 +28,7 @@ from training.episodes.room_pictures import parse_seeds
 from training.episodes.team import refuse_bounds
 from training.runs.campaign import Workers, backend_names, keep_settings, run_all
 from training.runs.config_files import read_config
-from training.runs.errors import BadInput, bad_input
+from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.provenance import behind_agent, code_digest, modules_of_backend, short_digest
 from training.runs.running import versions
 from training.runs.typed import parts_of
@@ -83,7 +84,10 @@ class BenchmarkPlan:
             if any(team is not None for team in teams):
                 refuse_bounds(names)
             world = make_config(config=config, robot=robot)
-            backends = tuple(backend_names(slam if slam is not None else world.slam))
+            joint = any(team is not None and team.belief == "joint" for team in teams)
+            backends = tuple(backend_names(slam if slam is not None else JOINT_SLAM if joint else world.slam))
+            if joint and backends != (JOINT_SLAM,):
+                raise ValueError(f"a joint belief is one {JOINT_SLAM} over all robots; leave out --slam {slam}")
             check_name("split", split, SPLITS)
             chosen = tuple(parse_seeds(seeds, most=_MOST_SEEDS)) if seeds is not None else None
             if baseline is not None and baseline not in names:
@@ -228,8 +232,11 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
         def keep(job: EpisodeJob, result: EpisodeRow | EpisodeFailure) -> None:
             if isinstance(result, EpisodeFailure):
                 failures.append((job, result))
-            else:
+                return
+            try:
                 store.add(job, result, made_by=made_by[job.key])
+            except ValueError as error:  # of an agent or a backend that puts something else into a row
+                failures.append((job, EpisodeFailure(message=one_line(error))))
 
         # Even one worker is a process of its own: the libraries' threads, and with them the roundings, are the
         # same in any number of workers.

@@ -50,6 +50,7 @@ _NEEDED = ("coverage", "time_s", "path_length_m", "collisions", "limit_s")  # ne
 _LARGEST = 1e15  # of any metric
 _TOLD = ("time_to_95_s", "ate_rmse_m", "final_position_error_m")  # null where not reached
 _CURVES = ("coverage_by_time", "coverage_by_path", "nees")
+_COLUMNS = ("metrics", *_CURVES, "thumbnail")  # what a row holds besides its key and what made it
 
 
 class Store:
@@ -76,12 +77,16 @@ class Store:
         self._opened.close()
 
     def add(self, job: EpisodeJob, row: EpisodeRow, *, made_by: str) -> None:
-        """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same."""
-        # What is beyond all bounds, such as the NEES of a covariance next to zero, is null as infinity is.
-        told = {k: None if isinstance(v, float) and abs(v) >= _LARGEST else v for k, v in row.metrics.items()}
-        metrics = json.dumps(told, ensure_ascii=False, allow_nan=False)
-        curves = [np.asarray(getattr(row, name), "<f4").tobytes() for name in _CURVES]
-        values = (*job.key, made_by, metrics, *curves, row.thumbnail)
+        """Keep a row; where another process has kept it in the meantime, theirs stays, which is the same.
+
+        Raises
+        ------
+        ValueError
+            For a row that could not be read again; nothing is kept.
+        """
+        columns = _encode(row)
+        _decode(columns)
+        values = (*job.key, made_by, *columns.values())
         marks = ", ".join("?" * len(values))
         with self._blaming_the_file():
             if len(job.key) == 7:
@@ -99,18 +104,17 @@ class Store:
 
     def rows(self, keys: Iterable[Key]) -> Iterator[tuple[Key, EpisodeRow]]:
         """Yield the rows of keys that there are, in the order of the keys."""
-        columns = ("metrics", *_CURVES, "thumbnail")
         with self._blaming_the_file():
             sizes = self._sizes()
         for key in keys:
             if (size := len(key)) not in sizes:
                 continue
             marks = ", ".join("?" * size)
-            query = f"SELECT {', '.join(columns)} FROM {_TABLES[size]} WHERE ({_KEYS[size]}) = ({marks})"
+            query = f"SELECT {', '.join(_COLUMNS)} FROM {_TABLES[size]} WHERE ({_KEYS[size]}) = ({marks})"
             with self._blaming_the_file():
                 found = self._connection.execute(query, key).fetchone()
                 if found is not None:
-                    row = _decode(dict(zip(columns, found, strict=True)))
+                    row = _decode(dict(zip(_COLUMNS, found, strict=True)))
             if found is not None:
                 yield key, row
 
@@ -146,6 +150,18 @@ class Store:
         except (sqlite3.Error, ValueError) as error:
             problem = plain_name(" ".join(str(error).split()), 300)
             raise BadInput(f"cannot use {self._path} ({problem}); choose another --out, or remove it") from error
+
+
+def _encode(row: EpisodeRow) -> dict[str, Any]:
+    # What is beyond all bounds, such as the NEES of a covariance next to zero, is null as infinity is.
+    told = {k: None if isinstance(v, float) and abs(v) >= _LARGEST else v for k, v in row.metrics.items()}
+    try:
+        metrics = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        metrics.encode("utf-8")  # a lone surrogate has no bytes
+    except TypeError as error:
+        raise ValueError(f"a row's metrics are no JSON: {error}") from error
+    curves = [np.asarray(getattr(row, name), "<f4").tobytes() for name in _CURVES]
+    return dict(zip(_COLUMNS, (metrics, *curves, row.thumbnail), strict=True))
 
 
 def _decode(columns: dict[str, Any]) -> EpisodeRow:

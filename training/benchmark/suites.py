@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -142,20 +143,17 @@ def _make(name: str, plans: tuple[Place, ...]) -> Suite:
 
 
 def teams_of(
-    robots: str, *, communication: str | None, range_m: float | None, starts: str | None, unknown_starts: bool
-) -> tuple[TeamConfig | None, ...]:
-    """Return the teams of ``--robots 1,2,3`` and ``--communication range,none``; None is one robot alone."""
-    counts = whole_numbers("--robots", robots, low=1, high=64)
-    if counts == [1]:  # refuses what is for several
-        read_team(communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts)
+    robots: str | None, *, config: Path | None = None, communication: str | None, range_m: float | None,
+    starts: str | None, unknown_starts: bool,
+) -> tuple[TeamConfig | None, ...]:  # fmt: skip
+    """Return the teams of ``--robots 1,2,3`` and ``--communication range,none``; None is one robot alone.
+
+    What no option says, a config file's [run.team] does.
+    """
+    read = partial(read_team, config, range_m=range_m, starts=starts, unknown_starts=unknown_starts)
+    counts: list[int | None] = [None] if robots is None else [*whole_numbers("--robots", robots, low=1, high=64)]
     words = [None] if communication is None else parts_of(communication)
-    found: list[TeamConfig | None] = [None] if 1 in counts else []
-    for count in counts:
-        found += [
-            read_team(
-                robots=count, communication=word, range_m=range_m, starts=starts, unknown_starts=unknown_starts
-            )
-            for word in words
-            if count > 1
-        ]
-    return tuple(found)
+    several = [count for count in counts if count != 1] or counts  # one alone refuses what is for several
+    teams = [read(robots=count, communication=word) for count in several for word in words]
+    found = [None if team.robots == 1 else team for team in teams]
+    return (None, *found) if 1 in counts and several != counts else tuple(found)

@@ -74,4 +74,6 @@ def _metrics(episode: TeamEpisode) -> dict[str, Any]:
         "first_share_max": max((robot["first_share"] for robot in robots if robot["first_share"]), default=None),
         "path_length_max_m": max(robot["path_length_m"] for robot in robots),
     }
-    return single.row_metrics(episode, metrics, float(np.sqrt(np.mean(np.square(aligned)))))
+    # Over all robots' poses, as the ATE; each robot's path is aligned by a motion of its own.
+    poses = [len(record.estimates) for record in records]
+    return single.row_metrics(episode, metrics, float(np.sqrt(np.average(np.square(aligned), weights=poses))))

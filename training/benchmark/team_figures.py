@@ -87,7 +87,7 @@ def _touching(group: Group) -> Interval:
     rows = [row.metrics for row in group.rows]
     contacts = np.array([row["robot_collisions"] for row in rows], float)
     ways = np.array([row["path_length_m"] for row in rows], float)
-    return ratio_of_sums(100.0 * contacts, ways, group.strata)
+    return ratio_of_sums(contacts / 2, ways, group.strata, per=200.0)  # of two robots at a time
 
 
 # ---- shown -----------------------------------------------------------------------------------------------------

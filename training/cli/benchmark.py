@@ -44,15 +44,18 @@ def benchmark(
     robot: opt.Robot = None,
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.toml", help="Configuration of the world: another lidar, robot, noise, …"),
+        typer.Option(
+            metavar="FILE.toml", help="Configuration of the world, and of a team: another lidar, robot, noise, …"
+        ),
     ] = None,
     baseline: Annotated[
         str | None,
         typer.Option(help="Agent to compare the others with.  [default: nearest-frontier, if it is one of them]"),
     ] = None,
     robots: Annotated[
-        str, typer.Option(help="How many robots explore together; several numbers, separated by commas.")
-    ] = "1",
+        str | None,
+        typer.Option(help="How many robots explore together; several numbers, separated by commas.  [default: 1]"),
+    ] = None,
     communication: opt.Communication = None,
     range_m: opt.Range = None,
     starts: opt.Starts = None,
@@ -113,7 +116,7 @@ def benchmark(
             "--suite": suite, "--slam": slam, "--split": split, "--seeds": seeds, "--floor-plans": floor_plans,
             "--robot": robot, "--config": config, "--baseline": baseline, "--max-steps": max_steps,
             "--report": report or None, "--parquet": parquet or None,
-            "--robots": None if robots == "1" else robots, "--communication": communication, "--range": range_m,
+            "--robots": robots, "--communication": communication, "--range": range_m,
             "--starts": starts, "--unknown-starts": unknown_starts or None,
         }  # fmt: skip
         not_its = [name for name, given in suites_only.items() if given is not None]
@@ -146,28 +149,30 @@ def benchmark(
         suite=suite, agents=agents, slam=slam, split="test" if split is None else split, seeds=seeds,
         baseline=baseline, floor_plans=floor_plans, max_steps=max_steps, robot=robot, config=config,
         teams=teams_of(
-            robots, communication=communication, range_m=range_m, starts=starts, unknown_starts=unknown_starts
+            robots, config=config, communication=communication, range_m=range_m, starts=starts,
+            unknown_starts=unknown_starts,
         ),
     )  # fmt: skip
     if parquet:
         require()
 
-    def write(result: Report) -> None:
+    def tell(result: Report) -> None:
         for name in (PAGE, TEAMS, PARQUET):  # of an earlier run: they show other episodes than the tables
             (out / name).unlink(missing_ok=True)
         if report:
             write_report(out, result)
         if parquet:
             write_parquet(out, result)
+        if as_json or result.entries:
+            print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
 
     try:
         with opt.json_alone(as_json):
             result = task.benchmark(plan, out=out, workers=who)
     except task.EpisodesFailed as failed:
-        write(failed.report)
+        tell(failed.report)
         raise
-    write(result)
-    print(json.dumps(as_mapping(result), ensure_ascii=False) if as_json else table(result))
+    tell(result)
 
 
 def _check_protocol(protocol: str | None, its_own: list[str], not_its: list[str]) -> None:

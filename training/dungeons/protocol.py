@@ -103,27 +103,28 @@ def run_dungeons(
 
 
 def summarise(rows: Sequence[Row]) -> dict[str, Row]:
-    """Return one summary per agent; ratios are of the mean paths over the maps that both have covered.
+    """Return one summary per agent: paths and hops of the maps that it covered, of the others how many there are.
 
-    Who gave a map up has a short path. Their intervals resample layouts: a map turned or mirrored, or moved by
-    less than a tile, is no new one.
+    Who gave a map up has a short path. Ratios are of the mean paths over the maps that both have covered; their
+    intervals resample layouts: a map turned or mirrored, or moved by less than a tile, is no new one.
     """
     by_agent: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_agent.setdefault(row["agent"], {})[row["map"]] = row
     out: dict[str, Row] = {}
     for agent, own in by_agent.items():
-        paths = [row["path_m"] for row in own.values()]
+        covered = [row for row in own.values() if row["end"] == "covered"]
+        paths = [row["path_m"] for row in covered]
         decisions = [row["decision_ms_median"] for row in own.values() if row["decision_ms_median"] is not None]
         out[agent] = {
             "maps": len(own),
             "layouts": len({row["layout"] for row in own.values()}),
-            "covered": sum(row["end"] == "covered" for row in own.values()),
-            "path_m_mean": statistics.fmean(paths),
-            "path_m_std": statistics.stdev(paths) if len(paths) > 1 else 0.0,
+            "covered": len(covered),
+            "path_m_mean": _mean(paths),
+            "path_m_std": statistics.stdev(paths) if len(paths) > 1 else None,
             "coverage_mean": statistics.fmean(row["coverage"] for row in own.values()),
             "coverage_least": min(row["coverage"] for row in own.values()),
-            "hops_mean": _mean([row["hops"] for row in own.values()]),
+            "hops_mean": _mean([row["hops"] for row in covered]),
             "path_to_250_m_mean": _mean([row["path_to_250_m"] for row in own.values()]),
             "decision_ms_median": statistics.median(decisions) if decisions else None,
         }
@@ -135,7 +136,7 @@ def summarise(rows: Sequence[Row]) -> dict[str, Row]:
 
 def _mean(values: list[float | None]) -> float | None:
     reached = [value for value in values if value is not None]
-    return statistics.fmean(reached) if len(reached) == len(values) else None
+    return statistics.fmean(reached) if reached and len(reached) == len(values) else None
 
 
 def _ratio(own: dict[str, Row], other: dict[str, Row]) -> Row:
@@ -166,14 +167,14 @@ def table(summary: dict[str, Any]) -> str:
     """Return our agents and the published ones as one Markdown table."""
     references = [name for name in REFERENCES if name in summary["agents"]]
     head = [
-        "agent", "maps (layouts)", "covered", "path, mean ± std [m]", f"to {BASELINE} (95 %)",
+        "agent", "maps (layouts)", "covered", "path of these, mean ± std [m]", f"to {BASELINE} (95 %)",
         *(f"to {name} (95 %)" for name in references), "decision [ms]",
     ]  # fmt: skip
     rows = []
     for name, own in summary["agents"].items():
         rows.append([
             f"`{name}`", f"{own['maps']} ({own['layouts']})", str(own["covered"]),
-            f"{own['path_m_mean']:.0f} ± {own['path_m_std']:.0f}",
+            _path_text(own),
             _ratio_text(own), *(_ratio_text(own["to"][name]) for name in references),
             number(own["decision_ms_median"], 1, ""),
         ])  # fmt: skip
@@ -182,6 +183,11 @@ def table(summary: dict[str, Any]) -> str:
         ratios = [f"{mean / base:.3f}", *(f"{mean / bound:.3f}" if r in BOUNDS else "" for r in references)]
         rows.append([f"published: {name}", "100 others", "", f"{mean:.0f} ± {std:.0f}", *ratios, ""])
     return markdown_table(head, rows)
+
+
+def _path_text(own: Row) -> str:
+    std = "" if own["path_m_std"] is None else f" ± {own['path_m_std']:.0f}"
+    return number(own["path_m_mean"], 0) + std
 
 
 def _ratio_text(ratio: Row) -> str:

@@ -7,10 +7,12 @@ Everything is drawn from fixed seeds: the same values give the same intervals.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,13 +22,14 @@ from training.runs.running import plain
 
 __all__ = [
     "CONFIDENCE", "NONE", "RESAMPLES", "Comparison", "Estimate", "Interval", "compare", "estimate", "interval",
-    "iqm", "mean_interval", "median", "ratio_of_sums", "resampled_indices",
+    "iqm", "mean_interval", "median", "ratio_of_sums", "resampled_indices", "share_interval",
 ]  # fmt: skip
 
 Indices = NDArray[np.intp]
 
 CONFIDENCE = 0.95
 RESAMPLES = 2000
+_TAIL = 0.5 * (1.0 - CONFIDENCE)  # beyond either limit
 _SEED = 20210830  # of every resampling: figures of the same episodes share their resamples
 
 
@@ -152,13 +155,42 @@ def mean_interval(values: ArrayLike, strata: Sequence[Hashable]) -> Interval:
     return interval(lambda at: np.asarray(v[at].mean(axis=-1)), strata)
 
 
-def ratio_of_sums(above: ArrayLike, below: ArrayLike, strata: Sequence[Hashable]) -> Interval:
-    """Return Σ above / Σ below of values ``(n,)``, such as contacts over way driven, with its interval."""
-    a, b = np.asarray(above, np.float64), np.asarray(below, np.float64)
+def share_interval(values: ArrayLike, strata: Sequence[Hashable]) -> Interval:
+    """Return the mean of values ``(n,)`` in [0, 1], such as whether a level was reached, with its interval.
+
+    That of :func:`_share`: resamples of episodes that all agree say nothing of how sure that is.
+    """
+    v = np.asarray(values, np.float64)
+    return _share(float(v.mean()), len(v), strata) if len(v) else NONE
+
+
+def _share(share: float, n: float, strata: Sequence[Hashable]) -> Interval:
+    """Return a share of n episodes with its score interval (Wilson, "Probable inference", JASA 1927).
+
+    Of values between 0 and 1, or of strata that differ, it is somewhat too wide: they scatter less.
+    """
+    if _has_lone(strata):
+        return Interval(share, np.nan, np.nan)
+    z2 = NormalDist().inv_cdf(1.0 - _TAIL) ** 2
+    middle = share + z2 / (2 * n)
+    half = math.sqrt(z2 * (share * (1.0 - share) / n + z2 / (4 * n * n)))
+    low, high = ((middle + side) / (1.0 + z2 / n) for side in (-half, half))
+    return Interval(share, max(low, 0.0), min(high, 1.0))
+
+
+def ratio_of_sums(counts: ArrayLike, ways: ArrayLike, strata: Sequence[Hashable], *, per: float = 1.0) -> Interval:
+    """Return Σ counts / Σ ways of episodes ``(n,)``, such as contacts over way driven, times ``per``.
+
+    Where nothing was counted, the upper limit is that of a Poisson process: the rate at which nothing comes in
+    2.5 % of all cases.
+    """
+    counted, way = np.asarray(counts, np.float64), np.asarray(ways, np.float64)
+    if not counted.any() and way.sum() > 0.0 and not _has_lone(strata):
+        return Interval(0.0, 0.0, per * -math.log(_TAIL) / float(way.sum()))
 
     def statistic(at: Indices) -> Array:
         with np.errstate(invalid="ignore", divide="ignore"):
-            return np.asarray(a[at].sum(axis=-1) / b[at].sum(axis=-1))
+            return np.asarray(per * counted[at].sum(axis=-1) / way[at].sum(axis=-1))
 
     return interval(statistic, strata)
 
@@ -187,7 +219,7 @@ def compare(
     Notes
     -----
     The probability of improvement takes every episode (a room under its noise) for a task with one run each, as
-    Agarwal et al. do with runs: P = mean of [ours better] + ½ [equal].
+    Agarwal et al. do with runs: P = mean of [ours better] + ½ [equal]. Its interval is that of a share.
     """
     a, b = np.asarray(ours, np.float64), np.asarray(theirs, np.float64)
     rank_a, rank_b = (a, b) if for_rank is None else (np.asarray(v, np.float64) for v in for_rank)
@@ -205,20 +237,25 @@ def compare(
             logs = np.log(ours_at / theirs_at)
             defined = ~np.isnan(logs)  # not 0 / 0
             ratio = np.exp(np.sum(logs, axis=0, where=defined) / defined.sum(axis=0))
-        probability = np.mean([won[at[:, p]].mean(axis=-1) for p in places], axis=0)
-        found.append(((ours_at - theirs_at).mean(axis=0), ratio, probability))
-    (difference, ratio, probability), resampled = found
+        found.append(((ours_at - theirs_at).mean(axis=0), ratio))
+    (difference, ratio), resampled = found
+    # The mean of the strata's shares is as sure as the share of so many episodes: all of them, in strata alike.
+    n = len(places) ** 2 / sum(1.0 / len(p) for p in places)
     return Comparison(
         difference=_limits(float(difference[0]), resampled[0], strata),
         ratio=_limits(float(ratio[0]), resampled[1], strata),
-        probability=_limits(float(probability[0]), resampled[2], strata),
+        probability=_share(float(np.mean([won[p].mean() for p in places])), n, strata),
         n=len(a),
     )
 
 
 def _limits(value: float, resampled: Array, strata: Sequence[Hashable]) -> Interval:
-    if min(Counter(strata).values()) < 2:  # one episode of a place cannot tell how much others would differ
+    if _has_lone(strata):
         return Interval(value, np.nan, np.nan)
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low, high = np.quantile(resampled, (tail, 1.0 - tail), method="inverted_cdf").tolist()
+    low, high = np.quantile(resampled, (_TAIL, 1.0 - _TAIL), method="inverted_cdf").tolist()
     return Interval(value, low, high)
+
+
+def _has_lone(strata: Sequence[Hashable]) -> bool:
+    """Whether a place has but one episode, which cannot tell how much others would differ."""
+    return min(Counter(strata).values()) < 2

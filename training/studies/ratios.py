@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from slam.types import Array
-from training.figures.statistics import Interval, interval
+from training.figures.statistics import NONE, Interval, interval
 from training.figures.tables import markdown_table
 from training.runs.errors import BadInput
 
@@ -30,8 +30,14 @@ COLUMNS = {
 
 
 def ratio(ours: Array, theirs: Array) -> Interval:
-    """Return mean(ours) / mean(theirs) of pairs ``(n,)`` with its 95 % interval, pairs resampled together."""
-    return interval(lambda at: ours[at].mean(axis=-1) / theirs[at].mean(axis=-1), ["all"] * len(ours))
+    """Return mean(ours) / mean(theirs) of pairs ``(n,)`` with its 95 % interval, pairs resampled together.
+
+    Over a mean of 0, such as the ATE of ``truth``, there is none.
+    """
+    if not theirs.any():
+        return NONE
+    with np.errstate(divide="ignore", invalid="ignore"):  # a resample may be of zeros alone
+        return interval(lambda at: ours[at].mean(axis=-1) / theirs[at].mean(axis=-1), ["all"] * len(ours))
 
 
 def table(episodes: Path, suite: str, agent: str) -> str:
@@ -61,8 +67,8 @@ def table(episodes: Path, suite: str, agent: str) -> str:
                 shares.append("")
                 continue
             found = ratio(pairs[:, 0], pairs[:, 1])
-            limits = "" if np.isnan(found.low) else f" [{found.low:.2f}, {found.high:.2f}]"
-            shares.append(f"{found.value:.2f}{limits}")
+            limits = f" [{found.low:.2f}, {found.high:.2f}]" if np.isfinite([found.low, found.high]).all() else ""
+            shares.append("–" if np.isnan(found.value) else f"{found.value:.2f}{limits}")
         rows.append([f"`{other}`", *means, *shares])
     return markdown_table(head, rows)
 

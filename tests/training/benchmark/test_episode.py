@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from mecanum_env.config import EnvConfig
 from tests.training.benchmark.small import STEPS, without_clock
-from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, resampled, run_job
+from training.benchmark.episode import EpisodeFailure, EpisodeJob, EpisodeRow, resampled, row_metrics, run_job
 from training.benchmark.store import FILE, Store
+from training.episodes.explore import Course
 
 
 def test_ctrl_c_in_an_episode_leaves_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,6 +43,15 @@ def test_an_agent_that_exits_fails_its_episode_alone(monkeypatch: pytest.MonkeyP
     assert "sys.exit()" in failed.trace
 
 
+def test_the_first_decision_in_which_code_may_be_compiled_is_not_timed() -> None:
+    course = Course(config=EnvConfig(), run={"max_steps": 100}, out=Path("nowhere"))
+    for times, median, p95 in (([], None, None), ([9000.0], None, None), ([9000.0, 1.0, 3.0], 2.0, 2.9)):
+        course.decisions_ms = times
+        metrics = row_metrics(course, {}, 0.0)
+        assert (metrics["decisions"], course.decision_ms) == (len(times), median)
+        assert metrics["decision_ms_p95"] == pytest.approx(p95)
+
+
 def test_a_curve_holds_until_the_next_row() -> None:
     curve = resampled(np.array([0.1, 0.5, 0.9]), np.array([0.0, 0.0, 127.0]))
     np.testing.assert_array_equal(curve, np.array([0.5] * 127 + [0.9], np.float32))
@@ -64,6 +75,7 @@ def test_a_row_is_what_an_episode_left(tmp_path: Path) -> None:
             rows[noise] = row
     row = rows["nominal"]
     assert row.metrics["limit_s"] == 2.5 and len(row.nees) == 2
+    assert row.metrics["decisions"] > 0
     assert row.metrics["ate_aligned_rmse_m"] <= row.metrics["ate_rmse_m"]
     assert row.coverage_by_time[-1] == pytest.approx(row.metrics["coverage"])
     assert np.all(np.diff(row.coverage_by_path) > -0.01)

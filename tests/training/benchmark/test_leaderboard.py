@@ -49,6 +49,16 @@ def test_tables_rank_the_agents_and_tell_the_whole_story():
     assert "numpy 2.4" in text and "baseline slow" not in text
 
 
+def test_a_mean_nees_that_is_infinite_is_told_from_none():
+    infinite, none = ({"n": n} | figure(None) for n in (3, 0))
+    summary = SUMMARY | {
+        "apartments": {"sure": agent(40.0) | {"anees": infinite}, "blind": agent(50.0) | {"anees": none}}
+    }
+    rows = tables(summary | {"ends": {"apartments": {}, "apartments-slippery": {}}}).splitlines()
+    cells = {row.split(" | ")[0]: row for row in rows if row.count("|") > 8}
+    assert "∞" in cells["| `sure`"] and "∞" not in cells["| `blind`"]
+
+
 def test_update_keeps_the_rest_of_the_page():
     page = f"# Title\n{BEGIN}\nold\n{END}\nmore\n"
     once = update(page, "new")

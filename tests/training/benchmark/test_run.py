@@ -169,6 +169,38 @@ def test_an_episode_that_fails_does_not_stop_the_others(
     assert {key[2] for key in contents(tmp_path)} == {0, 2}
     assert "nearest-frontier" in (tmp_path / "summary.csv").read_text("utf-8")
     assert "2 episodes an agent" in (tmp_path / "report.html").read_text("utf-8")
+    assert main(small(tmp_path, "--json")) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out)["rooms"]["nearest-frontier"]["coverage"]["n"] == 2
+    assert "1 of 1 episodes failed" in told.err
+    assert main(small(tmp_path)) == 1
+    assert "nearest-frontier" in capsys.readouterr().out, "the table, too"
+
+
+@pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("harm", ["status", "row"])
+def test_an_agent_that_makes_rows_no_table_can_be_made_of_fails_alone(
+    harm: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from agents.random import RandomAgent
+
+    if harm == "status":
+        monkeypatch.setattr(RandomAgent, "status", property(lambda self: None))
+        words = "random, invariant-ekf: TypeError: status of agent RandomAgent must be a word (str), got None"
+    else:
+
+        def unreadable(job: EpisodeJob) -> EpisodeRow | EpisodeFailure:
+            row = run_job(job)
+            if job.agent == "random" and isinstance(row, EpisodeRow):
+                row.metrics["end"] = None
+            return row
+
+        monkeypatch.setattr(benchmark, "run_job", unreadable)
+        words = "random, invariant-ekf: a row's metrics lack end, a word"
+    assert main(small(tmp_path, "--agents", "nearest-frontier,random", "--json", seeds="0")) == 1
+    told = capsys.readouterr()
+    assert words in told.err and json.loads(told.out)["rooms"].keys() == {"nearest-frontier"}
+    assert {key[3] for key in contents(tmp_path)} == {"nearest-frontier"}
 
 
 def test_killed_in_the_middle_and_run_again_it_has_the_rows_of_an_undisturbed_run(tmp_path: Path) -> None:

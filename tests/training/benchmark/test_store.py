@@ -17,6 +17,8 @@ from training.benchmark.store import FILE, Store
 from training.runs.errors import BadInput
 from training.studies.reliability.files import results
 
+JOB = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
+
 
 @pytest.fixture(scope="module")
 def sound() -> bytes:
@@ -83,18 +85,28 @@ def test_metrics_that_no_table_can_be_made_of_are_refused(
     refused(stored(tmp_path, sound, f"UPDATE episodes SET metrics = '{text}' WHERE seed = 1"), "cannot use")
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("end", None), ("end", object()), ("end", "\udcff"), ("coverage", None), ("anees", "x")]
+)
+def test_a_row_that_could_not_be_read_again_is_not_written(name: str, value: Any, tmp_path: Path) -> None:
+    with Store(tmp_path / FILE) as store:
+        with pytest.raises(ValueError):
+            store.add(JOB, episode(JOB.key, **{name: value}), made_by="x")
+        assert store.made_by() == {}
+        store.add(JOB, episode(JOB.key), made_by="x")
+        assert len(list(store.rows([JOB.key]))) == 1
+
+
 def test_two_runs_into_one_store_do_not_disturb_each_other(tmp_path: Path) -> None:
-    job = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
     with Store(tmp_path / FILE) as one, Store(tmp_path / FILE) as other:
-        one.add(job, episode(job.key), made_by="x")
-        other.add(job, episode(job.key, coverage=0.5), made_by="x")
-        ((key, row),) = one.rows([job.key, ("rooms", "rectangular", 2, "a", "ekf")])
-    assert key == job.key and without_clock(row) == without_clock(episode(key))
+        one.add(JOB, episode(JOB.key), made_by="x")
+        other.add(JOB, episode(JOB.key, coverage=0.5), made_by="x")
+        ((key, row),) = one.rows([JOB.key, ("rooms", "rectangular", 2, "a", "ekf")])
+    assert key == JOB.key and without_clock(row) == without_clock(episode(key))
 
 
 def test_what_is_beyond_all_bounds_is_null(tmp_path: Path) -> None:
-    job = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
     with Store(tmp_path / FILE) as store:
-        store.add(job, episode(job.key, anees=1e20), made_by="x")
-        ((_, row),) = store.rows([job.key])
+        store.add(JOB, episode(JOB.key, anees=1e20), made_by="x")
+        ((_, row),) = store.rows([JOB.key])
     assert row.metrics["anees"] is None and row.metrics["coverage"] == 0.99

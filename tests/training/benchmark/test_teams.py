@@ -17,16 +17,20 @@ import pytest
 from mecanum_env.team.config import TeamConfig
 from tests.training.benchmark.small import episode, made_up_group, without_clock
 from tests.training.cli.test_bad_input import refused
+from training.benchmark import team_episode
 from training.benchmark.episode import CURVE_POINTS, EpisodeFailure, EpisodeJob, run_job
 from training.benchmark.figures import Group, group_rows
 from training.benchmark.output import Report, as_json, markdown, table
 from training.benchmark.report import page
 from training.benchmark.report_charts import COLOURS, scaling_charts, team_chart
+from training.benchmark.run import BenchmarkPlan
 from training.benchmark.store import FILE, Store
 from training.benchmark.suites import teams_of
 from training.benchmark.team_episode import TeamJob
 from training.benchmark.team_figures import scaling_of, scaling_table
 from training.cli import main
+from training.episodes.team import prepare, run
+from training.runs.errors import BadInput
 
 NOTHING: dict[str, Any] = {"communication": None, "range_m": None, "starts": None, "unknown_starts": False}
 
@@ -58,6 +62,30 @@ def test_teams_of_options() -> None:
     assert found[0] is None
     said = [(team.robots, team.communication.model, team.starts) for team in found if team is not None]
     assert said == [(n, how, "scattered") for n in (2, 3) for how in ("range", "none")]
+
+
+def test_a_file_s_team_is_benchmarked_and_options_come_first(tmp_path: Path) -> None:
+    file = tmp_path / "team.toml"
+    file.write_text(
+        '[run]\nagent = "random"\nseed = 7\n[run.team]\nrobots = 2\nstarts = "scattered"\nbelief = "joint"\n'
+    )
+    (found,) = teams_of(None, **NOTHING, config=file)
+    assert found is not None and (found.robots, found.starts, found.belief) == (2, "scattered", "joint")
+    one, three = teams_of("3,1", **(NOTHING | {"starts": "together"}), config=file)
+    assert one is None
+    assert three is not None and (three.robots, three.starts, three.belief) == (3, "together", "joint")
+    assert teams_of("1", **NOTHING, config=file) == (None,) == teams_of(None, **NOTHING)
+    plan = BenchmarkPlan.parse(suite="rooms", agents="tour", slam=None, seeds="3", config=file, teams=(found,))
+    assert plan.backends == ("ekf-lines",), "that of a joint belief"
+    assert [(job.agent, job.seed) for job in plan.jobs] == [("tour", 3)], "not the file's"
+    with pytest.raises(BadInput, match="leave out --slam ekf"):
+        BenchmarkPlan.parse(suite="rooms", agents="tour", slam="ekf", config=file, teams=(found,))
+    file.write_text('[run.team]\nrobots = 2\ncommunication = { model = "none" }\n')
+    told = [team.communication.model for team in teams_of(None, **NOTHING, config=file) if team is not None]
+    assert told == ["none"]
+    file.write_text("[run.team]\nrobot = 2\n")
+    with pytest.raises(BadInput, match="robot"):
+        teams_of(None, **NOTHING, config=file)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +123,17 @@ def test_a_row_has_what_a_single_robots_has() -> None:
     assert row.thumbnail.startswith(b"\x89PNG")
     assert 0.5 <= row.metrics["first_share_max"] <= 1.0
     assert row.metrics["path_length_max_m"] <= row.metrics["path_length_m"]
+
+
+def test_a_robot_that_ended_early_counts_in_the_ate_by_its_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    episode = prepare(TeamConfig(robots=2), out=Path("nowhere"), rooms="rectangular", seed=3, max_steps=20)
+    run(episode, lambda **_: None)
+    longer, shorter = (member.truth.record for member in episode.team.members)
+    poses = {id(longer): np.zeros((21, 3)), id(shorter): np.zeros((11, 3))}
+    monkeypatch.setattr(type(shorter), "estimates", property(lambda self: poses[id(self)]))
+    monkeypatch.setattr(team_episode, "ate_aligned", lambda _, estimates: 0.0 if len(estimates) == 21 else 3.0)
+    found = team_episode._metrics(episode)["ate_aligned_rmse_m"]
+    assert found == pytest.approx(math.sqrt(9.0 * 11 / 32))
 
 
 def test_an_error_in_an_episode_is_its_result() -> None:
@@ -152,6 +191,17 @@ def test_teams_are_added_to_single_robots_and_the_command_goes_on(
     assert "other code, configuration or plans" in capsys.readouterr().err
 
 
+def test_the_team_of_a_file_explores(here: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "team.toml"
+    file.write_text('[run]\nseed = 7\nmax_steps = 9999\n[run.team]\nrobots = 2\nbelief = "joint"\n')
+    assert main(small(tmp_path / "out", "--config", str(file), "--json")) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["rooms"].keys() == {"nearest-frontier ×2"}
+    assert found["config"]["backends"] == ["ekf-lines"] and found["config"]["seeds"] == {"rooms": [0, 1]}
+    assert [team["belief"] for team in found["config"]["teams"]] == ["joint"]
+    assert found["rooms"]["nearest-frontier ×2"]["time_s"]["value"] <= 1.5
+
+
 # ---- figures ---------------------------------------------------------------------------------------------------
 
 
@@ -180,6 +230,9 @@ def test_figures_by_the_number_of_robots() -> None:
     assert found.ratio[1].value == pytest.approx(0.5)
     assert found.ratio[1].low == pytest.approx(0.5) and found.ratio[1].high == pytest.approx(0.5)
     assert found.touching[1].value == pytest.approx(20.0)
+    (apart,) = scaling_of([team_group(3, [50.0] * 4)], suite="rooms")
+    # Of two robots at a time: 3.7 such contacts, counted twice, in four times 30 m.
+    assert apart.touching[0].value == 0.0 and apart.touching[0].high == pytest.approx(2 * 3.689 / 1.2, rel=1e-3)
     # Each robot is a run of its own.
     assert found.nees == (pytest.approx(1.0 / 3.0), pytest.approx(1.0))
     assert found.nees_each == (pytest.approx((1.0 / 3.0,)), pytest.approx((1.0 / 3.0, 1.0, 5.0 / 3.0)))

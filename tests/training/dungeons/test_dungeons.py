@@ -331,6 +331,11 @@ def test_the_ratio_is_of_means_and_has_an_interval():
             for r in rows]  # fmt: skip
     assert summarise(gone)["tour"]["ratio"] == pytest.approx(0.9, abs=0.04)
     assert summarise(gone)["tour"]["covered"] == 20
+    kept = [r["path_m"] for r in gone if r["agent"] == "tour" and r["end"] == "covered"]
+    assert summarise(gone)["tour"]["path_m_mean"] == pytest.approx(np.mean(kept)), "nor in the mean"
+    none = summarise([r | {"end": "stuck"} for r in gone if r["agent"] == "tour"])
+    assert none["tour"]["path_m_mean"] is None is none["tour"]["hops_mean"] and none["tour"]["covered"] == 0
+    assert "| `tour` | 40 (10) | 0 | – |" in table({"agents": none})
     alone = summarise([r for r in rows if int(r["map"]) < 4])["tour"]
     assert alone["ratio_low"] is None and alone["ratio"] == pytest.approx(0.9, abs=0.1)
     assert " (None" not in table({"agents": {"nearest-frontier": alone, "tour": alone}})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,19 @@ def test_an_episode_may_take_as_long_whatever_a_step_is(step_s: float, steps: in
     config = tmp_path / "c.toml"
     config.write_text(f"step_s = {step_s}", "utf-8")
     assert explore.prepare(out=tmp_path, config=config, rooms="rectangular", seed=5).run["max_steps"] == steps
+
+
+class Word(Enum):
+    DONE = "covered"
+
+
+@pytest.mark.parametrize("status", [None, Word.DONE, 3])
+def test_a_status_that_is_no_word_is_told_with_the_agent(status: Any, tmp_path: Path) -> None:
+    episode = explore.prepare(out=tmp_path, rooms="rectangular", seed=5, max_steps=100)
+    episode.agent = LostAtTheEnd()
+    episode.agent.__class__ = type("Mine", (LostAtTheEnd,), {"status": status})
+    with pytest.raises(TypeError, match="status of agent Mine must be a word"):
+        explore.run(episode, lambda **_: None)
 
 
 class WithoutGoals(Agent):

@@ -20,6 +20,7 @@ from training.figures.statistics import (
     median,
     ratio_of_sums,
     resampled_indices,
+    share_interval,
 )
 
 
@@ -106,6 +107,41 @@ def test_the_ratio_of_sums_weighs_by_way() -> None:
     found = ratio_of_sums([0, 2, 0], [10.0, 20.0, 70.0], ["a"] * 3)
     assert found.value == pytest.approx(0.02)
     assert found.low == 0.0 and found.high >= 0.05
+    by_hundred = ratio_of_sums([0, 2, 0], [10.0, 20.0, 70.0], ["a"] * 3, per=100.0)
+    assert (by_hundred.value, by_hundred.high) == pytest.approx((2.0, 100 * found.high))
+
+
+def test_no_contact_at_all_leaves_a_rate_that_may_have_been() -> None:
+    found = ratio_of_sums([0, 0, 0], [10.0, 20.0, 70.0], ["a"] * 3, per=100.0)
+    assert (found.value, found.low) == (0.0, 0.0)
+    assert found.high == pytest.approx(stats.chi2.ppf(0.975, 2) / 2), "Poisson's exact upper limit, of 100 m"
+    assert stats.poisson.cdf(0, found.high) == pytest.approx(0.025)
+    assert math.isnan(ratio_of_sums([0, 0], [10.0, 10.0], ["a", "b"]).high)
+    assert math.isnan(ratio_of_sums([0, 0], [0.0, 0.0], ["a"] * 2).value), "nor has who stood still one"
+
+
+# ---- shares ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("of", "n"), [(0, 4), (4, 4), (1, 10), (33, 50), (50, 50)])
+def test_the_interval_of_a_share_is_scipy_s_and_never_without_width(of: int, n: int) -> None:
+    found = share_interval([1.0] * of + [0.0] * (n - of), ["a"] * n)
+    theirs = stats.binomtest(of, n).proportion_ci(method="wilson")
+    assert found.value == of / n and (found.low, found.high) == pytest.approx((theirs.low, theirs.high))
+    assert 0.0 <= found.low < found.high <= 1.0
+
+
+def test_a_share_of_nothing_or_of_one_episode_has_no_interval() -> None:
+    assert math.isnan(share_interval([], []).value)
+    lone = share_interval([1.0, 1.0, 0.0], ["a", "a", "b"])
+    assert lone.value == pytest.approx(2 / 3) and math.isnan(lone.low) and math.isnan(lone.high)
+
+
+def test_the_interval_of_a_share_holds_the_true_one_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(5)
+    for share in (0.5, 0.9, 0.98):
+        found = [share_interval(rng.random(50) < share, ["a"] * 50) for _ in range(400)]
+        assert np.mean([one.low <= share <= one.high for one in found]) > 0.9
 
 
 # ---- in pairs --------------------------------------------------------------------------------------------------
@@ -136,7 +172,8 @@ def test_pairs_are_resampled_together() -> None:
     theirs = np.random.default_rng(1).uniform(20.0, 200.0, 40)
     found = compare(0.8 * theirs, theirs, ["a"] * 40, lower_is_better=True)
     assert (found.ratio.low, found.ratio.value, found.ratio.high) == pytest.approx((0.8, 0.8, 0.8))
-    assert (found.probability.low, found.probability.high) == (1.0, 1.0)
+    sure = stats.binomtest(40, 40).proportion_ci(method="wilson")
+    assert (found.probability.low, found.probability.high) == pytest.approx((sure.low, sure.high))
 
 
 def test_every_stratum_counts_the_same() -> None:
@@ -145,6 +182,9 @@ def test_every_stratum_counts_the_same() -> None:
     assert found.ratio.value == pytest.approx(math.sqrt(0.5 * 8.0))
     assert found.difference.value == pytest.approx((-1.0 + 7.0) / 2)
     assert found.probability.value == pytest.approx(0.5)
+    # The two episodes of the one place leave more open than twelve would.
+    twelve = stats.binomtest(6, 12).proportion_ci(method="wilson")
+    assert found.probability.low < twelve.low and twelve.high < found.probability.high
 
 
 def test_brute_force_of_a_stratified_comparison() -> None:

@@ -33,7 +33,7 @@ def test_the_figures_are_those_of_the_episode(tmp_path: Path) -> None:
     metrics = episode.metrics()
     assert found["steps"] == metrics["steps"]
     assert found["nees_over_3"] == pytest.approx(metrics["anees"], rel=0.2)  # that counts the start, too
-    assert found["ate_rmse_m"] == pytest.approx(metrics["ate_rmse_m"], rel=0.05)
+    assert found["ate_rmse_m"] == pytest.approx(metrics["ate_rmse_m"], rel=1e-9)
     kinds = found["nis_over_2"]
     assert set(kinds) <= {"wall", "wall end", "convex corner", "concave corner", "landmark"}
     assert kinds["wall"]["count"] > 60

@@ -33,6 +33,16 @@ def test_the_table_is_of_means_over_shared_seeds(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == expected
 
 
+@pytest.mark.filterwarnings("error")
+def test_over_a_mean_of_nothing_there_is_no_ratio(tmp_path):
+    rows = [["caves", "cave", s, "one", 10 + s, 20, 0.002, 0.01, 300] for s in range(4)]
+    rows += [["caves", "cave", s, "known", 10, 20, 0.0, 0.0 if s else 0.01, 300] for s in range(4)]
+    write(tmp_path / "episodes.csv", rows)
+    *_, ate, corners = table(tmp_path / "episodes.csv", "caves", "one").splitlines()[-1].strip("| ").split(" | ")
+    # Some resamples of the corners are of nothing but zeros.
+    assert (ate, corners) == ("–", "4.00")
+
+
 def test_backends_and_teams_are_told_apart(tmp_path, capsys):
     fields = (*FIELDS, "slam", "robots", "communication")
     with (tmp_path / "episodes.csv").open("w", newline="") as file:

@@ -6,8 +6,11 @@ measured.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Sequence
+from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +29,7 @@ from training.episodes.explore import Episode, prepare, run, run_whole
 from training.figures.charts import chart, label, png, told
 from training.figures.tables import number, text_table
 from training.runs.campaign import keep_settings, made_by
-from training.runs.errors import BadInput, bad_input
+from training.runs.errors import BadInput, bad_input, one_line
 from training.runs.options import Out, Seed
 from training.runs.processes import memory_mb
 from training.runs.rows import resume
@@ -70,8 +73,8 @@ class _Watch:
         self._last, self._goal = now, goal
 
 
-def explore(job: Job) -> dict[str, Any]:
-    """Explore a plan; return its figures, and write a picture of the map into the folder.
+def explore(job: Job, *, picture: str) -> dict[str, Any]:
+    """Explore a plan; return its figures, and write a picture of the map of that name into the folder.
 
     ``rows`` by explored area: steps, and the median, mean and 99th percentile of a step, and of what the agent
     takes between two steps where it does not choose and where it does (``driving_ms``, ``decision_ms``).
@@ -94,7 +97,10 @@ def explore(job: Job) -> dict[str, Any]:
                 "area_m2": float(area[here].mean()), "steps": int(here.sum()), "step_ms": _spread(step[here]),
                 "driving_ms": _spread(rest[here & ~choice]), "decision_ms": _spread(rest[here & choice]),
             })  # fmt: skip
-    _draw(episode, Path(folder) / f"{Path(plan).stem}_{agent}.png")
+    try:
+        _draw(episode, Path(folder) / picture)
+    except OSError as error:  # the figures took minutes
+        print(f"no picture of {Path(plan).name}: {one_line(error)}", file=sys.stderr)
     metrics = episode.metrics()
     kept = ("coverage", "time_s", "wall_time_s", "collisions", "path_length_m", "ate_rmse_m")
     return {
@@ -124,6 +130,16 @@ def _draw(episode: Episode, path: Path) -> None:
     atomic_write(path, cv2.imencode(".png", picture)[1].tobytes())
 
 
+def _pictures(jobs: Sequence[Job]) -> dict[Job, str]:
+    """Return what each exploration's picture is called: after plan and agent, numbered where several are alike."""
+    names: dict[Job, str] = {}
+    for job in jobs:
+        name = f"{Path(job[0]).stem}_{Path(job[1]).name.removesuffix('.safetensors')}"
+        tried = chain([f"{name}.png"], (f"{name}_{k}.png" for k in count(2)))
+        names[job] = next(one for one in tried if one not in names.values())
+    return names
+
+
 def study(
     plans: Annotated[list[Path], typer.Argument(metavar="PLAN...", help="ROS maps or images.")],
     out: Out = Path("out/scale"),
@@ -143,9 +159,11 @@ def study(
             load(plan)
     keep_settings(out, {**made_by(*plans, agents=names), "seed": seed, "minutes": minutes}, FILES)
     jobs: list[Job] = [(str(p), name, seed, minutes, str(out)) for p in plans for name in names]
+    pictures = _pictures(jobs)
     for k, job in enumerate(jobs):  # each in a process of its own, so that its memory is
         what = f"exploration {k + 1} of {len(jobs)}, {Path(job[0]).stem}, {job[1]}"
-        rows = resume(out / STORE, jobs[: k + 1], explore, workers=1, what=what, apart=True)
+        work = partial(explore, picture=pictures[job])
+        rows = resume(out / STORE, jobs[: k + 1], work, workers=1, what=what, apart=True)
     found = list(rows.values())
     write_json(out / "scale.json", found)
     atomic_write(out / "scale.png", _chart(found))

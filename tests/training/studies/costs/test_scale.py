@@ -9,13 +9,14 @@ from typing import Any
 import cv2
 import pytest
 
+from agents import make
 from tests.training.plans import write_room
 from training.cli import main
 from training.episodes import explore
 from training.studies.costs import scale
 
 
-def test_a_room_is_explored_and_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_room_is_explored_and_measured(tmp_path: Path) -> None:
     plan, out = write_room(tmp_path / "hall.png"), tmp_path / "out"
     command = ["study", "scale", str(plan), "--agent", "nearest-frontier", "--out", str(out)]
     assert main(command) == 0
@@ -27,8 +28,30 @@ def test_a_room_is_explored_and_measured(tmp_path: Path, monkeypatch: pytest.Mon
     assert row["step_ms"]["median"] < row["decision_ms"]["median"] <= row["decision_ms"]["p99"]
     picture = cv2.imread(str(out / "hall_nearest-frontier.png"))
     assert picture is not None and picture.shape[1] > 500
-    monkeypatch.setattr(scale, "explore", None)  # it is all there
+    (out / "hall_nearest-frontier.png").unlink()
     assert main(command) == 0
+    assert not (out / "hall_nearest-frontier.png").exists(), "it is all there: nothing is run again"
+
+
+def test_pictures_of_like_names_are_told_apart_and_lie_in_the_folder(tmp_path: Path) -> None:
+    agents = ("tour", "/some/where/mine.safetensors", "/else/where/mine.safetensors")
+    jobs = [(f"{folder}/hall.yaml", agent, 0, 1.0, "out") for folder in ("a", "b") for agent in agents]
+    assert list(scale._pictures(jobs).values()) == [
+        "hall_tour.png", "hall_mine.png", "hall_mine_2.png", "hall_tour_2.png", "hall_mine_3.png",
+        "hall_mine_4.png",
+    ]  # fmt: skip
+
+
+def test_a_policy_s_file_explores_and_a_picture_that_cannot_be_written_costs_no_row(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shipped = make("ppo-frontier").policy_path  # type: ignore[attr-defined]
+    plan, out = write_room(tmp_path / "hall.png"), tmp_path / "out"
+    (out / f"hall_{shipped.stem}.png").mkdir(parents=True)  # where the picture would be
+    assert main(["study", "scale", str(plan), "--agent", str(shipped), "--minutes", "0", "--out", str(out)]) == 0
+    (found,) = json.loads((out / "scale.json").read_text())
+    assert found["agent"] == str(shipped) and found["end"] == "minutes"
+    assert "no picture of hall.png" in capfd.readouterr().err
 
 
 def test_an_exploration_that_was_broken_off_is_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +62,7 @@ def test_an_exploration_that_was_broken_off_is_no_result(tmp_path: Path, monkeyp
     for module in (scale, explore):  # the one that is measured, then the one before it
         monkeypatch.setattr(module, "run", broken_off)
         with pytest.raises(KeyboardInterrupt):
-            scale.explore(job)
+            scale.explore(job, picture="hall.png")
 
 
 def test_what_was_typed_wrong_is_told_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
