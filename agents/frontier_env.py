@@ -186,8 +186,10 @@ class ExploreFrontierEnv(ChoiceEnv):
         super().reset(seed=seed)
         self._decisions = StepClock.of_caller(self)
         self.base.planned_path = None
+        # One generator for both: it draws the next episode, whoever sets it back.
+        self.base._np_random, self.base._np_random_seed = self._np_random, self._np_random_seed
         self._seen, info = self._limited.reset(seed=seed, options=options)
-        self._np_random = self.base.np_random  # one for both: it draws the next episode, whoever sets it back
+        self._np_random, self._np_random_seed = self.base._np_random, self.base._np_random_seed
         self.agent.reset(self.base.outline, 0 if seed is None else int(seed))
         self._choice = self.agent.survey(self.base.belief)
         return self._observed(), info | {"duration_s": 0.0}

@@ -115,6 +115,8 @@ class ExploreEnv(gymnasium.Env[Observation, Floats]):
         super().reset(seed=seed)
         self._ready = False
         options = reset_options(options, ("floor_plan", "start_pose", "room_seed"))
+        if seed is None and not hasattr(self, "truth") and self.np_random_seed >= 0:
+            seed = self.np_random_seed  # with which the first episode can be had again
         episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         plan = make_plan(
             self.config, room_seed_of(options, episode_seed, self._plan),

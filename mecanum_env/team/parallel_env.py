@@ -95,6 +95,9 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
         for name in self.agents:
             require(name in actions, f"actions must have one of each of {self.agents}; that of {name} is missing")
         outcomes = self.team.step({self._numbers[name]: actions[name] for name in self.agents})
+        for outcome in outcomes.values():
+            # By this stable-baselines3 tells an end from a cut, where it adds the value of what would follow.
+            outcome.info["TimeLimit.truncated"] = outcome.truncated and not outcome.terminated
         self.agents = [names[k] for k in self.team.active]
         return (
             {names[k]: outcome.observation for k, outcome in outcomes.items()},
@@ -103,6 +106,11 @@ class ExploreParallelEnv(ParallelEnv[str, Observation, Action]):  # type: ignore
             {names[k]: outcome.truncated for k, outcome in outcomes.items()},
             {names[k]: outcome.info for k, outcome in outcomes.items()},
         )
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """What draws the seeds of episodes; wrappers of SuperSuit draw from it, too."""
+        return self.team.np_random
 
     def member(self, agent: str) -> Member:
         """Return the environment of one robot: its belief, truth and metrics."""

@@ -108,7 +108,7 @@ class Team:
         )
         if self.team.robots > 1 and self.joint is None and not self.team.starts_exact:
             Account.of(0, 0.0, self.members[0].backend)  # raises where frames could not be found
-        self._rng = np.random.default_rng()
+        self._rng: np.random.Generator | None = None
         self.ends_covered = True
         """Whether coverage of the target ends the episode."""
         self.active: list[int] = []
@@ -127,7 +127,7 @@ class Team:
         options = reset_options(options, _OPTIONS)
         if seed is not None:
             self._rng, _ = np_random(seed)
-        seed = int(self._rng.integers(2**31)) if seed is None else int(seed)
+        seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         plans = self._plans(options, seed, room_seed_of(options, seed, self._plan))
         config, team = self.config, self.team
         drawn = np.random.default_rng(np.random.SeedSequence([seed, 2])).standard_normal((team.robots, 3))
@@ -287,6 +287,13 @@ class Team:
         """The true poses ``(3,)`` of the frames of the robots' beliefs in that of the first robot."""
         back = inverse(self.ground.start)
         return [compose(back, member.truth.ground.start) for member in self.members]
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """What draws the seeds of episodes; made when first asked for, so that copies made before have others."""
+        if self._rng is None:
+            self._rng, _ = np_random()
+        return self._rng
 
     @property
     def time_s(self) -> float:

@@ -162,6 +162,22 @@ def test_one_seed_is_one_episode_and_whatever_is_no_candidate_is_the_first():
     assert [i["time_s"] for _, _, i in first] == [i["time_s"] for _, _, i in none]
 
 
+@pytest.mark.parametrize("early", [False, True])
+def test_an_episode_without_a_seed_can_be_had_again(early):
+    env, other = (gymnasium.make(ID, rooms="rectangular") for _ in range(2))
+    asked = env.unwrapped.np_random_seed if early else None
+    seen = [env.reset()[0]]
+    seed = env.unwrapped.np_random_seed
+    assert asked in (None, seed)
+    again = [other.reset(seed=seed)[0]]
+    for its, those in ((env, seen), (other, again)):
+        those += [its.step(0)[0], its.reset()[0]]
+    for one, same in zip(seen, again, strict=True):
+        assert all(np.array_equal(one[key], same[key]) for key in one)
+    assert env.unwrapped.np_random is env.unwrapped.base.np_random
+    assert env.unwrapped.np_random_seed == env.unwrapped.base.np_random_seed == seed
+
+
 def test_what_the_reward_is_made_of_adds_up_to_it_and_a_copy_goes_on_alike():
     env = gymnasium.make(ID, rooms="rectangular", discount=0.99)
     env.reset(seed=0)

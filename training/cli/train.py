@@ -73,8 +73,6 @@ def train(
     begun = (out / "progress.json").exists()
     if begun and not resume:
         raise BadInput(f"{out} holds a run already; go on with it by --resume, or choose another --out")
-    if resume and not begun:
-        raise BadInput(f"{out} holds no run to go on with; leave out --resume")
     if wandb is not None:
         with needs_extra("wandb", "--wandb"):
             import_module("wandb")
@@ -88,6 +86,8 @@ def train(
         where = _device(device)
         command = f"mecanum train --config {Path(config).name} --seed {settings.seed}"
         run = make_run(settings, out, workers=who, log=_say, command=command, follow=Follow(wandb), device=where)
+    if resume and not begun:
+        raise BadInput(f"{out} holds no run to go on with; leave out --resume")
     try:
         run.train()
     except KeyboardInterrupt as error:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from agents.frontier_env import ExploreFrontierEnv
 from agents.learned.choice import SIDEWAYS
 from mecanum_env import rooms as room_registry
+from mecanum_env.config import EnvConfig
 from training.learning.config import RehearsalConfig, RoomsConfig, WorldConfig
 from training.learning.hindsight import Hindsight
-from training.learning.jump_world import JumpWorld
+from training.learning.jump_world import JumpWorld, discounted_s
 from training.runs.processes import start_worker
 from training.truth.places import TruePlaces
 
@@ -70,14 +71,20 @@ class Whole(Families):
     """Families of rooms explored in ``ExploreFrontier-v0``.
 
     An episode that ends with nothing left to choose before 95 % are mapped is charged with the time until the
-    limit, as in rehearsals and trials: else to give up would pay.
+    limit, as in rehearsals and trials: else to give up would pay. That time is discounted by ``gamma`` a second,
+    as the environment's own reward is.
     """
+
+    def __init__(self, env: gymnasium.Env[Any, Any], world: RoomsConfig, *, gamma: float = 1.0) -> None:
+        super().__init__(env, world)
+        self._gamma = gamma
 
     def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated and not info["is_success"]:
-            reward += self._world.time_1_s * (self._world.time_limit_s - info["time_s"])
+            left = discounted_s(self._world.time_limit_s - info["time_s"], self._gamma)
+            reward += self._gamma ** info["duration_s"] * self._world.time_1_s * left
         return observation, reward, terminated, truncated, info
 
 
@@ -85,15 +92,15 @@ class Rehearsal(Families):
     """Families of rooms explored in jumps: every other episode, by chance, in a mirror, and the reward shaped.
 
     The shaping is the difference of a potential (Ng, Harada and Russell, ICML 1999), what is still to go by
-    hindsight, 0 at the end, discounted as what follows is, by ``gamma`` a second: what is best to do stays the
-    same, and a choice's part in how long it takes is felt at once.
+    hindsight, 0 at the end, discounted as what follows is: what is best to do stays the same, and a choice's part
+    in how long it takes is felt at once.
     """
 
     env: JumpWorld
 
-    def __init__(self, env: JumpWorld, world: WorldConfig, *, shaping_s_m: float, gamma: float = 1.0) -> None:
+    def __init__(self, env: JumpWorld, world: WorldConfig, *, shaping_s_m: float) -> None:
         super().__init__(env, world)
-        self._shaping, self._gamma, self._mirrored = world.time_1_s * shaping_s_m, gamma, False
+        self._shaping, self._mirrored = world.time_1_s * shaping_s_m, False
         self._places: dict[tuple[str, int], TruePlaces] = {}
 
     def reset(
@@ -110,7 +117,7 @@ class Rehearsal(Families):
         """Step; the reward is shaped by what is still to go."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         before, self._potential = self._potential, 0.0 if terminated else self._worth(observation)
-        shaped = float(reward) + self._gamma ** info["duration_s"] * self._potential - before
+        shaped = float(reward) + self.env.gamma ** info["duration_s"] * self._potential - before
         return self._seen(observation), shaped, terminated, truncated, info
 
     def _seen(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -133,22 +140,24 @@ class Rehearsal(Families):
         return self._hindsight.price_from_here(env.belief)
 
 
-def make_world(world: WorldConfig, index: int = 0) -> Families:
-    """Return environment number ``index`` of a training run."""
+def make_world(world: WorldConfig, index: int = 0, *, gamma: float = 1.0) -> Families:
+    """Return environment number ``index`` of a training run; its reward is discounted by ``gamma`` a second."""
+    config = EnvConfig(time_limit_s=world.time_limit_s)
     env = ExploreFrontierEnv(
         rooms=world.rooms[0], slam=world.slam, noise=world.noises[index % len(world.noises)],
-        driver=dict(world.driver), reward=world.reward, config={"time_limit_s": world.time_limit_s},
+        driver=dict(world.driver), reward=world.reward, config=config, discount=gamma**config.step_s,
     )  # fmt: skip
-    return Whole(env, world)
+    return Whole(env, world, gamma=gamma)
 
 
 def make_rehearsal(world: WorldConfig, rehearsal: RehearsalConfig) -> Rehearsal:
     """Return an environment of a rehearsal: the same families of rooms, explored in jumps."""
     patience = {**world.driver.get("patience", {}), "replan_s": rehearsal.replan_s}
     env = JumpWorld(
-        driver={**world.driver, "patience": patience}, time_limit_s=world.time_limit_s, time_1_s=world.time_1_s
-    )
-    return Rehearsal(env, world, shaping_s_m=rehearsal.shaping_s_m, gamma=rehearsal.gamma)
+        driver={**world.driver, "patience": patience}, time_limit_s=world.time_limit_s, time_1_s=world.time_1_s,
+        gamma=rehearsal.gamma,
+    )  # fmt: skip
+    return Rehearsal(env, world, shaping_s_m=rehearsal.shaping_s_m)
 
 
 def world_of_worker(make: Callable[[], Families]) -> Families:

@@ -17,6 +17,7 @@ from slam.settings import (
     Few,
     Finite,
     NotNegative,
+    PositiveShare,
     Seed,
     SettingError,
     Share,
@@ -99,7 +100,7 @@ class PpoConfig(Config):
     batch_size: Annotated[int, Within("[1, 1000000]")] = 256
     n_epochs: Few = 4
     learning_rate: Share = 3e-4  # falls to nothing
-    gamma: Share = 0.998
+    gamma: PositiveShare = 0.998
     gae_lambda: Share = 0.97
     ent_coef: Annotated[float, Within("[0, 1000]")] = 0.003
     clip_range: Annotated[float, Within("[0, 1000]")] = 0.2
@@ -146,7 +147,7 @@ class RehearsalConfig(PpoConfig):
     batch_size: Annotated[int, Within("[1, 1000000]")] = 512
     n_epochs: Few = 3
     learning_rate: Share = 5e-4
-    gamma: Share = 1.0
+    gamma: PositiveShare = 1.0
     gae_lambda: Share = 0.9
     chunk: Count = 4
     # Seconds that a metre less still to go, by hindsight, counts for; 0: no such reward.
@@ -184,4 +185,10 @@ class TrainConfig(Config):
         require(
             self.width % self.heads == 0,
             f"{type(self).__name__}.width must be a multiple of heads, got {self.width} and {self.heads}",
+        )
+        count, environments = len(self.world.noises), self.ppo.environments
+        require(
+            self.ppo.steps == 0 or environments >= count,
+            f"{type(self).__name__}.ppo.environments must be {count} at least, one for each of world.noises, got "
+            f"{environments}",
         )

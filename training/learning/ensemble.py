@@ -36,13 +36,24 @@ class EnsembleRun(FolderRun):
 
     config: TrainConfig
 
+    def _check_files(self) -> None:
+        """Raise ``ValueError`` where a member cannot go on, before any does."""
+        super()._check_files()
+        for config, folder in self._members():
+            Run(config, folder, workers=1, log=self._log)
+
+    def _members(self) -> list[tuple[TrainConfig, Path]]:
+        """Return the members' configurations and folders."""
+        config = self.config
+        folders = enumerate(_folders(config, self.out))
+        return [(replace(config, members=1, seed=seed_of(config.seed, k)), folder) for k, folder in folders]
+
     def _train(self, pool: Pool) -> None:
-        folders = _folders(self.config, self.out)
+        members = self._members()
         each = max(1, self._workers // self.config.members) if isinstance(self._workers, int) else 1
         with pool.channel() as said:
             futures = []
-            for number, folder in enumerate(folders):
-                config = replace(self.config, members=1, seed=seed_of(self.config.seed, number))
+            for config, folder in members:
                 command = f"{self._progress['command']}: {folder.name}"
                 about = config, folder, command, said, self._follow, self._device, each
                 futures.append(pool.submit(_train_member, *about))
@@ -50,7 +61,7 @@ class EnsembleRun(FolderRun):
                 self._pass_on(said, futures)
         for future in futures:
             future.result()
-        steps = sum(json.loads((folder / "progress.json").read_text())["steps"] for folder in folders)
+        steps = sum(json.loads((folder / "progress.json").read_text())["steps"] for _, folder in members)
         self._keep(steps=steps)
         weights = best_weights(self.config, self.out)
         result = evaluate(weights, self.config.heads, trials_in_full(self.config), pool)

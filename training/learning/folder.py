@@ -33,6 +33,12 @@ __all__ = ["FolderRun", "save_model", "seed_of", "words"]
 
 NOBODY = Follow()
 
+_LEFT = (
+    "checkpoint.zip", "checkpoint.safetensors", "best.zip", "best.safetensors", "curve.jsonl", "maps-*.npz",
+    "control-*.npz", "member-*",
+)  # fmt: skip
+"""What a run leaves in its folder beside its note."""
+
 
 class FolderRun:
     """A training run in a folder: begun there, or gone on with.
@@ -44,7 +50,7 @@ class FolderRun:
     Raises
     ------
     ValueError
-        Where the folder holds a run with another configuration.
+        Where the folder holds a run with another configuration, or one whose files are damaged, or not all there.
     """
 
     seeds_from = 0
@@ -62,11 +68,15 @@ class FolderRun:
             "best_in": "", "wall_s": 0.0, "done": False, "identity": secrets.token_hex(8),
         }  # fmt: skip
         path = out / "progress.json"
-        if path.exists():
-            self._progress |= self._noted(path)
-            self._catch_up()
+        if not path.exists():
+            self._check_empty()
+            return
+        self._progress |= self._noted(path)
         if self._progress["config"] != settings:
             raise ValueError(f"{out} holds a run with another configuration; choose another --out")
+        if not self._progress["done"]:
+            self._catch_up()
+            self._check_files()
 
     def _noted(self, path: Path) -> dict[str, Any]:
         """Return what an earlier process noted; ``ValueError`` where the file says nothing of the kind."""
@@ -77,6 +87,28 @@ class FolderRun:
             if not isinstance(value, kinds.get(name, type(usual))) or (type(usual) is int and value < 0):
                 raise ValueError(f"{path} is damaged: {name} is {quoted(value)}; choose another --out")
         return dict(found)
+
+    def _check_empty(self) -> None:
+        """Raise ``ValueError`` where files of a run would be taken for this one's."""
+        found = sorted(path.name for pattern in _LEFT for path in self.out.glob(pattern))
+        if found:
+            raise ValueError(
+                f"{self.out} holds {found[0]} of a run, but no progress.json; empty it, or choose another --out"
+            )
+
+    def _check_files(self) -> None:
+        """Raise ``ValueError`` where a file that the run goes on from is missing or damaged."""
+        for name in self._needed():
+            path = self.out / name
+            if not path.exists():
+                raise ValueError(f"{path} is missing, and the run goes on from it; choose another --out")
+            if path.suffix == ".npz" and not zipfile.is_zipfile(path):
+                raise ValueError(f"{path} is damaged, and the run goes on from it; choose another --out")
+        _read_curve(self.out / "curve.jsonl")
+
+    def _needed(self) -> list[str]:
+        """Return the names of the files that the run goes on from."""
+        return ["checkpoint.zip"] if self._progress["chunk"] > 0 else []
 
     def _catch_up(self) -> None:
         """Take the last chunk for learned where the run was killed after its checkpoint, before the note of it."""
@@ -147,9 +179,8 @@ class FolderRun:
     ) -> None:
         """Add a trial to the curve; ``save`` the weights, of equals the last, if none in this stage cost less."""
         path = self.out / "curve.jsonl"
-        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
         # A run killed after a trial repeats it: one line of it is enough.
-        kept = [line for line in map(json.loads, lines) if not at.items() <= line.items()]
+        kept = [line for line in _read_curve(path) if not at.items() <= line.items()]
         line = at | result | {"wall_s": time.perf_counter() - self._began}
         atomic_write(path, "".join(json.dumps(each) + "\n" for each in [*kept, line]))
         self._say("evaluation: " + words(at | result))
@@ -167,6 +198,19 @@ class FolderRun:
 
     def _say(self, text: str) -> None:
         self._log(f"{text} [{time.perf_counter() - self._began:.0f} s]")
+
+
+def _read_curve(path: Path) -> list[dict[str, Any]]:
+    """Return a run's evaluations, none where there is no file; ``ValueError`` where a line is none."""
+    found = []
+    for number, line in enumerate(path.read_bytes().splitlines() if path.exists() else [], 1):
+        try:
+            found.append(dict(json.loads(line)))
+        except (ValueError, TypeError) as error:
+            raise ValueError(
+                f"{path} is damaged in line {number}; remove that line, or choose another --out"
+            ) from error
+    return found
 
 
 def seed_of(*numbers: int) -> int:

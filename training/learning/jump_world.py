@@ -29,7 +29,7 @@ from slam.grids.occupancy import OccupancyGrid
 from slam.settings import from_mapping
 from slam.types import Array, Scan
 
-__all__ = ["COVERED", "JumpWorld"]
+__all__ = ["COVERED", "JumpWorld", "discounted_s"]
 
 COVERED = 0.95
 """Coverage that an episode ends at."""
@@ -44,6 +44,11 @@ _ROOM_M = 0.4  # around a place to begin at
 _POSE_COV = np.diag([2.5e-5, 2.5e-5, 1e-6])  # that the planner keeps off walls by; a filter's is about that
 
 
+def discounted_s(time_s: float, gamma: float) -> float:
+    """Return how much a time from now on weighs, discounted by ``gamma`` a second: ∫ γᵗ dt [s]."""
+    return time_s if gamma == 1.0 else (gamma**time_s - 1.0) / math.log(gamma)
+
+
 class JumpWorld(ChoiceEnv):
     """The choices of ``ExploreFrontier-v0``, with jumps from look to look in between.
 
@@ -56,6 +61,8 @@ class JumpWorld(ChoiceEnv):
     time_1_s : float
         Reward of a second. An episode that ends with nothing left to choose before 95 % are mapped is charged with
         the time until the limit.
+    gamma : float
+        Discount of the reward, a second: of what a step adds up, that charge included, as seen from its start.
 
     Notes
     -----
@@ -69,10 +76,11 @@ class JumpWorld(ChoiceEnv):
         driver: ChooserConfig | Mapping[str, Any] | None = None,
         time_limit_s: float = 300.0,
         time_1_s: float = -1.0 / 30.0,
+        gamma: float = 1.0,
     ) -> None:
         config = from_mapping(ChooserConfig, driver)
         super().__init__(replace(config, choice=replace(config.choice, uncertainty=False)))
-        self.time_limit_s, self._time_1_s = time_limit_s, time_1_s
+        self.time_limit_s, self._time_1_s, self.gamma = time_limit_s, time_1_s, gamma
         self.robot, self.lidar = RobotConfig(), LidarConfig()
         self.agent: _Passenger = _Passenger(self.driver, robot=self.robot, lidar=self.lidar)
         self._eye, self._extractor = Lidar(self.lidar, NoiseConfig()), FeatureExtractor()
@@ -120,12 +128,14 @@ class JumpWorld(ChoiceEnv):
             self._choice = self.agent.survey(self.belief)
             if self._choice is not None and len(self._choice.index) > 1:
                 break
-        reward = self._time_1_s * (self.time_s - began)
+        lasted = self.time_s - began
+        reward = self._time_1_s * discounted_s(lasted, self.gamma)
         truncated = self.time_s >= self.time_limit_s and self.covered < COVERED
         terminated = not truncated and (self.covered >= COVERED or self._choice is None)
         if terminated and self.covered < COVERED:
-            reward += self._time_1_s * (self.time_limit_s - self.time_s)
-        return self._observed(), reward, terminated, truncated, self._info(self.time_s - began)
+            left = discounted_s(self.time_limit_s - self.time_s, self.gamma)
+            reward += self.gamma**lasted * self._time_1_s * left
+        return self._observed(), reward, terminated, truncated, self._info(lasted)
 
     @property
     def _over(self) -> bool:

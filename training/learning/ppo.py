@@ -100,6 +100,6 @@ def _stages(config: TrainConfig) -> list[_Stage]:
         makers = [partial(make_rehearsal, world, rehearsal)] * rehearsal.environments
         trials = trials_of(world, unshaped, rehearsal.episodes, {"anywhere": False})
         stages.append(_Stage("rehearsal", rehearsal, 0, rehearsal.every, makers, trials))
-    in_full = [partial(make_world, world, k) for k in range(ppo.environments)]
+    in_full = [partial(make_world, world, k, gamma=ppo.gamma) for k in range(ppo.environments)]
     every = config.evaluation.every
     return [*stages, _Stage("ppo", ppo, rehearsal.chunks, every, in_full, trials_in_full(config))]

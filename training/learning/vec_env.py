@@ -32,13 +32,17 @@ class ExploreVecEnv(VecEnv):
     max_episode_steps : int, optional
         Steps after which an episode is truncated; None where environments see to that themselves.
     **settings
-        Those of ``ExploreVectorEnv``.
+        Those of ``ExploreVectorEnv``, but ``copy``.
     """
 
     def __init__(
         self, n_envs: int, *, seed: int | None = None,
         max_episode_steps: int | None = mecanum_env.MAX_EPISODE_STEPS, **settings: Any,
     ) -> None:  # fmt: skip
+        if not settings.get("copy", True):
+            raise ValueError(
+                "ExploreVecEnv: stable-baselines3 keeps observations for longer than a step; leave out copy=False"
+            )
         self.envs = ExploreVectorEnv(
             n_envs, autoreset_mode=AutoresetMode.SAME_STEP, max_episode_steps=max_episode_steps, **settings
         )
@@ -50,12 +54,12 @@ class ExploreVecEnv(VecEnv):
     def reset(self) -> VecEnvObs:
         """Start an episode in every environment, with the seeds that :meth:`seed` was given, once."""
         options = [given or None for given in self._options]
+        self._reset_options()  # where they are refused, too: else every later reset would be
         if any(given != options[0] for given in options):
             raise ValueError("ExploreVecEnv: reset options must be the same for every environment")
         observations, infos = self.envs.reset(seed=self._seeds, options=options[0])
         self.reset_infos = self._of_each(infos)
         self._reset_seeds()
-        self._reset_options()
         return observations
 
     def step_async(self, actions: NDArray[Any]) -> None:
@@ -111,16 +115,20 @@ class ExploreVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Set an attribute of every environment to the same value."""
-        if len(list(self._get_indices(indices))) != self.num_envs:
-            raise ValueError("ExploreVecEnv: set_attr sets an attribute of every environment: leave out indices")
+        self._check_all("set_attr", indices)
         self.envs.set_attr(attr_name, [value] * self.num_envs)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call a method of every environment; return the results of some."""
+        """Call a method of every environment; return the results."""
+        self._check_all("env_method", indices)
         values = self.envs.call(method_name, *method_args, **method_kwargs)
         return [values[k] for k in self._get_indices(indices)]
+
+    def _check_all(self, method: str, indices: VecEnvIndices) -> None:
+        if set(self._get_indices(indices)) != set(range(self.num_envs)):
+            raise ValueError(f"ExploreVecEnv: {method} is for every environment: leave out indices")
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Tell of some environments whether they are in a wrapper of a class; all are made alike."""

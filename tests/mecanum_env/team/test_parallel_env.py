@@ -34,6 +34,59 @@ def test_stable_baselines3_takes_it_by_supersuit() -> None:
     envs.close()
 
 
+@pytest.mark.parametrize("robots", [1, 2])
+def test_ppo_adds_the_value_of_what_would_follow_where_the_step_limit_cuts(
+    robots: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stable_baselines3 import PPO
+
+    env = mecanum_env.parallel_env(robots=robots, rooms="rectangular", max_steps=4)
+    envs = supersuit.concat_vec_envs_v1(
+        supersuit.pettingzoo_env_to_vec_env_v1(env), 1, base_class="stable_baselines3"
+    )
+    model = PPO("MultiInputPolicy", envs, n_steps=8, batch_size=8, n_epochs=1)
+    asked, predict = [], model.policy.predict_values
+    monkeypatch.setattr(model.policy, "predict_values", lambda seen: (asked.append(1), predict(seen))[1])
+    model.learn(8 * robots)
+    assert len(asked) == 2 * robots + 1  # after each robot's two episodes, and at the end of the rollout
+    envs.close()
+
+
+def test_an_end_is_no_cut() -> None:
+    env = mecanum_env.parallel_env(robots=2, max_steps=3)
+    env.reset(seed=0)
+    still = {name: np.zeros(3, np.float32) for name in env.agents}
+    cut = [env.step(still)[-1]["robot_0"]["TimeLimit.truncated"] for _ in range(3)]
+    assert cut == [False, False, True]
+    env = mecanum_env.parallel_env(robots=2, max_steps=1, config={"coverage_target": 0.01})
+    env.reset(seed=0)
+    assert [info["TimeLimit.truncated"] for info in env.step(still)[-1].values()] == [False, False]
+
+
+def test_copies_of_a_team_that_is_not_seeded_explore_rooms_of_their_own() -> None:
+    env = mecanum_env.parallel_env(robots=2, max_steps=3)
+    robots = supersuit.pettingzoo_env_to_vec_env_v1(env)
+    envs = supersuit.concat_vec_envs_v1(robots, 2, base_class="gymnasium")
+    first, _ = envs.reset()
+    assert not np.array_equal(first["scan"][0], first["scan"][2])
+    for _ in range(3):
+        then, *_ = envs.step(np.zeros((4, 3), np.float32))
+    assert not np.array_equal(then["scan"][0], then["scan"][2])
+    envs.close()
+
+
+def test_supersuit_repeats_actions() -> None:
+    env = supersuit.frame_skip_v0(mecanum_env.parallel_env(robots=2, rooms="rectangular"), (2, 4))
+    times = []
+    for seed in (5, 5):
+        env.reset(seed=seed)
+        for _ in range(4):
+            *_, infos = env.step({name: np.zeros(3, np.float32) for name in env.agents})
+            times.append(infos["robot_0"]["time_s"])
+    assert times[:4] == times[4:]  # how often is drawn from the seed
+    assert 0.8 <= times[3] <= 1.6
+
+
 def test_agents_have_beliefs_goals_and_a_picture() -> None:
     env = mecanum_env.parallel_env(robots=2, render_mode="rgb_array", max_steps=5)
     env.reset(seed=0)

@@ -60,7 +60,7 @@ def _rehearsal(shaping_s_m, rooms="rectangular", gamma=1.0):
 def test_shaping_adds_up_to_what_there_was_to_go_at_the_beginning(gamma):
     """Discounted as PPO discounts: else it would tell what is best to do."""
     totals = []
-    for world in (_rehearsal(0.0), _rehearsal(2.0, gamma=gamma)):
+    for world in (_rehearsal(0.0, gamma=gamma), _rehearsal(2.0, gamma=gamma)):
         world.reset(options={"rooms": "rectangular", "room_seed": 3})
         first = world.price_from_here()
         total, weight, done = 0.0, 1.0, False

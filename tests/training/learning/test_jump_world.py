@@ -12,12 +12,16 @@ from mecanum_env import rooms
 from mecanum_env.config import RobotConfig
 from mecanum_env.rooms.floor_plan import FloorPlan
 from slam.geometry import transform_points
+from training.learning import jump_world
 from training.learning.choice_world import make_rehearsal, make_world, mirrored
 from training.learning.config import RehearsalConfig, WorldConfig
-from training.learning.jump_world import COVERED, JumpWorld
+from training.learning.jump_world import COVERED, JumpWorld, discounted_s
 
 FAMILIES = ["rectangular", "apartment", "corridors", "cave", "maze"]
 WHERE = [CANDIDATE.index(name) for name in ("distance", "ahead", "left", "target_ahead", "target_left")]
+
+
+GAMMA = 0.9
 
 
 def play(world: JumpWorld, plan: FloorPlan, seed: int, **options: object) -> list[tuple]:
@@ -87,6 +91,27 @@ def test_out_of_time_is_cut_off_with_a_choice_before_it():
     observation, _, terminated, truncated, info, _ = trace[-1]
     assert truncated and not terminated and not info["is_success"]
     assert info["time_s"] >= 4.0 and observation["present"].any()
+
+
+def test_the_reward_is_discounted_by_time_within_a_step_as_after_it():
+    plan = rooms.make("apartment", seed=4)
+    whole, less = (play(JumpWorld(time_1_s=-0.5, gamma=gamma), plan, 1) for gamma in (1.0, GAMMA))
+    for (_, alike, *_), (_, reward, _, _, info, _) in list(zip(whole, less, strict=True))[1:]:
+        times = np.arange(0.0, info["duration_s"], 1e-4)
+        assert reward == pytest.approx(-0.5 * (GAMMA**times).sum() * 1e-4, rel=1e-3)
+        assert alike == -0.5 * info["duration_s"]
+
+
+@pytest.mark.parametrize("gamma", [1.0, GAMMA])
+def test_to_give_up_is_worth_as_much_as_to_stay_until_the_limit(monkeypatch, gamma):
+    monkeypatch.setattr(jump_world, "COVERED", 1.1)  # which nobody comes to
+    trace = play(JumpWorld(time_1_s=-0.5, gamma=gamma), rooms.make("rectangular", seed=4), 1)
+    total, weight = 0.0, 1.0
+    for _, reward, _, _, info, _ in trace:
+        total += weight * reward
+        weight *= gamma ** info["duration_s"]
+    assert trace[-1][2] and info["time_s"] < 200.0
+    assert total == pytest.approx(-0.5 * discounted_s(300.0, gamma))
 
 
 def test_the_first_choice_is_the_environments():

@@ -16,9 +16,11 @@ from agents.frontier_env import as_observation, choice_space  # noqa: E402
 from agents.learned import choice_network  # noqa: E402
 from agents.learned.choice import CANDIDATE, STATE, Choice, mirrored  # noqa: E402
 from agents.learned.chooser import ChooserConfig  # noqa: E402
+from slam.settings import from_mapping  # noqa: E402
 from training.learning.choice_world import Whole, make_world  # noqa: E402
-from training.learning.config import WorldConfig  # noqa: E402
+from training.learning.config import TrainConfig, WorldConfig  # noqa: E402
 from training.learning.networks import ChoiceNetwork  # noqa: E402
+from training.learning.ppo import _stages  # noqa: E402
 from training.learning.semi_markov import Durations, SemiMarkovBuffer  # noqa: E402
 
 CONFIG = ChooserConfig()
@@ -184,6 +186,31 @@ def test_giving_up_costs_the_time_until_the_limit(success, truncated, charged):
     world = Whole(_GivenUp(success, truncated), WorldConfig(time_1_s=-0.1, time_limit_s=100.0))
     assert world.step(0)[1] == pytest.approx(charged)
     assert isinstance(make_world(WorldConfig()), Whole)
+
+
+def test_giving_up_is_discounted_as_the_time_that_it_saves():
+    gamma = 0.98
+    world = Whole(_GivenUp(False, False), WorldConfig(time_1_s=-0.1, time_limit_s=100.0), gamma=gamma)
+    times = np.arange(20.0, 100.0, 1e-3)
+    assert world.step(0)[1] == pytest.approx(-2.0 - 0.1 * (gamma**times).sum() * 1e-3, rel=1e-3)
+
+
+def test_the_reward_of_a_choice_is_discounted_by_time():
+    gamma, each_s = 0.9, 0.1
+    world = make_world(WorldConfig(rooms=("rectangular",), time_1_s=-0.1), gamma=gamma)
+    world.reset(seed=3)
+    for _ in range(3):
+        _, reward, *_, info = world.step(0)
+        times = each_s * np.arange(round(info["duration_s"] / each_s))
+        assert reward == pytest.approx(-0.1 * each_s * (gamma**times).sum())
+    assert make_world(WorldConfig()).env.discount == 1.0
+
+
+def test_ppo_learns_where_the_reward_is_discounted_as_it_discounts():
+    config = from_mapping(TrainConfig, {"ppo": {"gamma": 0.9}, "rehearsal": {"gamma": 0.8, "steps": 1}})
+    rehearsal, in_full = _stages(config)
+    assert rehearsal.makers[0]().env.gamma == 0.8
+    assert in_full.makers[0]().env.discount ** 10 == pytest.approx(0.9)
 
 
 def test_a_room_serves_as_many_episodes_as_it_is_told_to():

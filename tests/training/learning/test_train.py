@@ -13,11 +13,12 @@ pytest.importorskip("sb3_contrib")
 import torch
 
 from agents.learned.choice import CANDIDATE, STATE
-from slam.settings import from_mapping
+from slam.settings import from_mapping, to_mapping
 from tests.training.learning.small_runs import REHEARSED, SMALL, Killed, curve, run, same_weights
 from training.cli import main
 from training.cli.train import CONFIGS, _read
 from training.learning.config import TrainConfig
+from training.learning.ensemble import EnsembleRun
 from training.learning.networks import read_zip
 from training.learning.ppo import Run
 
@@ -91,12 +92,45 @@ def test_a_run_killed_between_a_checkpoint_and_its_note_is_the_one_that_was_not(
     assert steps[0] == steps[1] == 48
 
 
-def test_a_checkpoint_that_is_none_is_refused(tmp_path):
+def test_a_run_whose_files_are_damaged_or_missing_is_refused(tmp_path):
     with pytest.raises(Killed):
         run(tmp_path, kill_after="ppo, chunk 1 ", workers=1)
-    (tmp_path / "checkpoint.zip").write_bytes(b"no zip")
-    with pytest.raises(ValueError, match=r"checkpoint\.zip is no checkpoint of a run"):
-        run(tmp_path, workers=1)
+    checkpoint, curve_file = tmp_path / "checkpoint.zip", tmp_path / "curve.jsonl"
+    whole = curve_file.read_bytes()
+    for torn in (b'{"stage": "ppo", "st', b"[1]", b"5", b"\xff"):
+        curve_file.write_bytes(whole + torn)
+        with pytest.raises(ValueError, match=r"curve\.jsonl is damaged in line 2; remove that line, or .* --out$"):
+            run(tmp_path)
+    curve_file.write_bytes(whole)
+    checkpoint.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match=r"checkpoint\.zip is no checkpoint of a run; choose another --out$"):
+        run(tmp_path)
+    checkpoint.unlink()
+    with pytest.raises(ValueError, match=r"checkpoint\.zip is missing, .*; choose another --out$"):
+        run(tmp_path)
+
+
+@pytest.mark.parametrize("left", ["checkpoint.zip", "curve.jsonl", "maps-0.npz", "control-1.npz", "member-1"])
+@pytest.mark.parametrize("resume", [[], ["--resume"]])
+def test_files_of_a_run_without_its_note_are_not_taken_up(tmp_path, capsys, left, resume):
+    (tmp_path / left).write_bytes(b"")
+    assert main(["train", *resume, "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        f"mecanum train: {tmp_path} holds {left} of a run, but no progress.json; empty it, or choose another --out"
+    )
+
+
+def test_a_member_that_cannot_go_on_is_said_before_any_does(tmp_path):
+    config = from_mapping(TrainConfig, SMALL | {"members": 2})
+    out, member = tmp_path / "out", tmp_path / "out" / "member-2"
+    member.mkdir(parents=True)
+    (out / "progress.json").write_text(json.dumps({"config": json.loads(json.dumps(to_mapping(config)))}))
+    (member / "checkpoint.zip").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"member-2 holds checkpoint\.zip of a run, but no progress\.json"):
+        EnsembleRun(config, out, workers=1, log=print)
+    (member / "checkpoint.zip").unlink()
+    EnsembleRun(config, out, workers=1, log=print)
 
 
 @pytest.mark.parametrize("note", ["null", "[]", '"x"', '{"chunk": "a"}', '{"chunk": -3}', '{"wall_s": null}'])
@@ -125,6 +159,9 @@ def test_the_configurations_that_come_with_the_package_are_valid(path):
         (["--config", "{folder}/left.toml"], "leave no single decision of a rollout's 16"),
         (["--config", "{folder}/slam.toml"], "did you mean 'ekf'?"),
         (["--config", "{folder}/driver.toml"], "driver.choice.patch_cells must be a whole number"),
+        (["--config", "{folder}/noises.toml"], "ppo.environments must be 2 at least, one for each"),
+        (["--config", "{folder}/gamma.toml"], "ppo.gamma must be in [1e-6, 1], got 0.0"),
+        (["--config", "{folder}/shares.toml"], "lessons.teacher_shares must have one at least"),
         (["--resume"], "holds no run to go on with"),
     ],
 )
@@ -139,6 +176,10 @@ def test_the_command_says_what_is_wrong(tmp_path, capsys, arguments, message):
     (tmp_path / "left.toml").write_text("[ppo]\nn_steps = 8\nenvironments = 2\nbatch_size = 15")
     (tmp_path / "slam.toml").write_text("[world]\nslam = 'ekff'")
     (tmp_path / "driver.toml").write_text("[world.driver.choice]\npatch_cells = 300")
+    noises = "[world]\nnoises = ['nominal', 'slippery']\n[ppo]\nenvironments = 1"
+    (tmp_path / "noises.toml").write_text(noises)
+    (tmp_path / "gamma.toml").write_text("[ppo]\ngamma = 0.0")
+    (tmp_path / "shares.toml").write_text("policy = 'drive'\n[lessons]\nteacher_shares = []\n[ppo]\nsteps = 0")
     arguments = [a.format(folder=tmp_path) for a in arguments]
     assert main(["train", *arguments, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err

@@ -120,7 +120,7 @@ def test_what_stable_baselines_asks_of_it() -> None:
     envs = ExploreVecEnv(2, workers=1, **SETTINGS)
     envs.reset()
     assert [config.rooms for config in envs.get_attr("config", [1])] == ["rectangular"]
-    assert envs.env_method("episode_metrics", indices=0)[0]["steps"] == 0
+    assert [metrics["steps"] for metrics in envs.env_method("episode_metrics", indices=[1, 0])] == [0, 0]
     assert envs.env_is_wrapped(TimeLimit) == [True, True] and envs.env_is_wrapped(Monitor, [0]) == [False]
     for mark in (3, (4, 5)):
         envs.set_attr("mark", mark)
@@ -130,7 +130,16 @@ def test_what_stable_baselines_asks_of_it() -> None:
     assert callable(envs.get_attr("reset")[0]) and envs.get_attr("_elapsed_steps") == [1, 1]  # nothing was called
     with pytest.raises(ValueError, match="leave out indices"):
         envs.set_attr("mark", 3, indices=[0])
+    with pytest.raises(ValueError, match="env_method is for every environment: leave out indices"):
+        envs.env_method("reset", indices=[0])
+    assert envs.get_attr("_elapsed_steps") == [1, 1]
     envs.set_options([{"room_seed": 1}, {"room_seed": 2}])
     with pytest.raises(ValueError, match="must be the same"):
         envs.reset()
+    envs.reset()
     envs.close()
+
+
+def test_observations_stay_as_they_are() -> None:
+    with pytest.raises(ValueError, match="leave out copy=False"):
+        ExploreVecEnv(2, copy=False, **SETTINGS)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from agents.learned.drive_memory import PlanSettings
 from mecanum_env.config import NOISE_PRESETS
-from slam.settings import Config, Duration, Finite, Gap, Length, OneOf, PositiveShare, Seed, Within
+from slam.settings import Config, Duration, Finite, Gap, Length, OneOf, PositiveShare, Seed, Within, require
 from training.learning.config import EvaluationConfig, PpoConfig, RoomsConfig, check_names
 
 __all__ = ["DriveConfig", "DriveLearningConfig", "DriveLessonsConfig", "DriveWorldConfig"]
@@ -68,6 +68,14 @@ class DriveConfig(Config):
     learning: DriveLearningConfig = field(default_factory=DriveLearningConfig)
     ppo: PpoConfig = field(default_factory=PpoConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(
+            len(self.lessons.teacher_shares) > 0 or self.ppo.steps > 0,
+            f"{type(self).__name__}.lessons.teacher_shares must have one at least where ppo.steps is 0: else "
+            "nothing learns to drive",
+        )
 
     @property
     def planning(self) -> PlanSettings:

@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file, save
 from stable_baselines3.common.vec_env import VecMonitor
 
@@ -51,14 +51,28 @@ class DriveRun(FolderRun):
         checkpoint = self.out / "checkpoint.safetensors"
         if checkpoint.exists():
             weights = load_file(checkpoint)
-            # Killed after the checkpoint, before the note of it, the round is done all the same.
-            self._progress["round"] = max(self._progress["round"], _rounds_of(checkpoint))
             for network in (self._plan, self._control):
                 network.load_state_dict({name: torch.from_numpy(weights[name]) for name in network.state_dict()})
         while self._progress["round"] <= len(self.config.lessons.teacher_shares):
             self._round(self._progress["round"], pool)
         if self.config.ppo.steps > 0:
             self._practise(pool)
+
+    def _catch_up(self) -> None:
+        """Take a round for done, too, where the run was killed after its checkpoint, before the note of it."""
+        super()._catch_up()
+        checkpoint = self.out / "checkpoint.safetensors"
+        if checkpoint.exists():
+            self._progress["round"] = max(self._progress["round"], _rounds_of(checkpoint))
+
+    def _needed(self) -> list[str]:
+        """Return the names of the files that the run goes on from, past lessons where there are rounds to come."""
+        done = self._progress["round"]
+        if done == 0:
+            return super()._needed()
+        past = range(done if done <= len(self.config.lessons.teacher_shares) else 0)
+        lessons = [f"maps-{k}.npz" for k in past] + [f"control-{k}.npz" for k in past[1:]]
+        return ["checkpoint.safetensors", *lessons, *super()._needed()]
 
     @property
     def weights(self) -> Weights:
@@ -179,8 +193,11 @@ def summary(jobs: list[Episode], outcomes: list[Outcome]) -> dict[str, Any]:
 
 def _rounds_of(path: Path) -> int:
     """Return how many rounds a checkpoint's weights have learned from."""
-    with safe_open(path, "numpy") as file:
-        return int((file.metadata() or {}).get("rounds", 0))
+    try:
+        with safe_open(path, "numpy") as file:
+            return int((file.metadata() or {}).get("rounds", 0))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"{path} is no checkpoint of a run; choose another --out") from error
 
 
 def _gathered(paths: Iterable[Path]) -> dict[str, NDArray[Any]]:

@@ -161,8 +161,27 @@ def test_a_run_that_was_killed_and_resumed_is_the_one_that_was_not(tmp_path, mon
     assert [line.get("round", line.get("steps")) for line in lines] == [1, 2, 32]
     with pytest.raises(ValueError, match="another configuration"):
         run(tmp_path / "parts", seed=2)
+    for name in ("maps-0.npz", "maps-1.npz", "control-1.npz"):  # which nothing that is left asks for
+        (tmp_path / "parts" / name).unlink()
+    run(tmp_path / "parts")
     target = tmp_path / "mine.safetensors"
     export_run(tmp_path / "whole", target)
     network, about = load_drive_policy(target)
     assert isinstance(network, DriveNetwork) and len(about["curve"]) == 3
     agents.make("ppo", config={"policy": str(target)})
+
+
+def test_a_run_whose_files_are_damaged_or_not_all_there_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("training.learning.folder.worker_pool", no_workers)
+    with pytest.raises(Killed):
+        run(tmp_path, kill_at="round 1 of 2 done")
+    for name in ("checkpoint.safetensors", "maps-0.npz", "control-1.npz"):
+        path = tmp_path / name
+        whole = path.read_bytes()
+        path.write_bytes(whole[:200])
+        with pytest.raises(ValueError, match=rf"{name} is .*; choose another --out$"):
+            run(tmp_path)
+        path.unlink()
+        with pytest.raises(ValueError, match=rf"{name} is missing, .*; choose another --out$"):
+            run(tmp_path)
+        path.write_bytes(whole)
