@@ -201,7 +201,7 @@ class Explorer(Driver):
         looks = np.array([t.looks - at_last * t.afar if t else 0 for t in troubles], dtype=np.float64)
         cells, costs = view_points(
             cost_map, travel, frontiers.targets, frontiers.normals, range_m=watch.range_m,
-            beyond_m=config.frontiers.beyond_m,
+            beyond_m=config.frontiers.beyond_m, short_m=self._short_m(),
         )  # fmt: skip
         # The farther the way, the more there must be to see.
         worth = frontiers.extents[frontiers.target_labels] >= self._frontier_config.wanted_extent(costs) - 1e-9
@@ -242,6 +242,12 @@ class Explorer(Driver):
             range_m=min(self.config.frontiers.view_range_m, 0.8 * self._lidar.range_max_m, self._dense_m),
             half_view_rad=math.radians(0.5 * self._lidar.field_of_view_deg),
         )
+
+    def _short_m(self) -> float:
+        """Return how far beside a view point the sensor may be when the robot has arrived [m]."""
+        # Who does not see all round faces the target: there the sensor's place ahead brings it nearer.
+        all_round = self._lidar.field_of_view_deg >= 360.0
+        return self.config.control.arrived_m + (abs(self._lidar.offset_m) if all_round else 0.0)
 
     def looked(self, belief: Belief) -> None:
         """Take note that the sensor looked from the belief's pose."""

@@ -20,7 +20,7 @@ import numpy as np
 
 from agents.explorer import Candidates, Explorer, ExplorerConfig
 from agents.view_points.gain import expected_area
-from agents.view_points.sight import first_in_good_sight
+from agents.view_points.sight import first_in_good_sight, reach_m
 from agents.ways.cost_map import CostMap
 from agents.ways.planning import TravelCosts
 from slam.belief import Belief
@@ -30,7 +30,6 @@ from slam.types import Array, Cells, Flags
 __all__ = ["NextBestView", "NextBestViewConfig"]
 
 _SAMPLE_RAYS = 60  # enough to rank places by; six degrees apart
-_NEARER = 0.85  # share of the range of good sight that a place keeps to: the robot stops a little short
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +82,7 @@ class NextBestView(Explorer):
         if not len(live) or self.config.samples == 0:
             return own
         targets = own.cost_map.to_cells(own.frontiers.targets)
-        reach = _NEARER * self._watch_kept().range_m
+        reach = reach_m(self._watch_kept().range_m, self._short_m(), own.cost_map.resolution)
         places = self._places(own.cost_map, own.travel, targets[live], reach)
         cost = own.travel.cost[places[:, 0], places[:, 1]].astype(np.float64)
         worth = self.worth(own.cost_map, places, cost, rays=_SAMPLE_RAYS)

@@ -88,14 +88,17 @@ class PathFollower:
     @config.setter
     def config(self, config: ControlConfig) -> None:
         self._config = config
-        lag_s, braking = self._stopping()
-        # From v·lag + v²/2a: faster than this it could not stop within what the check looks at.
-        ahead = WINDOW_M - self._robot.circumscribed_radius_m
-        self._fastest = math.sqrt((lag_s * braking) ** 2 + 2.0 * braking * max(ahead, 0.1)) - lag_s * braking
         robot, view_deg = self._robot, self._lidar.field_of_view_deg
+        can_m_s2, can_rad_s2 = _motors_can(robot)
+        lag_s = max(config.lag_s, self._step_s + robot.motor_lag_s)
+        braking = min(config.braking_m_s2, can_m_s2)
+        # From v·lag + v²/2a: faster than this it could not stop within what the check looks at.
+        ahead = WINDOW_M - robot.circumscribed_radius_m
+        self._fastest = math.sqrt((lag_s * braking) ** 2 + 2.0 * braking * max(ahead, 0.1)) - lag_s * braking
         as_they_are = {name: getattr(config, name) for name in Pace._fields if hasattr(config, name)}
         self._pace = Pace(**as_they_are | {
             "max_speed_m_s": min(config.speed_share * robot.max_speed_m_s, self._fastest),
+            "deceleration_m_s2": min(config.deceleration_m_s2, can_m_s2),
             "lag_s": lag_s,
             "max_turn_rad_s": min(config.turn_rate_rad_s, robot.max_turn_rate_rad_s),
             "half_length_m": 0.5 * max(robot.length_m, robot.width_m),
@@ -109,8 +112,8 @@ class PathFollower:
         })  # fmt: skip
         self._motors = Motors(
             step_s=self._step_s,
-            acceleration_m_s2=config.acceleration_m_s2,
-            turn_acceleration_rad_s2=config.turn_acceleration_rad_s2,
+            acceleration_m_s2=min(config.acceleration_m_s2, can_m_s2),
+            turn_acceleration_rad_s2=min(config.turn_acceleration_rad_s2, can_rad_s2),
             max_speed_m_s=robot.max_speed_m_s,
             lever_m=robot.lever_m,
         )
@@ -119,7 +122,7 @@ class PathFollower:
             half=self._half,
             lag_s=lag_s,
             braking_m_s2=braking,
-            turn_braking_rad_s2=2.0 * config.turn_acceleration_rad_s2,
+            turn_braking_rad_s2=min(2.0 * config.turn_acceleration_rad_s2, can_rad_s2),
             scan_gap_m=config.scan_gap_m,
         )
 
@@ -127,13 +130,6 @@ class PathFollower:
         """Return what the body takes up to either side of the way [m] where a long side leads, and askew."""
         askew = self.config.align_rad
         return float(self._half.max() * math.cos(askew) + self._half.min() * math.sin(askew))
-
-    def _stopping(self) -> tuple[float, float]:
-        """Return how long a twist is held before braking shows [s], and the deceleration then [m/s²]."""
-        robot = self._robot
-        moved_kg = robot.mass_kg + 4.0 * robot.wheel_inertia_kg_m2 / robot.wheel_radius_m**2
-        motors = 4.0 * robot.motor_torque_nm / (robot.wheel_radius_m * moved_kg)
-        return max(self.config.lag_s, self._step_s + robot.motor_lag_s), min(self.config.braking_m_s2, motors)
 
     def reset(self) -> None:
         """Stand still, with no path."""
@@ -269,3 +265,15 @@ class PathFollower:
         )  # fmt: skip
         self._turn = float(sent[2])
         return np.asarray(sent)
+
+
+def _motors_can(robot: RobotConfig) -> tuple[float, float]:
+    """Return the acceleration that the motors can give along every direction [m/s²], and in turning [rad/s²].
+
+    Along the body's axes all four wheels drive; on a diagonal two do, and give 1/√2 of that.
+    """
+    wheels_kg = 4.0 * robot.wheel_inertia_kg_m2 / robot.wheel_radius_m**2
+    force_n = 4.0 * robot.motor_torque_nm / robot.wheel_radius_m
+    along = force_n / (robot.mass_kg + wheels_kg)
+    turning = force_n * robot.lever_m / (robot.inertia_kg_m2 + wheels_kg * robot.lever_m**2)
+    return along / math.sqrt(2.0), turning

@@ -28,6 +28,7 @@ _SAME_SHARE = 0.2  # of the lidar's reach, within which pieces of frontier may b
 _NARROW_DEG = 90.0  # field of view below which a robot without a way turns round before it gives up
 # Shares of a slow robot's speed: what it moves at least unless it is stuck; what a goal is given time by.
 _STUCK_SHARE, _SLOWEST_SHARE = 0.075, 0.3
+_LEAST_TURN = 0.1  # share of the turn asked for that counts as turned though the robot cannot: it ends then
 _LOOK_S = 1.0  # for so long a robot without a way looks again: a few scans may have lost the beams that show one
 
 
@@ -70,6 +71,7 @@ class Driver(Agent):
         # Of a wedge of free space no cell may be far enough from the unknown to be driven to.
         self._circle_rad = 2.0 * math.pi if self._lidar.field_of_view_deg < _NARROW_DEG else 0.0
         self._to_turn_rad, self._turning = self._circle_rad, False
+        self._turned_to: float | None = None  # heading [rad] at the last step of turning
         # What a short-sighted robot sees beside the piece that it has looked at is another.
         same_m = min(self.config.patience.same_m, _SAME_SHARE * self._lidar.range_max_m)
         self._troubles = Troubles(0.6 * same_m)
@@ -110,6 +112,7 @@ class Driver(Agent):
             self._turning = True
         if self._turning:
             return self._turn(observation, belief)
+        self._turned_to = None
         if self._goal is None:
             if self._status == "unreachable" and self._time < self._had_one_at + _LOOK_S:
                 self._status = "looking"
@@ -168,10 +171,13 @@ class Driver(Agent):
         """Turn on the spot, for a robot that sees little at a time to see what is around it."""
         self._status = "looking"
         self._anchored_at = self._time
-        turn = 0.5 * self._robot.max_turn_rate_rad_s
-        self._to_turn_rad -= turn * self._step_s
+        robot, pose = self._robot, np.array(belief.pose, dtype=np.float64)
+        turn = min(0.5 * robot.max_turn_rate_rad_s, robot.max_speed_m_s / robot.lever_m)
+        heading = float(pose[2])
+        turned = 0.0 if self._turned_to is None else geometry.wrap_scalar(heading - self._turned_to)
+        self._turned_to = heading
+        self._to_turn_rad -= max(turned, _LEAST_TURN * turn * self._step_s)
         self._turning = self._to_turn_rad > 0.0
-        pose = np.array(belief.pose, dtype=np.float64)
         self._goal = Goal(pose=pose, path=pose[None, :2]) if self._turning else None
         return self._to_action(self._follower.drive(np.zeros(2), turn, observation, belief))
 

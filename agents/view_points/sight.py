@@ -21,9 +21,10 @@ from agents.ways.planning import TravelCosts
 from slam.grids.occupancy import FREE, OCCUPIED, UNKNOWN
 from slam.types import Array, Cells, Flags, Floats, Indices
 
-__all__ = ["Track", "Watch", "first_in_good_sight", "in_good_sight", "view_points"]
+__all__ = ["Track", "Watch", "first_in_good_sight", "in_good_sight", "reach_m", "view_points"]
 
 _NEARER = 0.85  # share of the view range that places to look from keep to: the robot stops a little short
+_LEAST_CELLS = 2.0  # that they keep to at least
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,19 +120,42 @@ def first_in_good_sight(
     return np.asarray(_first_seen(cost_map.classes, cells, normals, poses, first, beyond, reach, math.pi))
 
 
+def reach_m(range_m: float, short_m: float, resolution_m: float) -> float:
+    """Return the diameter of the circle that places to look from keep to [m].
+
+    Good sight reaches ``range_m``; the sensor may come to look from ``short_m`` beside the place.
+    """
+    return max(min(_NEARER * range_m, range_m - short_m), _LEAST_CELLS * resolution_m)
+
+
 def view_points(
-    cost_map: CostMap, travel: TravelCosts, targets: Array, normals: Array, *, range_m: float, beyond_m: float
-) -> tuple[Indices, Array]:
+    cost_map: CostMap, travel: TravelCosts, targets: Array, normals: Array, *, range_m: float, beyond_m: float,
+    short_m: float = 0.0,
+) -> tuple[Indices, Array]:  # fmt: skip
     """Return, for each piece of frontier ``(m, 2)`` [m], the cheapest cell that has it in good sight.
 
     Row and column ``(m, 2)``, −1 where there is none, and the cell's travel cost ``(m,)``, there infinite.
 
+    Places keep to :func:`reach_m` of ``range_m`` and ``short_m``; where the body cannot come that near to a piece,
+    to the farther reach of a sensor that comes to look from the place itself.
     Sight lines are walked backwards from a point ``beyond_m`` behind the frontier. Where no reachable cell sees
     that point, one near the frontier that sees the frontier itself will do: it is the last that can be tried.
     A piece whose cost is ``travel.beyond_m`` is seen from no cell that costs less, and from any of the others.
     """
-    reach, beyond = _NEARER * range_m / cost_map.resolution, beyond_m / cost_map.resolution
-    start = cost_map.in_cells(targets)
+    resolution = cost_map.resolution
+    start, beyond = cost_map.in_cells(targets), beyond_m / resolution
+    reach, farther = (reach_m(range_m, short, resolution) / resolution for short in (short_m, 0.0))
+    cells, costs = _cheapest(cost_map, travel, start, normals, reach, beyond)
+    left = np.flatnonzero(np.isinf(costs))
+    if farther > reach and len(left):
+        cells[left], costs[left] = _cheapest(cost_map, travel, start[left], normals[left], farther, beyond)
+    return cells, costs
+
+
+def _cheapest(
+    cost_map: CostMap, travel: TravelCosts, start: Array, normals: Array, reach: float, beyond: float
+) -> tuple[Indices, Array]:
+    """Return what :func:`view_points` does, of one reach; positions ``(m, 2)`` and lengths in cells."""
     cells = np.full((len(start), 2), -1, dtype=np.int64)
     costs = np.full(len(start), np.inf)
     # No way is shorter than the straight line: where that alone is too long, one place is as good as another.

@@ -49,6 +49,7 @@ LEVER_SIGN = (-1.0, 1.0, -1.0, 1.0)
 
 SUBSTEP_S = 1e-3
 """Longest inner step of :func:`turn_wheels` [s]; its error is of this order, its stability is not at stake."""
+_MORE_ROUNDS = 2  # of finding how the wheels grip, where the motors move the slip by more than s₀ in a substep
 
 # The state that the kernels carry: one array, so that a call unpacks one argument.
 POSE = slice(0, 3)
@@ -269,9 +270,10 @@ def turn_wheels(
     """Integrate wheels, motors, traction and body velocity over substeps (docs/reference/robot.md).
 
     Each substep splits into motors, traction and drift. Traction is semi-implicit: with k_i = μ N/√(s_i² + s₀²)
-    frozen at the slip s_i at its start, the forces −k_i s_i are taken at its end, which costs a 3 × 3 solve
-    and makes the substep dissipative whatever its length (the wheels and the body form M q' = −AᵀKA q with K
-    positive semidefinite). Explicit integration would need rates of over 1000/s resolved.
+    frozen at the slip s_i that the motors leave, the forces −k_i s_i are taken at its end, which costs a 3 × 3
+    solve and makes the substep dissipative whatever its length (the wheels and the body form M q' = −AᵀKA q with
+    K positive semidefinite). Explicit integration would need rates of over 1000/s resolved. Motors that are strong
+    for their wheels move the slip by more than s₀ in a substep: then k_i is found again, from the slip at its end.
 
     Parameters
     ----------
@@ -309,6 +311,8 @@ def turn_wheels(
     x, y, angle = 0.0, 0.0, 0.0
     c, s = math.cos(state[2]), math.sin(state[2])
     quarter_h = 0.25 * h / lever
+    kick = m[6] * max(max(r0, r1), max(r2, r3))  # √2 times what the motors move the slip by in a substep, at most
+    more_rounds = _MORE_ROUNDS if 0.5 * kick * kick > s0_squared else 0
     for _ in range(substeps):
         old_vx, old_vy, old_vl = vx, vy, vl
         sum0, sum1, sum2, sum3 = sum0 + w0, sum1 + w1, sum2 + w2, sum3 + w3
@@ -326,6 +330,16 @@ def turn_wheels(
         g2 = grip2 / (math.sqrt(0.5 * q2 * q2 + s0_squared) + give2)
         g3 = grip3 / (math.sqrt(0.5 * q3 * q3 + s0_squared) + give3)
         dvx, dvy, dvl = pull(q0, q1, q2, q3, g0, g1, g2, g3, mass, lever_inertia)
+        for _ in range(more_rounds):
+            e0 = (1.0 - g0 * arm0 * r0) * (q0 + dvx - dvy - dvl)
+            e1 = (1.0 - g1 * arm1 * r1) * (q1 + dvx + dvy + dvl)
+            e2 = (1.0 - g2 * arm2 * r2) * (q2 + dvx + dvy - dvl)
+            e3 = (1.0 - g3 * arm3 * r3) * (q3 + dvx - dvy + dvl)
+            g0 = grip0 / (math.sqrt(0.5 * e0 * e0 + s0_squared) + give0)
+            g1 = grip1 / (math.sqrt(0.5 * e1 * e1 + s0_squared) + give1)
+            g2 = grip2 / (math.sqrt(0.5 * e2 * e2 + s0_squared) + give2)
+            g3 = grip3 / (math.sqrt(0.5 * e3 * e3 + s0_squared) + give3)
+            dvx, dvy, dvl = pull(q0, q1, q2, q3, g0, g1, g2, g3, mass, lever_inertia)
         # J (ω' − ω) = −R f h/√2 with f = −k s': the wheel gains what the ground took from the body.
         w0 += g0 * arm0 * (q0 + dvx - dvy - dvl)
         w1 += g1 * arm1 * (q1 + dvx + dvy + dvl)

@@ -34,22 +34,31 @@ _LASTS_S = 1.0  # how long a robot that slips stays on one patch, or beside it
 
 
 def patch_friction(noise: NoiseConfig) -> float:
-    """Return the mean friction of slippery patches, or the floor's where there are none."""
-    return sum(noise.patch_friction) / 2.0 if noise.patch_share > 0.0 else noise.friction
+    """Return the mean friction of what patches cover, or the floor's where there are none.
+
+    A patch that would grip better than the floor does not: the world takes the lesser friction of both.
+    """
+    if noise.patch_share == 0.0 or slipperiest(noise) == noise.friction:
+        return noise.friction
+    least, most = noise.patch_friction
+    over = max(most - noise.friction, 0.0)
+    return (least + most) / 2.0 - (over**2 / (2.0 * (most - least)) if over > 0.0 else 0.0)
 
 
 def slipperiest(noise: NoiseConfig) -> float:
-    """Return the least friction that patches may have, or the floor's where there are none."""
-    return noise.patch_friction[0] if noise.patch_share > 0.0 else noise.friction
+    """Return the least friction that there may be, that of patches or the floor's."""
+    return min(noise.patch_friction[0], noise.friction) if noise.patch_share > 0.0 else noise.friction
 
 
 def mean_of_slipperiest(noise: NoiseConfig) -> float:
     """Return how far and how long a robot slides on patches in the mean, as a share of the slipperiest one's.
 
-    Both go by 1/μ, and μ is uniform: the mean of a/μ over [a, b] is a ln(b/a) / (b - a).
+    Both go by 1/μ, and μ is uniform, but cut at the floor's F: the mean of a/μ over [a, b] is a ln(b/a) / (b - a)
+    where b ≤ F, a (ln(F/a) + (b - F)/F) / (b - a) where a < F < b, and 1 where patches are as the floor.
     """
     least, most = noise.patch_friction
-    return least * math.log(most / least) / (most - least) if most > least else 1.0
+    cut = min(most, noise.friction)
+    return least * (math.log(cut / least) + (most - cut) / cut) / (most - least) if cut > least else 1.0
 
 
 def grip_m_s2(friction: float) -> float:

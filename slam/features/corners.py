@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit
 
 from slam.features.surfaces import (
@@ -40,6 +41,7 @@ from slam.types import CONCAVE, CONVEX, LINE, Array
 _LOOSE_M = 0.02
 _CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
 _MOST_ON_FACE = 40  # points
+_BACK = 24  # last beams of a surface that may have met its end face
 _SAME = 2.0  # σ along the surface by which a point may be off an end face's others
 
 
@@ -140,11 +142,14 @@ def edge(
     if not found or spacing > limits[EDGE_SPACING] or (t - end) * step < 0.0:
         return 0
     share = limits[EDGE_SIGMA]
-    if on_face == 0:
+    if on_face == 0 and beyond_it:
+        s, along = _likely_end(line, step, ranges, rays, limits)
+        if along == math.inf:
+            return 0
+        s *= step
+    elif on_face == 0:
         s = 0.5 * (t + end)
         along = (share * spacing) ** 2
-        if beyond_it:  # a face's first points pass for the surface's
-            along += 4.0 * limits[SIGMA] ** 2
     elif on_face == 1:
         s = end + step * min(0.5 * mean, mean)
         along = (share * mean) ** 2 + 1.0 / weight + limits[SIGMA] ** 2
@@ -165,6 +170,61 @@ def edge(
         CONVEX, direction, step, corner,
     )  # fmt: skip
     return 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _likely_end(line: Array, step: int, ranges: Array, rays: Array, limits: Array) -> tuple[float, float]:
+    """Return where a surface ends that is seen from beyond, along it towards ``step``, and its variance.
+
+    An end face hardly thicker than the noise shows points that pass for the surface's. So all is weighed that the
+    last beams allow: wherever the end is, the beams that meet the line before it lie on the surface, and others
+    as far along as the end is, up to the first that passes. Any place is as good as another beforehand.
+    """
+    n, sigma = ranges.shape[0], limits[SIGMA]
+    past = math.inf
+    last, first = (int(line[LAST]), int(line[FIRST])) if step == 1 else (int(line[FIRST]), int(line[LAST]))
+    back = min(_BACK, ((last - first) * step) % n)
+    meets, cost = np.empty(_BACK + _MOST_ON_FACE + 2), np.zeros(_BACK + _MOST_ON_FACE + 2)
+    along, weight = np.empty(_BACK + _MOST_ON_FACE + 2), np.empty(_BACK + _MOST_ON_FACE + 2)
+    m = 0
+    for k in range(-back, _MOST_ON_FACE + 1):
+        index = (last + step * k) % n
+        met = _meets(line, rays[index]) * step
+        slide = (-line[NY] * rays[index, 0] + line[NX] * rays[index, 1]) * step
+        reach = ranges[index]
+        if math.isnan(reach):
+            continue
+        px, py = reach * rays[index, 0], reach * rays[index, 1]
+        depth = line[NX] * px + line[NY] * py - line[R]
+        if k > 0 and (reach == math.inf or depth >= limits[EDGE_FACE]):  # it passes
+            past = met
+            break
+        if slide >= 0.0 or reach == math.inf:
+            continue
+        off = depth / (sigma * (line[NX] * rays[index, 0] + line[NY] * rays[index, 1]))
+        meets[m], cost[m + 1] = met, cost[m] + 0.5 * off * off
+        along[m] = (-line[NY] * (px - line[MX]) + line[NX] * (py - line[MY])) * step
+        weight[m] = 1.0 / ((sigma * slide) ** 2 + limits[FLOOR] ** 2)
+        m += 1
+    if m < 2 or past == math.inf:
+        return 0.0, math.inf
+    meets[m] = past
+    total = mean = square = w = b = c = 0.0
+    least = cost[m]
+    # From the last beam on the surface, the end lies between it and the next: first, were all of them on it.
+    for j in range(m, 0, -1):
+        if j < m:
+            w, b, c = w + weight[j], b + weight[j] * along[j], c + weight[j] * along[j] ** 2
+        width = meets[j] - meets[j - 1]
+        if width <= 0.0:
+            continue
+        parts = int(min(4.0 + 2.0 * width * math.sqrt(w), 32.0))
+        for i in range(parts):
+            at = meets[j - 1] + (i + 0.5) / parts * width
+            likely = math.exp(min(least - cost[j] - 0.5 * (w * at * at - 2.0 * b * at + c), 500.0)) * width / parts
+            total, mean, square = total + likely, mean + likely * at, square + likely * at * at
+    mean /= total
+    return mean, max(square / total - mean * mean, 0.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

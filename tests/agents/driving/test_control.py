@@ -8,7 +8,7 @@ import pytest
 from agents.driving.control import ControlConfig, PathFollower
 from agents.driving.safety import Guard, body_gaps, footprint, local_map, scan_points
 from agents.ways.planning import resample
-from mecanum_env.config import LIDAR_PRESETS, LidarConfig, RobotConfig
+from mecanum_env.config import LIDAR_PRESETS, ROBOT_PRESETS, LidarConfig, RobotConfig
 from slam import geometry
 from tests.agents.grids import belief_of, body_gap, drive, fill, room, two_rooms
 
@@ -158,6 +158,31 @@ def test_it_counts_on_no_more_than_the_robot_can():
     speed = fast._pace.max_speed_m_s
     stops_in = speed * fast._guard.lag_s + speed**2 / (2.0 * fast._guard.braking_m_s2)
     assert stops_in == pytest.approx(2.0 - RobotConfig().circumscribed_radius_m)
+
+
+def limits(**body) -> list[float]:
+    """Accelerations and decelerations, along [m/s²] and in turning [rad/s²], that a robot is driven with."""
+    control = PathFollower(ControlConfig(), lidar=LIDAR, step_s=0.1, **body)
+    pace, motors, guard = control._pace, control._motors, control._guard
+    return [
+        motors.acceleration_m_s2, pace.deceleration_m_s2, guard.braking_m_s2,
+        motors.turn_acceleration_rad_s2, guard.turn_braking_rad_s2,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("preset", sorted(ROBOT_PRESETS))
+def test_the_presets_motors_give_all_that_is_asked(preset):
+    assert limits(robot=ROBOT_PRESETS[preset]) == [1.2, 0.8, 1.5, 3.0, 6.0]
+
+
+def test_a_heavy_robot_is_driven_as_its_motors_can():
+    robot = RobotConfig(mass_kg=600.0)
+    wheels_kg = 4.0 * 0.01 / robot.wheel_radius_m**2
+    along = 4.0 * 2.0 / robot.wheel_radius_m / (600.0 + wheels_kg) / math.sqrt(2.0)  # two wheels drive a diagonal
+    lever = robot.lever_m
+    turn = 4.0 * 2.0 * lever / robot.wheel_radius_m / (robot.inertia_kg_m2 + wheels_kg * lever**2)
+    assert along < 0.8 and turn < 3.0
+    assert limits(robot=robot) == pytest.approx([along, along, along, turn, turn])
 
 
 def test_brakes_for_what_only_the_scan_shows():

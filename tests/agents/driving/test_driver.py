@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import agents
-from mecanum_env.config import LidarConfig
+from mecanum_env.config import LidarConfig, RobotConfig
 from mecanum_env.env import ExploreEnv
 from tests.agents.grids import belief_of, half_known
 
@@ -47,3 +47,21 @@ def test_who_sees_a_wedge_turns_round_before_it_gives_up():
         if terminated or idle > 20:
             break
     assert coverage >= 0.95
+
+
+def test_looking_round_counts_what_was_turned():
+    robot = replace(RobotConfig(), max_turn_rate_rad_s=6.0)
+    agent = agents.make("nearest-frontier", robot=robot, lidar=replace(LidarConfig(), field_of_view_deg=30.0))
+    agent.reset(belief_of(half_known(), (1.5, 2.0, 0.0)))
+    agent._turning = True
+
+    def turns(*, heading, by, steps):
+        """Return by how much the turn that is left shrinks while the heading changes by so much a step [rad]."""
+        agent._turned_to, left = None, agent._to_turn_rad
+        for k in range(steps + 1):
+            agent._turn(None, belief_of(half_known(), (1.5, 2.0, heading + k * by)))
+        return left - agent._to_turn_rad
+
+    least = 0.1 * 0.1 * robot.max_speed_m_s / robot.lever_m  # a tenth of what is asked, no more than wheels can
+    assert turns(heading=3.0, by=0.1, steps=5) == pytest.approx(0.5 + least)  # past ±π
+    assert turns(heading=0.0, by=0.0, steps=5) == pytest.approx(6 * least)  # held fast, it ends some time

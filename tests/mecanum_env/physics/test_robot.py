@@ -287,6 +287,31 @@ def test_converges_to_the_equations_of_motion_as_the_substep_shrinks(robot: Robo
     assert np.all(ratios > 1.8), errors
 
 
+@pytest.mark.parametrize(
+    ("changes", "bound"),
+    [
+        ({"motor_torque_nm": 20.0, "motor_gain": 20.0}, 0.002),  # m/s; 0.007 with the grip of the slip before
+        ({"motor_torque_nm": 20.0, "wheel_radius_m": 0.1}, 0.008),  # 0.018
+        ({"motor_torque_nm": 20.0, "motor_gain": 20.0, "wheel_radius_m": 0.1, "mass_kg": 100.0}, 0.03),  # 0.06
+    ],
+)
+def test_motors_strong_for_their_wheels_leave_the_friction_law_as_it_is(
+    changes: dict[str, float], bound: float
+) -> None:
+    """A substep's motors move the slip by several s₀; the body goes as it does with substeps of 20 µs."""
+    robot = dataclasses.replace(RobotConfig(), **changes)
+    rng, errors = np.random.default_rng(1), []
+    for _ in range(8):
+        coarse, fine = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
+        for action in rng.uniform(-1, 1, (4, 3)):
+            targets = WheelTargets(robot).of_twist(action)
+            for _ in range(4):
+                drive(robot, coarse, targets, duration=0.1)
+                drive(robot, fine, targets, duration=0.1, substeps=1000)
+                errors.append((coarse - fine)[TWIST][:2])
+    assert np.sqrt(np.mean(np.square(errors))) < bound
+
+
 @pytest.mark.parametrize("robot", PRESETS)
 @pytest.mark.parametrize(("axis", "share"), [((1, 0), 1 / math.sqrt(2)), ((0, 1), 1 / math.sqrt(2))])
 @pytest.mark.parametrize("mu", [0.15, 0.6])

@@ -14,7 +14,15 @@ from mecanum_env.physics.world import World
 from mecanum_env.sensing.calibration import odometry_noise
 from mecanum_env.sensing.odometry_calibration import open_floor
 from mecanum_env.sensing.sensors import WheelEncoders
-from mecanum_env.sensing.slip import add_up, follow, grip_m_s2, traction_constants
+from mecanum_env.sensing.slip import (
+    add_up,
+    follow,
+    grip_m_s2,
+    mean_of_slipperiest,
+    patch_friction,
+    slipperiest,
+    traction_constants,
+)
 from slam.motion import twist_between
 
 ROBOT = ROBOT_PRESETS["youbot"]
@@ -141,6 +149,25 @@ def test_what_slips_in_jerks_is_taken_out_where_the_floor_is_known(friction: flo
     errors, variances = jerky_errors(replace(NO_OTHER_NOISE, friction=friction), 1)
     assert np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.001
     assert np.all(np.mean(errors**2, axis=0) < 1.6 * variances.mean(axis=0))
+
+
+@given(least=st.floats(0.01, 1.0), wide=st.floats(0.0, 1.0), friction=st.floats(0.05, 2.0))
+def test_a_patch_is_no_slipperier_than_the_world_makes_it(least: float, wide: float, friction: float) -> None:
+    """Where a patch would grip better than the floor, the floor's friction counts: min(F, μ), μ uniform."""
+    noise = NoiseConfig(friction=friction, patch_share=0.3, patch_friction=(least, least + wide))
+    frictions = np.minimum(least + wide * (np.arange(20_000) + 0.5) / 20_000, friction)
+    assert slipperiest(noise) == min(least, friction)
+    assert patch_friction(noise) == pytest.approx(frictions.mean(), rel=1e-6)
+    assert mean_of_slipperiest(noise) == pytest.approx(np.mean(slipperiest(noise) / frictions), rel=1e-5)
+    assert patch_friction(replace(noise, patch_share=0.0)) == friction
+
+
+def test_patches_that_grip_better_than_the_floor_change_nothing() -> None:
+    noise = replace(NO_OTHER_NOISE, friction=0.2, patch_share=0.4, patch_friction=(0.5, 0.8))
+    errors, variances = jerky_errors(noise, 8)
+    assert np.sqrt(np.mean(errors[:, :2] ** 2)) < 0.001
+    np.testing.assert_allclose(errors, jerky_errors(replace(noise, patch_share=0.0), 8)[0], atol=1e-12)
+    assert np.all(variances > 0.0)
 
 
 @pytest.mark.parametrize("patch_share", [0.2, 0.4])

@@ -170,6 +170,15 @@ def test_an_end_is_the_same_from_both_sides_of_a_door(depth: float, from_x: tupl
     assert 0.5 < np.mean(normalised**2) < 1.5
 
 
+@pytest.mark.parametrize(("sigma", "thick"), [(0.03, 0.1), (0.02, 0.07), (0.01, 0.05)])
+def test_an_end_face_that_passes_for_the_wall_does_not_make_it_longer(sigma: float, thick: float) -> None:
+    """From beyond the end of a thin wall: its last points are on the end face, and met past the end."""
+    errors, nees = ends_of_a_wall(sigma, thick=thick, from_x=(4.8, 6.0), ends=(1,))
+    assert len(errors) > 100
+    assert abs(np.mean(errors, axis=0)[0]) < 0.01
+    assert 0.2 < np.mean(nees) / 2 < 1.2
+
+
 def test_a_wall_that_noise_has_split_ends_where_it_ends() -> None:
     """Near a wall some point is far enough off to split it: the end is beyond the piece that is left."""
     along, _ = ends_of(frame_of_a_door(0.1), from_x=(2.0, 2.8))
