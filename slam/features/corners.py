@@ -41,6 +41,7 @@ from slam.types import CONCAVE, CONVEX, LINE, Array
 _LOOSE_M = 0.02
 _CLEAR = 3.0  # σ behind a surface from which on a point is of its end face
 _MOST_ON_FACE = 40  # points
+_NOTHING = 12.0  # by which a log likelihood may lie below the highest
 _BACK = 24  # last beams of a surface that may have met its end face
 _SAME = 2.0  # σ along the surface by which a point may be off an end face's others
 
@@ -210,7 +211,7 @@ def _likely_end(line: Array, step: int, ranges: Array, rays: Array, limits: Arra
         return 0.0, math.inf
     meets[m] = past
     total = mean = square = w = b = c = 0.0
-    least = cost[m]
+    least, top = cost[m], 0.0
     # From the last beam on the surface, the end lies between it and the next: first, were all of them on it.
     for j in range(m, 0, -1):
         if j < m:
@@ -218,6 +219,11 @@ def _likely_end(line: Array, step: int, ranges: Array, rays: Array, limits: Arra
         width = meets[j] - meets[j - 1]
         if width <= 0.0:
             continue
+        at = min(max(b / w, meets[j - 1]), meets[j]) if j < m else past
+        highest = least - cost[j] - 0.5 * (w * at * at - 2.0 * b * at + c)
+        if highest < top - _NOTHING:
+            continue
+        top = max(top, highest)
         parts = int(min(4.0 + 2.0 * width * math.sqrt(w), 32.0))
         for i in range(parts):
             at = meets[j - 1] + (i + 0.5) / parts * width
