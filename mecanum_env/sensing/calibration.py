@@ -32,7 +32,9 @@ def odometry_noise(robot: RobotConfig, noise: NoiseConfig, step_s: float = 0.1) 
     weight 1/4 each, and into ω with 1/(4l). For filters that estimate the lasting part it is told apart.
     ``mecanum study calibration`` measures V on the simulated robot.
     """
-    white, steps = noise.encoder**2 + noise.slip**2 / 3.0, max(_PERSISTENCE_S / step_s, 1.0)
+    # Of the motion p u gets lost, u uniform in [0, 2]; the odometry tells the wheels' times 1 - p.
+    white = noise.encoder**2 + (noise.slip / (1.0 - noise.slip)) ** 2 / 3.0
+    steps = max(_PERSISTENCE_S / step_s, 1.0)
     as_white = steps * (noise.radius_error**2 / 3.0)
     per_wheel = math.sqrt((white + as_white) / 4.0)
     # A wrong lever is a bias in the turn rate, with half of the wheels' squared speed in a turn.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -97,6 +98,16 @@ def test_the_declared_v_is_the_measured_one(preset: str) -> None:
         assert told.speed_share == pytest.approx(found.speed_share, rel=0.2)
         assert told.turn_share_rad_m == pytest.approx(found.turn_share_rad_m, rel=0.2)
     assert all(0.7 < ratio < 1.2 for ratio in drift_ratios(drives, declared))
+
+
+def test_what_slips_at_random_is_a_share_of_the_motion_that_is_left() -> None:
+    """Odometry tells the wheels' motion less the mean slip p: of that, random slip is p / (1 - p), not p.
+
+    Over a window: from one step to the next the body does not follow at once.
+    """
+    noise = dataclasses.replace(NOISE_PRESETS["cavity"], slip=0.3, encoder=0.0, radius_error=0.0, base_error=0.0)
+    drives = drive(ROBOT, noise, episodes=30, steps=120)
+    assert drift_ratios(drives, odometry_noise(ROBOT, noise)) == pytest.approx((1.0, 1.0), abs=0.15)
 
 
 def test_errors_that_last_add_up_over_the_same_time_whatever_the_step() -> None:
