@@ -30,6 +30,7 @@ class Teammate(NamedTuple):
     goal: Array | None = None  # (2,) where it said to go [m], in the belief's frame
     ended: bool = False  # it has told that it stands where it is for good
     heard_s: float = math.inf  # since it was last heard
+    sigma_m: float = 0.0  # of where it told that it is, while starts are known but roughly: 1σ, the worst way
 
 
 @dataclass(frozen=True, slots=True, weakref_slot=True)

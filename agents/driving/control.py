@@ -95,6 +95,8 @@ class PathFollower:
         # From v·lag + v²/2a: faster than this it could not stop within what the check looks at.
         ahead = WINDOW_M - robot.circumscribed_radius_m
         self._fastest = math.sqrt((lag_s * braking) ** 2 + 2.0 * braking * max(ahead, 0.1)) - lag_s * braking
+        fastest = min(self._fastest, robot.max_speed_m_s)
+        self._stop_m = fastest * (lag_s + 0.5 * fastest / braking)  # way to a stand from there, at most
         as_they_are = {name: getattr(config, name) for name in Pace._fields if hasattr(config, name)}
         self._pace = Pace(**as_they_are | {
             "max_speed_m_s": min(config.speed_share * robot.max_speed_m_s, self._fastest),
@@ -248,8 +250,9 @@ class PathFollower:
     def _sides(self, belief: Belief, near: LocalMap) -> Array:
         """Return the lines ``(k, 3)`` that part the body from other robots."""
         return parting_lines(
-            belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s
-        )
+            belief, near, self._half, gap_m=self.config.robot_gap_m, speed_m_s=self._robot.max_speed_m_s,
+            stop_m=self._stop_m,
+        )  # fmt: skip
 
     def _send(
         self, velocity: Array, turn: float, observation: Mapping[str, Any] | None, belief: Belief, near: LocalMap,

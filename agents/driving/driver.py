@@ -147,7 +147,7 @@ class Driver(Agent):
             return False
         travel, cell = found
         path = self._path(cost_map, travel, cell, belief)
-        giving.until_s = now + giving.config.pass_s + float(travel.cost[cell]) / giving.config.speed_m_s
+        giving.until_s = now + giving.config.pass_s + float(travel.cost[cell]) / giving.speed_m_s
         self._goal = Goal(pose=np.array([*path[-1], float(belief.pose[2])]), path=path)
         self._follower.set_path(path, None)
         return True
@@ -245,7 +245,7 @@ class Driver(Agent):
         """Put last for a while what could not be driven to: the longer, the oftener."""
         trouble = self._troubles.note(target)
         trouble.avoid_until_s = self._time + self.config.patience.avoid_s * 2.0**trouble.failures
-        if self._giving_way.nearest(belief, self.config.giving_way.near_m) is None:
+        if self._giving_way.nearest(belief, self._giving_way.near_m) is None:
             trouble.failures += 1  # else it was another robot that stood in the way
 
     def _back_off(self, observation: Mapping[str, Any] | None, belief: Belief) -> Array:

@@ -24,22 +24,28 @@ __all__ = ["parting_lines"]
 
 _NONE = np.zeros((0, 3))
 _OLD_S = 1.5  # what is older says no longer where a robot is
+_SURE = 2.0  # so many σ of where another is believed to be it may be nearer
 _ROUND_M = 0.6  # how far round a corner two robots may be in each other's way
 
 
-def parting_lines(belief: Belief, near: LocalMap, half: Array, *, gap_m: float, speed_m_s: float) -> Array:
+def parting_lines(
+    belief: Belief, near: LocalMap, half: Array, *, gap_m: float, speed_m_s: float, stop_m: float
+) -> Array:
     """Return the lines ``(k, 3)`` that the robot's body must not cross, as rows nx, ny, d: n·p ≤ d.
 
-    In the body frame [m]; one for each robot that is on the map nearby and that no wall keeps away. ``half``
-    ``(2,)`` are half the length and width [m] of all bodies, ``gap_m`` is what the body keeps from the line,
-    ``speed_m_s`` at what speed another may have driven on since it was where it is believed to be.
+    In the body frame [m]; one for each robot that is on the map nearby, or so near that two at full speed might
+    not stop apart, and that no wall keeps away. ``half`` ``(2,)`` are half the length and width [m] of all bodies,
+    ``gap_m`` is what the body keeps from the line, ``speed_m_s`` at what speed another may have driven on since it
+    was where it is believed to be, ``stop_m`` the way that a body takes to come to a stand from full speed.
     """
     if not belief.teammates:
         return _NONE
     x, y, heading = (float(v) for v in belief.pose)
     c, s = math.cos(heading), math.sin(heading)
     rows, cols = near.clearance.shape
-    reach = 0.5 * max(rows, cols) * near.resolution + 0.5
+    # A line that begins later than this would lie where two large bodies can no longer come to a stand.
+    stopping = 2.0 * (math.hypot(half[0], half[1]) + stop_m + gap_m)
+    reach = max(0.5 * max(rows, cols) * near.resolution + 0.5, stopping)
     lines = []
     for mate in belief.teammates:
         dx, dy = float(mate.pose[0]) - x, float(mate.pose[1]) - y
@@ -48,7 +54,8 @@ def parting_lines(belief: Belief, near: LocalMap, half: Array, *, gap_m: float, 
             continue
         ahead, aside = c * dx + s * dy, c * dy - s * dx
         nx, ny, own, free = _parting(half, ahead, aside, float(mate.pose[2]) - heading)
-        lines.append((nx, ny, own + 0.5 * (free - speed_m_s * mate.age_s) - gap_m))
+        free -= speed_m_s * mate.age_s + _SURE * mate.sigma_m
+        lines.append((nx, ny, own + 0.5 * free - gap_m))
     return np.array(lines) if lines else _NONE
 
 

@@ -50,7 +50,7 @@ class Crew:
 
 def muster(
     belief: Belief, found: Candidates, goal: Array | None, left: Flags, *, trust_s: float,
-    range_m: float, beyond_m: float, same_m: float,
+    range_m: float, beyond_m: float, short_m: float, same_m: float,
 ) -> Crew | None:  # fmt: skip
     """Return who is counted on, or ``None`` where this robot is alone or has nowhere to go.
 
@@ -66,7 +66,7 @@ def muster(
         ``(m,)`` which candidates there is something to see at.
     trust_s
         How long after it was last heard or seen another robot is counted on [s], unless it has ended.
-    range_m, beyond_m
+    range_m, beyond_m, short_m
         As in :func:`agents.view_points.sight.view_points`.
     same_m
         A goal nearer than this [m] to the place where a piece is looked at from is that place.
@@ -83,7 +83,9 @@ def muster(
         travel = costs_from(found.cost_map, np.asarray(mate.pose)[:2])
         if travel is None:
             continue
-        cells, costs = view_points(found.cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m)
+        cells, costs = view_points(
+            found.cost_map, travel, targets, normals, range_m=range_m, beyond_m=beyond_m, short_m=short_m
+        )
         ahead = -1
         if mate.goal is not None and np.isfinite(costs).any():
             away = np.hypot(*(found.cost_map.to_points(cells) - mate.goal).T)

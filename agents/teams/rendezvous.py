@@ -26,6 +26,8 @@ from slam.types import Array, Floats
 
 __all__ = ["AppointmentsConfig", "Rendezvous", "RendezvousConfig"]
 
+_SPEED_SHARE = 0.5  # of a slow robot's speed, at which it drives to the meeting, about
+
 
 @dataclass(frozen=True, kw_only=True)
 class AppointmentsConfig(Config):
@@ -33,7 +35,7 @@ class AppointmentsConfig(Config):
 
     every_s: Duration = 60.0  # from the beginning to the first; each interval is twice the one before
     wait_s: Duration = 10.0  # for those that are late
-    speed_m_s: Rate = 0.4  # at which the way there is driven, about
+    speed_m_s: Rate = 0.4  # at which the way there is driven, about, and half a slow robot's speed at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +62,8 @@ class Rendezvous(TeamTour):
         """Return the next view point, or the meeting place when it is time."""
         if self._apart:
             there, cost = self._way_there(belief)
-            if self._time + cost / self.config.appointments.speed_m_s >= self._appointed_s(self._next):
+            speed_m_s = min(self.config.appointments.speed_m_s, _SPEED_SHARE * self._robot.max_speed_m_s)
+            if self._time + cost / speed_m_s >= self._appointed_s(self._next):
                 return self._set_off(there, cost)
         if self._meeting:
             self._target, self._meeting = None, False
@@ -115,7 +118,7 @@ class Rendezvous(TeamTour):
     def _watch(self, belief: Belief) -> None:
         """Take no note of what it sees from the meeting place, nor of standing there."""
         # The others may stand on the very place.
-        if self._meeting and self._follower.remaining_m <= self.config.giving_way.near_m:
+        if self._meeting and self._follower.remaining_m <= self._giving_way.near_m:
             self._anchored_at, self._arrived_for = self._time, 0.0
         else:
             super()._watch(belief)

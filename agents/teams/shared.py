@@ -60,7 +60,7 @@ class Shared(Explorer):
         crew = muster(
             belief, found, None if self._goal is None else self._goal.pose[:2], left,
             trust_s=self._sharing().trust_s, range_m=self._watch_kept().range_m,
-            beyond_m=self.config.frontiers.beyond_m, same_m=patience.same_m,
+            beyond_m=self.config.frontiers.beyond_m, short_m=self._short_m(), same_m=patience.same_m,
         )  # fmt: skip
         if crew is None:
             return found

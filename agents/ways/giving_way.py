@@ -24,6 +24,8 @@ from slam.types import Array, Indices
 __all__ = ["GivingWay", "GivingWayConfig", "costs_from"]
 
 _SLOW_M_S, _SLOW_SHARE = 0.06, 0.12  # that is held up, of a slow robot as a share of its speed
+_SPEED_SHARE = 0.5  # of a slow robot's speed, at which it drives out of the way, about
+_APART_M = 0.6  # between two bodies that hold each other up, at most
 _HEARD_S = 1.0  # ago, at most, that another was heard of whom it is known whether it has a goal
 _STIRRED_M, _STANDS_S = 0.3, 8.0  # one that has moved no farther in so long wants nothing
 _PAST_M = (3.0, 1.5)  # beyond this robot that another wants to get, where there is room
@@ -33,12 +35,13 @@ _PAST_M = (3.0, 1.5)  # beyond this robot that another wants to get, where there
 class GivingWayConfig(Config):
     """When a robot gives way, and for how long."""
 
-    near_m: Length = 1.3  # between centres: nearer than this robots can hold each other up
+    # Between centres, of large robots more, see GivingWay: nearer than this they can hold each other up.
+    near_m: Length = 1.3
     patience_s: Duration = 0.8  # with one that has right of way
     firm_s: Duration = 4.0  # with one that has not
     idle_near_m: Length = 2.0  # one without a goal looks out for others as far as this
     pass_s: Duration = 3.0  # to wait beside the way
-    speed_m_s: Rate = 0.4  # at which it drives there, about
+    speed_m_s: Rate = 0.4  # at which it drives there, about, and half a slow robot's speed at most
     beside_m: Length = 0.1  # between the bodies when one passes, both turned as it likes
     far_m: Length = 15.0  # [weighted m] that a place may be off
     avoid_s: Duration = 10.0  # how long what lies beyond the other is put last
@@ -51,10 +54,18 @@ class GivingWay:
     ----------
     until_s : float
         Until when it is giving way [s].
+    near_m : float
+        Between centres [m]: nearer than this robots of its size can hold each other up.
+    speed_m_s : float
+        At which it drives out of the way, about [m/s].
     """
 
     def __init__(self, config: GivingWayConfig, robot: RobotConfig) -> None:
         self.config, self._radius_m = config, robot.circumscribed_radius_m
+        self.speed_m_s = min(config.speed_m_s, _SPEED_SHARE * robot.max_speed_m_s)
+        # The centres of two bodies of 1.4 m that stand nose to nose are 1.4 m apart.
+        self.near_m = max(config.near_m, 2.0 * self._radius_m + _APART_M)
+        self._idle_near_m = max(config.idle_near_m, self.near_m + config.idle_near_m - config.near_m)
         self._slow_m_s = min(_SLOW_M_S, _SLOW_SHARE * robot.max_speed_m_s)
         self.until_s = -math.inf
         self._held_s = 0.0
@@ -78,7 +89,7 @@ class GivingWay:
         """
         config = self.config
         idle = speed_m_s is None
-        mate = self.nearest(belief, config.idle_near_m if idle else config.near_m)
+        mate = self.nearest(belief, self._idle_near_m if idle else self.near_m)
         silent = mate is not None and self._watch(mate, step_s)
         if mate is None or (idle and mate.goal is None and not silent):
             self._held_s = 0.0

@@ -130,9 +130,9 @@ class Knowledge:
             report, seen = self.heard.get(robot), self._seen.get(robot)
             frame = None if self._frames is None else self._frames.of(robot)
             placed = report is not None and (self._frames is None or frame is not None)
-            goal = None
+            goal, sigma_m = None, 0.0
             if report is not None and placed:
-                pose, when, goal = report.pose, report.time_s, report.goal
+                pose, when, goal, sigma_m = report.pose, report.time_s, report.goal, self._off_m(report, robot)
                 if frame is not None:
                     pose = compose(frame, pose)
                     goal = None if goal is None else transform_points(frame, goal[None])[0]
@@ -144,12 +144,20 @@ class Knowledge:
                 or seen[0] > when
                 or (not self._team.starts_exact and seen[0] >= min(when, time_s - _IN_SIGHT_S))
             ):
-                when, pose = seen
+                (when, pose), sigma_m = seen, 0.0
             elif not placed:
                 continue
             # Copies: reports are everybody's.
             goal = None if goal is None else goal.copy()
             ended = report is not None and report.ended
             heard_s = math.inf if report is None else time_s - report.time_s
-            found.append(Teammate(robot, pose.copy(), time_s - when, goal, ended, heard_s))
+            found.append(Teammate(robot, pose.copy(), time_s - when, goal, ended, heard_s, sigma_m))
         return tuple(found)
+
+    def _off_m(self, report: Report, robot: int) -> float:
+        """Return 1σ of where a robot says that it is [m], of what both know of their starts; 0 where maps tell."""
+        team, frames = self._team, self._frames
+        if not team.known_starts or team.starts_exact or (frames is not None and robot in frames.found):
+            return 0.0
+        both = (self._backend.pose_cov + report.pose_cov)[:2, :2]
+        return math.sqrt(max(float(np.linalg.eigvalsh(both)[-1]), 0.0))

@@ -40,7 +40,8 @@ class AlignmentConfig(Config):
     # them agreed on a wrong place, and never without a quarter of one map's walls in the other's free space.
     fewest: Annotated[tuple[int, int], Within("[1, 1000]")] = (2, 8)
     fewest_without_grids: Annotated[tuple[int, int], Within("[1, 1000]")] = (9, 22)
-    fewest_with_prior: Annotated[tuple[int, int], Within("[1, 1000]")] = (1, 4)
+    # Where to look is known, and walls alone fix a frame: in bare rooms and round ones few corners are matched.
+    fewest_with_prior: Annotated[tuple[int, int], Within("[0, 1000]")] = (0, 4)
     rival_share: NotNegative = 0.6  # of the best one's matches that any other may explain
     rival_m: Gap = 0.5  # farther off than this, or turned by more, it is another one
     rival_rad: Gap = 0.15

@@ -25,16 +25,18 @@ from tests.agents.teams.teams import hall, run, touched
 ROBOT = RobotConfig()
 
 
-def among(belief: Belief, *poses: tuple[float, float, float], age_s: float = 0.0) -> Belief:
-    mates = tuple(Teammate(k + 1, np.array(pose, np.float64), age_s) for k, pose in enumerate(poses))
-    return replace(belief, teammates=mates)
+def among(belief: Belief, *poses: tuple[float, float, float], age_s: float = 0.0, sigma_m: float = 0.0) -> Belief:
+    at = [np.array(pose, np.float64) for pose in poses]
+    return replace(
+        belief, teammates=tuple(Teammate(k + 1, pose, age_s, sigma_m=sigma_m) for k, pose in enumerate(at))
+    )
 
 
 HALF = 0.5 * np.array([ROBOT.length_m, ROBOT.width_m])
 
 
 def lines(belief: Belief) -> np.ndarray:
-    return parting_lines(belief, local_map(belief, 2.0), HALF, gap_m=0.05, speed_m_s=0.8)
+    return parting_lines(belief, local_map(belief, 2.0), HALF, gap_m=0.05, speed_m_s=0.8, stop_m=0.4)
 
 
 def test_the_line_lies_halfway_between_the_bodies_and_turns_with_the_own_one():
@@ -44,15 +46,17 @@ def test_the_line_lies_halfway_between_the_bodies_and_turns_with_the_own_one():
     np.testing.assert_allclose(lines(among(belief, (4.0, 3.0, 0.0))), [[0.0, -1.0, 0.19 + 0.26 - 0.05]], atol=1e-9)
     # What was seen a while ago may have come nearer.
     np.testing.assert_allclose(lines(among(belief, (3.0, 4.0, 0.0), age_s=0.5)), [[1.0, 0.0, 0.3]], atol=1e-9)
+    # Known to 10 cm only, it may stand 20 cm nearer.
+    np.testing.assert_allclose(lines(among(belief, (3.0, 4.0, 0.0), sigma_m=0.1)), [[1.0, 0.0, 0.4]], atol=1e-9)
     assert lines(belief).shape == lines(among(belief, (3.0, 5.9, 0.0))).shape == (0, 3)
 
 
-def gap_between(a: np.ndarray, b: np.ndarray) -> float:
+def gap_between(a: np.ndarray, b: np.ndarray, robot: RobotConfig = ROBOT) -> float:
     """How far [m] the corner or side of one body is from the other, negative where they overlap."""
-    half = 0.5 * np.array([ROBOT.length_m, ROBOT.width_m])
+    half = 0.5 * np.array([robot.length_m, robot.width_m])
     least = np.inf
     for first, second in ((a, b), (b, a)):
-        rim = geometry.transform_points(geometry.compose(geometry.inverse(first), second), footprint(ROBOT, 0.01))
+        rim = geometry.transform_points(geometry.compose(geometry.inverse(first), second), footprint(robot, 0.01))
         out = np.abs(rim) - half
         least = min(least, float(np.where((out > 0).all(axis=1), np.hypot(*out.T), out.max(axis=1)).min()))
     return least
@@ -114,6 +118,28 @@ def test_bodies_that_brake_as_the_check_counts_on_never_touch(away, angles, aims
             poses[k][:2] += step_s * velocity[k]
         sent = np.array(twists)
         assert gap_between(*poses) > 0.0
+
+
+def test_large_bodies_that_drive_at_each_other_come_to_a_stand_too():
+    """Of 2.0 m by 1.6 m, at full speed: each needs 0.7 m to stop. By the lines alone, as above."""
+    large = RobotConfig(
+        length_m=2.0, width_m=1.6, wheelbase_m=1.6, track_m=1.28, wheel_radius_m=0.1, mass_kg=100.0,
+        motor_torque_nm=40.0, motor_gain=40.0, max_speed_m_s=1.2,
+    )  # fmt: skip
+    classes, step_s = room(12.0, 6.0), 0.1
+    poses = [np.array([2.0, 3.0, 0.0]), np.array([10.0, 3.0, math.pi])]
+    each = [PathFollower(BRISK, robot=large, lidar=LidarConfig(), step_s=step_s) for _ in poses]
+    velocity, sent, fastest = np.zeros(2), np.zeros(2), 0.0  # each along its body
+    for _ in range(80):
+        beliefs = [among(belief_of(classes, tuple(poses[k])), tuple(poses[1 - k])) for k in range(2)]
+        wanted = [(poses[1 - k] - poses[k])[:2] for k in range(2)]
+        twists = [each[k].drive(2.0 * wanted[k], 0.0, None, beliefs[k])[0] for k in range(2)]
+        velocity += np.clip(sent - velocity, -0.15, 0.15)
+        for k in range(2):
+            poses[k][0] += step_s * velocity[k] * math.cos(poses[k][2])
+        sent, fastest = np.array(twists), max(fastest, float(velocity.max()))
+        assert gap_between(*poses, large) > 0.0
+    assert fastest > 1.0 and gap_between(*poses, large) < 0.5  # they did drive at each other
 
 
 def drivers(team: Team) -> list[PathFollower]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from agents.teams.rendezvous import Rendezvous
+from mecanum_env.config import RobotConfig
 from slam.belief import Belief, Teammate
 from tests.agents.grids import belief_of, half_known
 
@@ -54,6 +55,21 @@ def test_the_time_between_appointments_doubles():
     for begins, ends in ((60, 90), (180, 210), (420, 450)):
         assert met[begins + 12 : ends - 2].mean() > 0.8  # it has to turn round first, or backs off
         assert not met[ends + 12 : 2 * ends - 20].any()
+
+
+@pytest.mark.parametrize(("max_speed_m_s", "early"), [(0.8, False), (0.15, True)])
+def test_a_slow_robot_leaves_off_in_time_to_be_there(max_speed_m_s, early):
+    """It is 2.5 m off, and at 0.15 m/s has to set off half a minute before: halfway to the appointment."""
+    agent = Rendezvous(
+        {"appointments": {"every_s": 40.0}, "frontiers": {"view_range_m": 1.0}},
+        robot=RobotConfig(max_speed_m_s=max_speed_m_s),
+    )
+    agent.reset(standing(0.0, 0.0))
+    said = []
+    for step in range(210):
+        agent.act(OF_TWO, standing(2.4 + 0.2 * (step % 2), 5.0))
+        said.append(agent.status)
+    assert ("meeting" in said) is early
 
 
 @pytest.mark.parametrize("last", [12, 28, 32, 50])

@@ -68,6 +68,44 @@ def test_who_gives_way_and_when(robot, goal, speed, after_s):
     assert (asked.index(True) + 1 if True in asked else None) == (None if after_s is None else round(10 * after_s))
 
 
+def test_large_robots_hold_each_other_up_though_their_centres_are_far_apart():
+    """Nose to nose, 0.2 m between the bodies."""
+    large = RobotConfig(length_m=1.4, width_m=0.8, wheelbase_m=1.1, track_m=0.6)
+    belief = meeting((5.6, 0.6), (4.0, 0.6), (9.4, 0.6))
+    for speed in (0.0, None):
+        giving = GivingWay(GivingWayConfig(), large)
+        asked = [giving.asked(belief, speed, 0.1) is not None for _ in range(60)]
+        assert asked.index(True) + 1 == 8
+    afar = meeting((6.7, 0.6), (4.0, 0.6), (9.4, 0.6))
+    for speed, reached in ((0.0, False), (None, True)):  # without a goal it looks farther
+        giving = GivingWay(GivingWayConfig(patience_s=0.1), large)
+        assert (giving.asked(afar, speed, 0.1) is not None) is reached
+
+
+def test_robots_of_the_usual_size_look_as_far_as_the_settings_say():
+    for away, speed, asked in ((1.29, 0.0, True), (1.31, 0.0, False), (1.99, None, True), (2.01, None, False)):
+        giving = GivingWay(GivingWayConfig(patience_s=0.1), ROBOT)
+        belief = meeting((4.0 + away, 0.6), (4.0, 0.6), (9.4, 0.6))
+        assert (giving.asked(belief, speed, 0.1) is not None) is asked
+
+
+def test_a_slow_robot_takes_the_time_that_it_needs_to_get_out_of_the_way():
+    belief = meeting((5.0, 0.6), (4.0, 0.6), (9.4, 0.6))
+    lasts_s = []
+    for max_speed_m_s in (0.8, 0.15):
+        agent = Commuter(step_s=0.1, robot=RobotConfig(max_speed_m_s=max_speed_m_s))
+        agent.reset(belief)
+        agent.to = belief.pose[:2]  # it has nothing to do
+        while agent.status != "giving way":
+            assert agent._time < 1.0
+            agent.act(None, belief)
+        lasts_s.append(agent._giving_way.until_s - agent._time)
+        way_m = np.hypot(*np.diff(agent.goal.path, axis=0).T).sum()
+        assert way_m > 2.0  # into the bay
+        assert lasts_s[-1] > 3.0 + way_m / max_speed_m_s
+    assert lasts_s[0] < 12.0
+
+
 @pytest.mark.parametrize(("robot", "speed", "after_s"), [(1, 0.0, 0.8), (0, 0.0, 4.0), (0, None, 0.8)])
 def test_one_that_is_not_heard_is_let_past_as_long_as_it_moves(robot, speed, after_s):
     giving = GivingWay(GivingWayConfig(), ROBOT)

@@ -67,6 +67,26 @@ def test_a_room_that_repeats_is_refused_but_not_with_a_prior() -> None:
     assert found is not None and np.hypot(*(found.pose - frame)[:2]) < 0.1
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_walls_alone_fix_a_frame_where_it_is_known_where_to_look(seed: int) -> None:
+    rng, frame = np.random.default_rng(seed), np.array([2.0, 1.0, 0.5])
+    world = World(rng, points=0, walls=8)
+    a, b = (world.account(k, pose, HERE, rng, sigma=0.01) for k, pose in enumerate((HERE, frame)))
+    rough = np.diag([0.1, 0.1, 0.035]) ** 2
+    found = align(a, b, EXACT, prior=(frame + np.array([0.1, -0.05, 0.03]), rough))
+    assert found is not None and len(found.points) == 0 and found.matches >= 4
+    off = found.pose - frame
+    assert np.hypot(*off[:2]) < 0.1 and off @ np.linalg.solve(found.cov, off) < 16.3  # 99.9 %
+    assert align(a, b, EXACT) is None
+    parallel = World(rng, points=0, walls=8)
+    parallel.walls[:, 0], parallel.walls[:, 1] = 0.3, np.arange(8.0)
+    middle = np.outer(parallel.walls[:, 1], [np.cos(0.3), np.sin(0.3)])
+    along = np.array([-np.sin(0.3), np.cos(0.3)])
+    parallel.ends = np.hstack([middle - along, middle + along])
+    a, b = (parallel.account(k, pose, HERE, rng, sigma=0.01) for k, pose in enumerate((HERE, frame)))
+    assert align(a, b, EXACT, prior=(frame, rough)) is None  # where along them nothing says
+
+
 def test_a_corridor_that_is_the_same_from_both_ends_is_refused() -> None:
     rng = np.random.default_rng(4)
     world = World(rng, points=24, walls=0)
@@ -107,6 +127,8 @@ def test_walls_in_free_space_contradict() -> None:
 def test_settings_are_checked() -> None:
     with pytest.raises(ValueError, match="gate"):
         AlignmentConfig(gate=1.0)
+    with pytest.raises(ValueError, match="fewest_with_prior"):
+        AlignmentConfig(fewest_with_prior=(-1, 4))
 
 
 def test_a_variance_that_rounds_below_zero_is_not_believed_and_warns_of_nothing() -> None:
