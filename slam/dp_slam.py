@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from slam.backend import BackendConfig, SurfaceBackend, found_cov
 from slam.geometry import about_z, compose, inverse, wrap
+from slam.grids.flat_walls import along_walls
 from slam.grids.key_scans import largest_shift
 from slam.grids.scan_matching import MatchConfig, body_points
 from slam.grids.scan_odometry import ScanOdometry, ScanOdometryConfig
@@ -162,12 +163,13 @@ class DpSlam(SurfaceBackend):
         guesses = np.array([compose(pose, motion) for pose in self._poses])
         reach = float(np.sqrt((points * points).sum(axis=1).max(initial=0.0))) + abs(config.lidar_offset_m)
         self.grids.enclose(guesses[:, :2].min(axis=0) - reach, guesses[:, :2].max(axis=0) + reach)
+        matched, _ = along_walls(points, config.matching)
         if self._key:
-            self._draw_poses(guesses, points)
+            self._draw_poses(guesses, matched)
         else:
             self._poses = guesses
         ancestors = self._choose_survivors()
-        self._follow_the_error(points)
+        self._follow_the_error(matched)
         self._odometry.settle()
         for i in np.unique(ancestors):  # the others' maps are forgotten at once
             self._cells.trace(self.grids.lattice, self._poses[i], config.lidar_offset_m, points)

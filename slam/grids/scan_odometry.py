@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slam.geometry import symmetric, transform_points
+from slam.grids.flat_walls import along_walls
 from slam.grids.scan_matching import LikelihoodField, Match, MatchConfig, match, refine
 from slam.motion import OdometryNoise, predict_robot
 from slam.settings import Config, Count, Few, Gap, NotNegative, Positive, Share
@@ -75,16 +76,18 @@ class ScanOdometry:
         """Match a scan's ends ``(n, 2)`` [m, body frame] to the local map; tell whether that was believed."""
         config = self.config
         believed = False
+        matched, drawn = along_walls(points, self.matching)
         if self._field is not None and len(points) >= config.fewest_points:
-            found = self._match(self._field, points)
+            found = self._match(self._field, matched)
             believed = found.score >= config.least_score
             if believed:
                 self.pose, self._upper = found.pose.copy(), found.cov
                 self._claimed = (0.0, 0.0)
         if len(points) >= config.fewest_points and (believed or not self._scans) and self._moved_on():
-            self._keep(points)
-        elif not believed and self._moved_on():
-            self._start_over(points)
+            self._keep(drawn)
+        elif not believed and self._moved_on() and len(points) >= config.fewest_points:
+            self._scans.clear()  # nothing fits any more, the wheels alone were believed for a while
+            self._keep(drawn)
         return believed
 
     def _match(self, field: LikelihoodField, points: Array) -> Match:
@@ -122,13 +125,7 @@ class ScanOdometry:
             self.pose[2] - last[2]
         ) <= math.cos(min(config.spacing_rad, math.pi))
 
-    def _keep(self, points: Array) -> None:
-        self._scans.append((self.pose.copy(), points))
+    def _keep(self, surfaces: Array) -> None:
+        self._scans.append((self.pose.copy(), surfaces))
         seen = [transform_points(pose, ends) for pose, ends in self._scans]
         self._field = LikelihoodField(self.matching, np.vstack(seen))
-
-    def _start_over(self, points: Array) -> None:
-        """Nothing fits any more, the wheels alone were believed for a while: forget the old surroundings."""
-        if len(points) >= self.config.fewest_points:
-            self._scans.clear()
-            self._keep(points)
