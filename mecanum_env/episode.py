@@ -148,14 +148,16 @@ class Truth:
 
 
 def score_map(truth: GroundTruth, belief: Belief) -> metrics.MapScore:
-    """Compare the belief's walls with the true ones, within :data:`WALL_TOLERANCE_M`, or a cell if that is more.
+    """Compare the belief's walls with the true ones, within :data:`WALL_TOLERANCE_M`, or the nearest eight cells.
 
-    What the belief has beyond the true plan's extent counts as wrong as far as ten metres out.
+    Two rasters of one wall at an angle differ by a cell, diagonally, too. What the belief has beyond the true
+    plan's extent counts as wrong as far as ten metres out.
     """
     margin = round(10.0 / truth.resolution)
     true_walls = on_lattice(truth.walls, truth.lattice_origin, truth, margin)
     walls = on_lattice(belief.grid.classes() == OCCUPIED, belief.grid.lattice_origin, truth, margin)
-    return metrics.compare_walls(walls, true_walls, tolerance_cells=max(WALL_TOLERANCE_M / truth.resolution, 1.0))
+    tolerance = max(WALL_TOLERANCE_M / truth.resolution, math.sqrt(2.0))
+    return metrics.compare_walls(walls, true_walls, tolerance_cells=tolerance)
 
 
 def wall_metrics(score: metrics.MapScore) -> dict[str, float | None]:

@@ -99,6 +99,8 @@ def _outline(
     low_y = high_y = y0
     count = 0
     lost = 0
+    while full_circle and lost < min(n, 2) and math.isnan(beams[0, n - 1 - lost]):
+        lost += 1  # a run of them may reach over the seam
     joined = surface.shape[0] == n
     for i in range(n):
         if joined and 0 < i < n - 1 and surface[i] >= 0 and surface[i - 1] == surface[i] == surface[i + 1]:

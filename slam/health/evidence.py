@@ -84,7 +84,7 @@ def _count_beams(
     rows, cols = log_odds.shape
     on_walls, sharp, blurred, in_the_open = 0, 0, 0, 0
     # Beside a cell is 5 cm away, and within it half of that, however fine cells are: beliefs are no finer for it.
-    near = max(1, round(_BESIDE_M / resolution))
+    near = max(1, int(_BESIDE_M / resolution + 0.5 + 1e-9))  # half a cell rounds up, as in cells of 2 cm
     within = (near - 1) // 2
     # Directions of the beams one after the other, each turned on from the one before it.
     c, s = math.cos(theta + angle_min), math.sin(theta + angle_min)

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import math
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from mecanum_env import rooms
-from mecanum_env.config import LidarConfig, RobotConfig
+from mecanum_env.config import EnvConfig, LidarConfig, RobotConfig
 from mecanum_env.episode import score_map
 from mecanum_env.ground_truth import Coverage, GroundTruth, on_lattice
 from mecanum_env.rooms.files.importers import from_raster
@@ -113,3 +115,18 @@ def test_a_perfect_map_scores_one_and_a_shifted_one_less() -> None:
     assert scores[1] > 0.95  # within the tolerance of two cells
     assert scores[2] < 0.7
     assert on_lattice(truth.walls, truth.lattice_origin, truth, 3).shape == (rows + 6, cols + 6)
+
+
+def test_in_coarse_cells_a_wall_at_an_angle_may_be_drawn_a_cell_beside_itself_diagonally() -> None:
+    plan = rooms.make("apartment", seed=1)
+    start = np.array([*plan.start[:2], math.pi / 4.0])
+    truth = GroundTruth(plan, start, robot=RobotConfig(), lidar=LidarConfig(), resolution=0.1)
+    row0, col0 = truth.lattice_origin
+    classes = np.where(truth.walls, OCCUPIED, UNKNOWN).astype(np.int8)
+    coarse = EnvConfig(grid_resolution_m=0.1)
+    env = gym.make("mecanum_env:mecanum_env/Explore-v0", rooms="rectangular", config=coarse)
+    env.reset(seed=0)
+    for shift in (1, -1):
+        moved = OccupancyGrid.from_classes(classes, 0.1, ((col0 + shift) * 0.1, (row0 + 1) * 0.1))
+        env.unwrapped.backend.grid = moved
+        assert score_map(truth, env.unwrapped.belief).iou > 0.99

@@ -310,6 +310,17 @@ def test_no_return_is_free_to_the_maximum_and_a_gap_of_lost_beams_is_unknown() -
     assert not np.any(grid.classes() == OCCUPIED)
 
 
+@pytest.mark.parametrize("lost", [(100, 101, 102), (359, 0, 1), (358, 359, 0), (358, 359, 0, 1)])
+def test_three_lost_beams_in_a_row_are_a_gap_wherever_the_row_lies(lost: tuple[int, ...]) -> None:
+    ranges = np.full(360, 4.0)
+    ranges[list(lost)] = np.nan
+    grid = OccupancyGrid()
+    grid.integrate(np.zeros(3), Scan(ranges, ANGLE_MIN, INCREMENT, 5.0))
+    angle = ANGLE_MIN + lost[1] * INCREMENT
+    middle = np.array([[r * math.cos(angle), r * math.sin(angle)] for r in (2.0, 2.5, 3.0, 3.5)])
+    assert all(grid.classes()[tuple(cell)] != FREE for cell in grid.to_cells(middle))
+
+
 def test_from_classes_round_trips_and_bad_resolution_is_refused() -> None:
     classes = np.random.default_rng(0).choice(np.array([UNKNOWN, FREE, OCCUPIED], np.int8), (37, 51))
     grid = OccupancyGrid.from_classes(classes, 0.05, (-1.0, 2.5))
