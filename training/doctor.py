@@ -125,6 +125,26 @@ def _policies() -> Answers:
     yield {"works": True, "found": f"{', '.join(names)} can be read"}
 
 
+def _own_agents() -> Answers:
+    """Try every agent that another package adds."""
+    import agents
+    from slam.files import plain_name
+
+    for name in agents.names():
+        if agents.entry_point(name).startswith("agents."):
+            continue
+        what, remedy = "", ""
+        try:
+            agents.make(name)
+        except (Exception, SystemExit) as error:  # whatever it is, the others are still to be looked at
+            what, _, remedy = one_line(error).rpartition("; ")
+            if not what.startswith("cannot load agent"):  # in its own words
+                what = f"cannot load agent {name} ({type(error).__name__}: {one_line(error)})"
+                remedy = "mend or uninstall the package that adds it"
+        found = plain_name(what or f"{name} can be loaded", 1000)
+        yield {"works": not what, "found": found, "remedy": remedy}
+
+
 def _disk() -> Answers:
     here = Path.cwd()
     free_mb = shutil.disk_usage(here).free / 1e6
@@ -207,6 +227,7 @@ _CHECKS: tuple[tuple[str, bool, Callable[[], Answers]], ...] = (
     ("numba", True, _numba),
     ("policies", True, _policies),
     ("disk", True, _disk),
+    ("agent", False, _own_agents),
     ("cache", False, _numba_cache),
     ("threads", False, _threads),
     ("browser", False, _browser),

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import agents
+from agents.random import RandomAgent
 from training import doctor
 from training.cli import main
 
@@ -76,6 +78,31 @@ def test_what_breaks_is_a_finding_and_no_traceback(monkeypatch: pytest.MonkeyPat
     needed, other = doctor.examine()
     assert needed.found == "OSError: no way" and needed.remedy and not needed.ok
     assert other.ok and not other.works
+
+
+def test_agents_of_other_packages_that_cannot_be_loaded_are_listed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "that_exits.py").write_text("raise SystemExit(3)")
+    (tmp_path / "that_breaks.py").write_text("raise ValueError('a; b')")
+    monkeypatch.syspath_prepend(tmp_path)
+    points = {
+        "tour": "agents.tour:Tour", "mine": "agents_of_mine:Mine", "random-too": "numpy:nothing",
+        "exits": "that_exits:X", "breaks": "that_breaks:X",
+    }  # fmt: skip
+    monkeypatch.setattr(agents, "_installed", lambda: points)
+    found = list(doctor._own_agents())
+    assert not any(answer["works"] for answer in found) and all(answer["remedy"] for answer in found)
+    said = " ".join(answer["found"] for answer in found)
+    assert "cannot load agent mine (No module named 'agents_of_mine')" in said and "tour" not in said
+    assert "random-too" in said and "load agent exits (SystemExit: 3)" in said
+    assert "load agent breaks (ValueError: a; b)" in said
+    monkeypatch.setattr(agents, "_installed", lambda: {"drunk": "tests.training.test_doctor:Drunk"})
+    assert [(a["works"], a["found"]) for a in doctor._own_agents()] == [(True, "drunk can be loaded")]
+
+
+class Drunk(RandomAgent):
+    """An agent of another package."""
 
 
 def test_the_cache_is_where_numba_says(tmp_path: Path) -> None:

@@ -133,10 +133,10 @@ def _against(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None
     return (
         f"<h3>{name_html(f'Against {baseline}, {where}')}</h3>"
         '<p class="soft">Change of the interquartile mean, of several plans within each, the plans counting the '
-        "same, with its interval, coloured where that excludes no change; below, in what share of the episodes it "
-        "did better, ties counted half, and n, where it is of other episodes than the time: a path is compared "
-        "where both reached 95 %, an error where both have one.</p>"
-        + tables.html(tables.against_table(found, baseline))
+        f"same, with its interval, coloured where that excludes no change and is of at least {tables.FEWEST} "
+        "episodes: of fewer it is too sure. Below, in what share of the episodes it did better, ties counted "
+        "half, and n, where it is of other episodes than the time: a path is compared where both reached 95 %, an "
+        "error where both have one.</p>" + tables.html(tables.against_table(found, baseline))
     )
 
 

@@ -223,7 +223,7 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
         After the tables of the other episodes are written.
     """
     made_by = plan.made_by()
-    keep_settings(out, plan.settings(), FILES)
+    keep_settings(out, plan.settings(), FILES, holds_runs=_holds_rows)
     failures: list[tuple[EpisodeJob, EpisodeFailure]] = []
     with benchmark_store.Store(out / benchmark_store.FILE) as store:
         missing = _missing(plan, store, made_by, out)
@@ -255,6 +255,14 @@ def benchmark(plan: BenchmarkPlan, *, out: Path, workers: Workers) -> Report:
         failed.add_note(first.trace)  # a traceback of this error shows that one, too
         raise failed
     return report
+
+
+def _holds_rows(out: Path) -> bool:
+    path = out / benchmark_store.FILE
+    if not path.exists():
+        return False
+    with benchmark_store.Store(path) as store:
+        return bool(store.made_by())
 
 
 def _missing(

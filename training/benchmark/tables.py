@@ -18,8 +18,8 @@ from training.figures.tables import markdown_name, markdown_table, text_table
 from training.truth.known_map import KNOWN_MAPS
 
 __all__ = [
-    "AGAINST", "BY_KEY", "HEADLINE", "Cell", "Table", "against_table", "change", "figure", "figures_table", "html",
-    "markdown", "overview", "ranked", "shown", "text",
+    "AGAINST", "BY_KEY", "FEWEST", "HEADLINE", "Cell", "Table", "against_table", "change", "figure",
+    "figures_table", "html", "markdown", "overview", "ranked", "shown", "text",
 ]  # fmt: skip
 
 BY_KEY = {metric.key: metric for metric in METRICS}
@@ -143,7 +143,8 @@ def _has(key: str, found: Mapping[str, Intervals]) -> bool:
     return any(not math.isnan(figures.get(key, NONE).value) for figures in found.values())
 
 
-_FEWEST = 10  # episodes: a bootstrap of fewer is too sure
+FEWEST = 10
+"""Episodes that a comparison is coloured from: a bootstrap of fewer is too sure."""
 
 
 def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str | None) -> Table:
@@ -156,7 +157,7 @@ def against_table(found: Mapping[str, Mapping[str, Comparison]], baseline: str |
             notes = [] if math.isnan(share.value) else [_plain(_share(share))]
             notes += [f"n {against[key].n}"] if against[key].n != against[_TIME].n else []
             cell = change(BY_KEY[key], against[key].ratio, ", ".join(notes))
-            cells.append(cell if against[key].n >= _FEWEST else replace(cell, tone=""))
+            cells.append(cell if against[key].n >= FEWEST else replace(cell, tone=""))
         time = against[_TIME]
         rows.append((name, (*cells, _share(time.probability), Cell(str(time.n)))))
     labels = [BY_KEY[key].label for key in AGAINST]

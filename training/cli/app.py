@@ -25,7 +25,7 @@ from training.cli.study import STUDIES, study
 from training.cli.train import train
 from training.runs.errors import BadInput, Interrupted, one_line, suggestion
 from training.runs.options import Command
-from training.runs.signals import INTERRUPTED, TERMINATED, forget_interrupt, heed_sigterm
+from training.runs.signals import INTERRUPTED, TERMINATED, UNWRITTEN, Heard, forget_interrupt, heed_signals
 
 __all__ = ["app", "main"]
 
@@ -89,14 +89,13 @@ app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code; what goes wrong is one line on standard error."""
-    with heed_sigterm() as ended:
-        code = _run(list(sys.argv[1:] if argv is None else argv))
+    with heed_signals() as heard:
+        code = _run(list(sys.argv[1:] if argv is None else argv), heard)
     forget_interrupt()
-    # Amid an import it may come out as any error.
-    return TERMINATED if ended.is_set() and code in (1, INTERRUPTED) else code
+    return TERMINATED if heard.sigterm and code in (1, INTERRUPTED) else code
 
 
-def _run(arguments: list[str]) -> int:
+def _run(arguments: list[str], heard: Heard) -> int:
     name = "mecanum"
     try:
         command = typer.main.get_command(app)
@@ -119,8 +118,10 @@ def _run(arguments: list[str]) -> int:
     except Interrupted as error:
         return _fail(name, str(error), INTERRUPTED)
     except (KeyboardInterrupt, typer.Abort):
-        return _fail(name, "interrupted before the results were written", INTERRUPTED)
+        return _fail(name, UNWRITTEN, INTERRUPTED)
     except Exception as error:
+        if heard.broken_off:  # amid an import it may come out as any error
+            return _fail(name, UNWRITTEN, INTERRUPTED)
         _drop_unwritable_output()
         if os.environ.get(TRACEBACK_VARIABLE) not in (None, "", "0"):
             traceback.print_exc()

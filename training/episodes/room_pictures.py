@@ -9,10 +9,12 @@ import cv2
 
 from mecanum_env import rooms as room_registry
 from mecanum_env.config import ROBOT_PRESETS, RobotConfig, resolve
+from mecanum_env.rooms import FloorPlan
 from mecanum_env.views.plans import contact_sheet, draw_plan
 from slam.formats import atomic_write
 from slam.settings import check_name
-from training.runs.errors import BadInput, bad_input, check_writable
+from training.runs.errors import BadInput, Interrupted, bad_input, check_writable
+from training.runs.signals import interrupt_flag
 from training.runs.typed import LAST_SEED
 
 __all__ = ["draw_rooms", "parse_seeds"]
@@ -53,6 +55,8 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str) -> dict[str, Any
     ------
     BadInput
         For an unknown kind or robot, bad seeds, or a folder that cannot be written to.
+    Interrupted
+        On Ctrl-C; the plans drawn until then stay.
     """
     with bad_input():
         chosen = parse_seeds(seeds)
@@ -60,13 +64,19 @@ def draw_rooms(*, kind: str, seeds: str, out: Path, robot: str) -> dict[str, Any
         body = resolve(RobotConfig, robot, ROBOT_PRESETS, "robot")
         sheet_name = f"{kind}-sheet.png"
         check_writable(out, [sheet_name, *(f"{kind}-{seed}.png" for seed in chosen)])
-        plans = [room_registry.make(kind, seed=seed) for seed in chosen]
     out.mkdir(parents=True, exist_ok=True)
-    files = []
-    for seed, plan in zip(chosen, plans, strict=True):
-        path = out / f"{kind}-{seed}.png"
-        atomic_write(path, cv2.imencode(".png", draw_plan(plan, pixels_per_m=60.0, robot=body))[1].tobytes())
-        files.append(str(path))
+    plans: list[FloorPlan] = []
+    files: list[str] = []
+    with interrupt_flag() as interrupted:
+        for seed in chosen:
+            with bad_input():
+                plans.append(room_registry.make(kind, seed=seed))
+            path = out / f"{kind}-{seed}.png"
+            picture = draw_plan(plans[-1], pixels_per_m=60.0, robot=body)
+            atomic_write(path, cv2.imencode(".png", picture)[1].tobytes())
+            files.append(str(path))
+            if interrupted.is_set():
+                raise Interrupted(f"interrupted after {len(files)} of {len(chosen)} plans, which are in {out}")
     sheet = out / sheet_name
     picture = contact_sheet(plans, _COLUMNS, pixels_per_m=24.0)
     atomic_write(sheet, cv2.imencode(".png", picture)[1].tobytes())

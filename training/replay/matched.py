@@ -8,6 +8,7 @@ backend nor its estimate has a part in it; the search begins at the reference's 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -133,8 +134,9 @@ def start_as_matched(matched: MatchedRelations, reference: Array) -> tuple[Array
 
 
 def nees_with_reference(
-    estimates: Array, covs: Array, reference: Array, start: Array, *, sigma: tuple[float, float], of: int
-) -> Array:
+    estimates: Array, covs: Array, reference: Array, start: Array, *, sigma: tuple[float, float], of: int,
+    form: Callable[[Array, Array, Array], float] = nees_pose,
+) -> Array:  # fmt: skip
     """Return the NEES ``(n,)`` of poses against a reference that errs itself.
 
     Parameters
@@ -146,6 +148,9 @@ def nees_with_reference(
         there, and turn about it.
     sigma, of
         1σ of a reference pose [m], [rad], and of how many such poses the start is the median.
+    form
+        The NEES of a pose, its covariance and the true pose, in the error that the covariances speak of. Either of
+        :mod:`slam.metrics.measures` is the same wherever the estimates are moved.
     """
     move = compose(start, inverse(estimates[0]))
     own = np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
@@ -156,5 +161,5 @@ def nees_with_reference(
         pose = compose(move, estimate)
         x, y = (pose[:2] - start[:2]).tolist()
         lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        out[k] = float(nees_pose(pose, turn @ cov @ turn.T + lever @ first @ lever.T + own, reference[k]))
+        out[k] = float(form(pose, turn @ cov @ turn.T + lever @ first @ lever.T + own, reference[k]))
     return out

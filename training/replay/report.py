@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -145,38 +145,50 @@ def _at(times: Array, stamps: Array, poses: Array) -> Array:
 
 
 def summary(found: Mapping[str, Any], out: Path, files: Sequence[str]) -> str:
-    """Return what is printed at the end, where no JSON is wanted."""
+    """Return what is printed at the end, where no JSON is wanted; what is not known is left out."""
 
     def shown(key: str, unit: str, digits: int = 2) -> str:
         return "-" if found[key] is None else f"{found[key]:.{digits}f} {unit}".rstrip()
 
     speed = f"{found['wall_s']:.1f} s, {found['realtime_factor']:.0f} times real time"
-    scan_rows: list[tuple[str, str]] = []
-    nees_rows: list[tuple[str, str]] = []
     sensed = f"{found['observations']} observations"
     if "scans" in found:
         sensed = f"{found['scans']} scans, {shown('ms_per_scan', 'ms each')} in the median"
-    if found.get("relations_count"):
-        error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
-        local = shown("relations_local_trans_m", "m", 3)
-        scan_rows.append(("relations", f"{found['relations_of']}: {error}, {local} along the way"))
-        online = shown("online_relations_trans_m", "m", 3)
-        scan_rows.append(("", f"online: {online}, of the poses believed at the time"))
-        own, other = (shown(f"matched_relations{kind}_trans_m", "m", 3) for kind in ("", "_reference"))
-        count = found["matched_relations_count"]
-        scan_rows.append(("matched", f"{own} off the {count} that scans bear witness to; the reference {other}"))
+    known: list[tuple[str, str]] = [("trajectory", "no reference")]
+    if found["ate_rmse_m"] is not None:
+        known = [
+            ("trajectory", f"{shown('ate_rmse_m', 'm')} off, {shown('ate_aligned_m', 'm')} aligned"),
+            ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
+        ]
+    surveyed = "" if found["landmark_rmse_m"] is None else f", {shown('landmark_rmse_m', 'm')} off"
+    nees = [] if found["anees"] is None else [("NEES / 3", shown("anees", ""))]
+    if found.get("anees_reference") is not None:
         own, other = shown("anees_reference", ""), shown("anees_reference_matched", "")
-        nees_rows.append(("", f"{own} with the reference's own error; {other} from the start that scans have"))
+        nees.append(("", f"{own} with the reference's own error; {other} from the start that scans have"))
     rows = (
         ("replayed", f"{found['log']} with {found['slam']}, {found['association']} association"),
         ("ended", f"{found['end']} after {found['duration_s']:.1f} s, {sensed}"),
-        ("trajectory", f"{shown('ate_rmse_m', 'm')} off, {shown('ate_aligned_m', 'm')} aligned"),
-        ("odometry", f"{shown('dead_reckoning_ate_m', 'm')} off by dead reckoning alone"),
-        ("landmarks", f"{found['landmarks']}, {shown('landmark_rmse_m', 'm')} off"),
-        ("NEES / 3", shown("anees", "")),
-        *nees_rows,
-        *scan_rows,
+        *known,
+        ("landmarks", f"{found['landmarks']}{surveyed}"),
+        *nees,
+        *_of_relations(found, shown),
         ("took", speed),
         ("files", f"{out}/: {', '.join(files)}"),
     )
     return "\n".join(f"{name:<12} {plain_name(text, 1000)}" for name, text in rows)
+
+
+def _of_relations(found: Mapping[str, Any], shown: Callable[..., str]) -> list[tuple[str, str]]:
+    if not found.get("relations_count"):
+        return []
+    error = f"{shown('relations_trans_m', 'm', 3)} ± {shown('relations_trans_std_m', 'm', 3)} off"
+    local = shown("relations_local_trans_m", "m", 3)
+    online = shown("online_relations_trans_m", "m", 3)
+    rows = [
+        ("relations", f"{found['relations_of']}: {error}, {local} along the way"),
+        ("", f"online: {online}, of the poses believed at the time"),
+    ]
+    if count := found["matched_relations_count"]:
+        own, other = (shown(f"matched_relations{kind}_trans_m", "m", 3) for kind in ("", "_reference"))
+        rows.append(("matched", f"{own} off the {count} that scans bear witness to; the reference {other}"))
+    return rows

@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from slam.dead_reckoning import OdometrySlam
+from slam.invariant import InvariantEkfSlam
 from slam.logs import ScanLog
-from slam.metrics.measures import anees
+from slam.metrics.measures import anees, nees_pose, nees_pose_invariant
 from slam.metrics.relations import RelationScore, closing_relations, local_relations, relation_score
 from slam.types import Array
 from training.replay.matched import (
@@ -22,6 +24,9 @@ from training.replay.matched import (
 from training.replay.run import Replay
 
 __all__ = ["scan_metrics"]
+
+_INVARIANT = InvariantEkfSlam, OdometrySlam
+"""Backends whose covariance is that of the invariant error."""
 
 _KINDS = ("", "local_", "closing_")  # all relations; those along the way; those between visits of one place
 
@@ -83,8 +88,10 @@ def _with_reference(
     online, covs = np.array(replay.estimates)[compared], np.array(replay.covs)[compared]
     start, of = start_as_matched(matched, true)
     starts = ((true[0], 1), (start, of))
+    # That of the backends' own ``pose_nees``.
+    form = nees_pose_invariant if isinstance(replay.backend, _INVARIANT) else nees_pose
     values = [
-        float(anees(nees_with_reference(online, covs, true, pose, sigma=sigma, of=count)))
+        float(anees(nees_with_reference(online, covs, true, pose, sigma=sigma, of=count, form=form)))
         for pose, count in starts
     ]
     return dict(zip(names, (*sigma, *values), strict=True))

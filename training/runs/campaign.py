@@ -84,10 +84,20 @@ def _digest(path: Path) -> str:
     return short_digest(each.read_bytes() for each in files)
 
 
-def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) -> None:
+def _holds_anything(out: Path) -> bool:
+    """Whether a folder has more than its settings and stores without a row."""
+    files = (path for path in out.iterdir() if path.name != SETTINGS)
+    return any(not path.is_file() or path.stat().st_size for path in files)
+
+
+def keep_settings(
+    out: Path, settings: Mapping[str, Any], files: Iterable[str], *,
+    holds_runs: Callable[[Path], bool] = _holds_anything,
+) -> None:  # fmt: skip
     """Make a folder, and note in it what its runs are made with.
 
-    Refused, with nothing written, is one that is not to be written to, or holds runs of other settings.
+    Refused, with nothing written, is one that is not to be written to, or holds runs of other settings. One that
+    was begun in, and has no run yet, takes the new ones.
 
     Raises
     ------
@@ -101,6 +111,8 @@ def keep_settings(out: Path, settings: Mapping[str, Any], files: Iterable[str]) 
         before = read_json(path, nan=True) if path.exists() else now
     except ValueError as error:
         raise BadInput(f"{error}; choose another --out, or remove that one") from error
+    if before != now and not holds_runs(out):
+        before = now
     if isinstance(before, dict) and isinstance(kept := before.get(_OWN, {}), dict) and (kept or _OWN in now):
         # Agents and backends may be added to those that are there.
         asked = now.get(_OWN, {})

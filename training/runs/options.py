@@ -79,7 +79,8 @@ Workers = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes.  
 class Command(TyperCommand):
     """A command that says when kernels compile, takes ``--ray`` without an address, and repeats what was wrong.
 
-    Typer offers none of it; and to the bounds of some of its versions NaN is neither too small nor too large.
+    Typer offers none of it; to the bounds of some of its versions NaN is neither too small nor too large, and no
+    name at all is the current folder.
     """
 
     def invoke(self, ctx: Any) -> Any:
@@ -104,6 +105,8 @@ class Command(TyperCommand):
             raise
         option: Any
         for option in self.params:
+            if isinstance(ctx.params.get(option.name or ""), Path) and _given(words, option) == repr(""):
+                raise typer.BadParameter("it is empty; give a name.", ctx=ctx, param=option)
             given = ctx.params.get(option.name or "")
             if isinstance(given, float) and not math.isfinite(given):
                 raise typer.BadParameter(f"{given} is no number.", ctx=ctx, param=option)

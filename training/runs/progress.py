@@ -6,13 +6,15 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from training.runs.compiling import compiled_s
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
 __all__ = ["Progress"]
 
 _BAR_EVERY_S, _LOG_EVERY_S = 0.1, 30.0
-_SOON_S = 1.0  # before that nobody knows how long the rest will take
+_SOON_S, _SOON = 1.0, 0.02  # before that time, and that share, nobody knows how long the rest will take
 
 
 class Progress:
@@ -25,12 +27,14 @@ class Progress:
     total : float
         What ``done`` comes to.
     eta : bool
-        Whether to say how long the rest will take, as long as what is done took.
+        Whether to say how long the rest will take: in proportion as long as what is done took, but for the
+        kernels that were compiled.
     """
 
     def __init__(self, what: str, total: float, *, eta: bool = True) -> None:
         self._what, self._total, self._eta = what, total, eta
         self._began = self._next = time.monotonic()
+        self._compiled_s = compiled_s()
         self._bar = _bar(what, total) if sys.stderr.isatty() else None
 
     def __enter__(self) -> Progress:
@@ -45,7 +49,7 @@ class Progress:
         now = time.monotonic()
         if now < self._next and done < self._total:
             return
-        left = self._left(done, now - self._began)
+        left = self._left(done, now - self._began - (compiled_s() - self._compiled_s))
         if self._bar is not None:
             self._next = now + _BAR_EVERY_S
             self._bar.update(self._bar.task_ids[0], completed=done, text=f"{text}{left}")
@@ -54,7 +58,7 @@ class Progress:
             print(f"{self._what}: {text}{left}", file=sys.stderr, flush=True)
 
     def _left(self, done: float, passed_s: float) -> str:
-        if not (self._eta and passed_s >= _SOON_S and 0 < done < self._total):
+        if not (self._eta and passed_s >= _SOON_S and _SOON * self._total <= done < self._total):
             return ""
         seconds = passed_s * (self._total / done - 1.0)
         return f", about {seconds:.0f} s left" if seconds < 100 else f", about {seconds / 60:.0f} min left"

@@ -76,6 +76,7 @@ def test_the_page_is_whole_and_needs_nothing_else(tmp_path: Path) -> None:
     assert "<b>" not in re.sub(r"<b>(rectangular, )?seed \d+</b>", "", text)  # names are text
     assert parsed.tags.count("svg") == 6 and parsed.tags.count("figure") == 24
     assert "prefers-color-scheme: dark" in text and "width=device-width" in text
+    assert "is of at least 10 episodes: of fewer" in text  # the four here have no colour
     assert "all nominal suites together" in text and "all slippery" not in text  # of which there is but one
 
 

@@ -11,10 +11,12 @@ from typing import Any
 
 import pytest
 
-from tests.training.benchmark.small import episode, without_clock
+from tests.training.benchmark.small import count, episode, small, without_clock
+from training.benchmark import run as benchmark
 from training.benchmark.episode import EpisodeJob
 from training.benchmark.store import FILE, Store
-from training.runs.errors import BadInput
+from training.cli import main
+from training.runs.errors import BadInput, Interrupted
 from training.studies.reliability.files import results
 
 JOB = EpisodeJob(suite="rooms", place="rectangular", seed=1, agent="a", slam="ekf", noise="nominal")
@@ -110,3 +112,17 @@ def test_what_is_beyond_all_bounds_is_null(tmp_path: Path) -> None:
         store.add(JOB, episode(JOB.key, anees=1e20), made_by="x")
         ((_, row),) = store.rows([JOB.key])
     assert row.metrics["anees"] is None and row.metrics["coverage"] == 0.99
+
+
+@pytest.mark.usefixtures("here")
+def test_a_folder_without_an_episode_yet_takes_other_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: Any, **__: Any) -> None:
+        raise Interrupted("interrupted after 0 of 3 episodes")
+
+    monkeypatch.setattr(benchmark, "run_all", interrupted)
+    assert main(small(tmp_path)) == 130
+    assert main(small(tmp_path, "--max-steps", "30")) == 130
+    assert "0 of 3" in capsys.readouterr().err and count(tmp_path) == 0
+    assert '"max_steps": 30' in (tmp_path / "settings.json").read_text("utf-8")

@@ -181,6 +181,23 @@ def test_an_out_that_cannot_be_written_to(
     assert in_the_way.read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["explore", "--out", ""], ["explore", "--out="], ["rooms", "--out", ""], ["consistency", "--out="],
+        ["explore", "--config", ""], ["study", "worlds", "--out", ""],
+    ],
+)  # fmt: skip
+def test_no_name_at_all_is_not_the_current_folder(
+    argv: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = refused(argv, capsys)
+    option = next(word for word in argv if word.startswith("--")).rstrip("=")
+    assert f"'{option}': it is empty; give a name" in line
+    assert not any(tmp_path.iterdir())
+
+
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no /proc")
 def test_a_place_that_takes_no_files_is_found_before_anything_is_done(capsys: pytest.CaptureFixture[str]) -> None:
     """Root may write anywhere by what permissions say."""

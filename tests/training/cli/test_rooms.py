@@ -1,12 +1,15 @@
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
 
 from training.cli import main
+from training.episodes import room_pictures
 from training.episodes.room_pictures import parse_seeds
 
 
@@ -43,3 +46,19 @@ def test_rooms_are_drawn_one_by_one_and_together(tmp_path: Path, capsys: pytest.
     assert main(["rooms", "--kind", "rectangular", "--seeds", "5", "--out", str(out)]) == 0
     assert Path(drawn["files"][2]).read_bytes() == before
     assert "1 plans" in capsys.readouterr().out
+
+
+def test_ctrl_c_keeps_the_plans_that_are_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make = room_pictures.room_registry.make
+
+    def pressed(kind: str, *, seed: int) -> Any:
+        if seed == 1:
+            signal.raise_signal(signal.SIGINT)
+        return make(kind, seed=seed)
+
+    monkeypatch.setattr(room_pictures.room_registry, "make", pressed)
+    assert main(["rooms", "--kind", "rectangular", "--seeds", "0:9", "--out", str(tmp_path)]) == 130
+    assert f"interrupted after 2 of 10 plans, which are in {tmp_path}" in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["rectangular-0.png", "rectangular-1.png"]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from slam.geometry import compose
 from slam.logs import ScanLog, open_log
+from slam.metrics.measures import nees_pose, nees_pose_invariant
 from slam.metrics.relations import local_relations
 from tests.slam.logs.scans_on_disk import carmen_lines, drive, put_lines
 from training.replay.matched import (
@@ -60,3 +63,16 @@ def test_nees_owns_to_the_reference_at_both_ends() -> None:
         sigma = float(SIGMA[0]), float(SIGMA[2])
         values.append(nees_with_reference(estimates, covs, reference, reference[0], sigma=sigma, of=1)[1:] / 3)
     assert np.mean(values) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("form", [nees_pose, nees_pose_invariant])
+def test_what_the_reference_errs_makes_no_nees_larger(form: Callable[..., float]) -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        estimate, reference = rng.normal(size=3), rng.normal(size=3)
+        cov, first = np.cov(rng.normal(size=(3, 9))), np.zeros(3)
+        with_own = nees_with_reference(
+            np.array([first, estimate]), np.array([cov, cov]), np.array([first, reference]), first,
+            sigma=(0.1, 0.05), of=1, form=form,
+        )  # fmt: skip
+        assert with_own[1] <= form(estimate, cov, reference)

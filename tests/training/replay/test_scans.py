@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import tomllib
 from pathlib import Path
@@ -75,6 +76,22 @@ def test_without_a_reference(logs: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert found["scans"] == 20 and found["samples"] == 0 and found["association"] == "unknown"
     assert found["ate_rmse_m"] is None and found["relations_trans_m"] is None and found["relations_count"] == 0
     assert "no reference" in found["note"]
+    shown = replay_report.summary(found, tmp_path, []).splitlines()
+    assert [line[:12].strip() for line in shown] == [
+        "replayed", "ended", "trajectory", "landmarks", "took", "files",
+    ]  # fmt: skip
+    assert shown[2].split(maxsplit=1)[1] == "no reference" and re.fullmatch(r"landmarks +\d+", shown[3])
+
+
+@pytest.mark.parametrize("name", ["odometry", "ekf"])
+def test_the_nees_with_an_exact_reference_is_the_backends_own(name: str, logs: Path, tmp_path: Path) -> None:
+    """A reference without an error of its own adds nothing: both are of the error that the backend speaks of."""
+    prepared = task.prepare(logs / "room.log.gz", reference=logs / "truth.log", slam=name, out=tmp_path)
+    task.run(prepared, lambda time_s: None)
+    found = replay_report.metrics(prepared)
+    assert found["reference_sigma_m"] < 1e-6
+    assert found["anees_reference"] == pytest.approx(found["anees"], rel=1e-6)
+    assert found["anees_reference_matched"] == pytest.approx(found["anees"], rel=1e-6)
 
 
 def test_the_config_repeats_the_replay_with_its_reference(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ def test_own_agents_and_backends_are_added_to_a_folder_and_not_mixed_with_other_
         keep_settings(tmp_path, made_by(agents=["mine"], backends=["ekf"]), [])
 
     keep()
+    (tmp_path / "runs.jsonl").write_text("a row")
     own["agent mine"] = "1"
     keep()
     own.clear()
@@ -34,6 +36,18 @@ def test_own_agents_and_backends_are_added_to_a_folder_and_not_mixed_with_other_
         keep()
     own["agent mine"] = "1"
     keep()
+
+
+def test_a_folder_with_no_run_yet_takes_other_settings(tmp_path: Path) -> None:
+    store = tmp_path / "runs.jsonl"
+    keep_settings(tmp_path, {"steps": 3000}, [])
+    store.touch()
+    keep_settings(tmp_path, {"steps": 20}, [])
+    assert json.loads((tmp_path / "settings.json").read_text("utf-8")) == {"steps": 20}
+    store.write_text("a row")
+    with pytest.raises(BadInput, match="holds runs with steps = 20, not 3000"):
+        keep_settings(tmp_path, {"steps": 3000}, [])
+    assert json.loads((tmp_path / "settings.json").read_text("utf-8")) == {"steps": 20}
 
 
 @pytest.mark.parametrize(
