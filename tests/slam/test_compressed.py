@@ -269,7 +269,9 @@ def test_rooms_are_explored_as_by_the_whole_filter_however_unsure_the_start(seed
     """
     unsure = {"name": "invariant-ekf", "start_sigma_m": 0.1, "start_sigma_rad": 0.1}
     slams = [{**unsure, **config} for config in (WHOLE, REGIONS)]
-    whole, regional = (ExploreEnv(slam=each, config={"lidar": {"range_max_m": 3.0}}) for each in slams)
+    # Of all coverage: an episode that has ended is summed up at each step.
+    config = {"lidar": {"range_max_m": 3.0}, "coverage_target": 1.0}
+    whole, regional = (ExploreEnv(slam=each, config=config) for each in slams)
     observation, _ = whole.reset(seed=seed)
     regional.reset(seed=seed)
     agent, far = agents.make("brisk-tour"), 0

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from slam.settings import from_mapping
 from training.learning.config import TrainConfig
@@ -31,9 +35,18 @@ REHEARSED = SMALL | {
 }  # fmt: skip
 
 
+@contextmanager
+def here() -> Iterator[None]:
+    """Have trials made in this process: starting another takes longer than they do."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("training.learning.folder.worker_pool", lambda _: nullcontext(SimpleNamespace(map=map)))
+        yield
+
+
 def run(
     out: Path, *, kill_after: str | None = None, config: dict = SMALL, workers: int = 2, device: str = "cpu"
 ) -> list[str]:
+    """Train; with one worker all is done in this process."""
     said: list[str] = []
 
     def log(text: str) -> None:
@@ -41,7 +54,8 @@ def run(
         if kill_after is not None and text.startswith(kill_after):
             raise Killed
 
-    Run(from_mapping(TrainConfig, config), out, workers=workers, log=log, device=device).train()
+    with here() if workers == 1 else nullcontext():
+        Run(from_mapping(TrainConfig, config), out, workers=workers, log=log, device=device).train()
     return said
 
 

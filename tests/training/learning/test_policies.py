@@ -18,7 +18,7 @@ import torch
 
 from agents.ppo_frontier import SHIPPED
 from slam.settings import from_mapping
-from tests.training.learning.small_runs import REHEARSED, SMALL, Killed, halved, same_weights
+from tests.training.learning.small_runs import REHEARSED, SMALL, Killed, halved, here, same_weights
 from training.cli import main
 from training.learning.config import TrainConfig
 from training.learning.ensemble import EnsembleRun
@@ -49,7 +49,8 @@ def test_a_policy_goes_from_a_run_to_the_packages_files_to_a_zip_and_back(tmp_pa
         "ppo": SMALL["ppo"] | {"steps": 16},
     }  # fmt: skip
     run_out, mine = tmp_path / "run", tmp_path / "mine.safetensors"
-    Run(from_mapping(TrainConfig, config), run_out, workers=1, log=lambda _: None, command="as typed").train()
+    with here():
+        Run(from_mapping(TrainConfig, config), run_out, workers=1, log=lambda _: None, command="as typed").train()
     assert main(["policy", str(run_out), str(mine)]) == 0
     _, driver, about = load_choice_policy(mine)
     assert about["steps"] == 16 and about["command"] == "as typed" and about["curve"]

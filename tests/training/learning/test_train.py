@@ -14,7 +14,7 @@ import torch
 
 from agents.learned.choice import CANDIDATE, STATE
 from slam.settings import from_mapping, to_mapping
-from tests.training.learning.small_runs import REHEARSED, SMALL, Killed, curve, run, same_weights
+from tests.training.learning.small_runs import REHEARSED, SMALL, Killed, curve, here, run, same_weights
 from training.cli import main
 from training.cli.train import CONFIGS, _read
 from training.learning.config import TrainConfig
@@ -83,7 +83,7 @@ def test_a_run_killed_between_a_checkpoint_and_its_note_is_the_one_that_was_not(
                 raise Killed
             super()._keep(**progress)
 
-    with pytest.raises(Killed):
+    with here(), pytest.raises(Killed):
         Dies(from_mapping(TrainConfig, REHEARSED), tmp_path, workers=1, log=lambda _: None).train()
     run(tmp_path, config=REHEARSED, workers=1)
     for name in ("checkpoint.zip", "best.zip"):

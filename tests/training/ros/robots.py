@@ -47,6 +47,8 @@ class Robot:
         self, *, rooms: str = "rectangular", seed: int = 3, clock_s: float = 1.7e9, beside_m: float = 0.0,
         **settings: Any,
     ) -> None:  # fmt: skip
+        # An episode that has ended is summed up at each step.
+        settings = {"config": {"coverage_target": 1.0}} | settings
         wrapped = gymnasium.make("mecanum_env/Explore-v0", rooms=rooms, disable_env_checker=True, **settings)
         wrapped.reset(seed=seed)
         self.env = cast("ExploreEnv", wrapped.unwrapped)
