@@ -28,7 +28,8 @@ _SPEED_SHARE = 0.5  # of a slow robot's speed, at which it drives out of the way
 _APART_M = 0.6  # between two bodies that hold each other up, at most
 _HEARD_S = 1.0  # ago, at most, that another was heard of whom it is known whether it has a goal
 _STIRRED_M, _STANDS_S = 0.3, 8.0  # one that has moved no farther in so long wants nothing
-_PAST_M = (3.0, 1.5)  # beyond this robot that another wants to get, where there is room
+_PAST_M = (3.0, 1.5)  # beyond this robot that another wants to get, where there is room …
+_ASIDE_M = 0.6  # … no farther from the line through both
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,10 +157,10 @@ def _past(cost_map: CostMap, mate: Teammate, pose: Array) -> Array:
     ahead = here - np.asarray(mate.pose)[:2]
     ahead /= max(float(np.hypot(*ahead)), 1e-9)
     for beyond in _PAST_M:
-        row, col = (int(v) for v in cost_map.to_cells((here + beyond * ahead)[None])[0])
-        rows, cols = cost_map.plain.shape
-        if 0 <= row < rows and 0 <= col < cols and cost_map.plain[row, col] > 0.0:
-            return np.asarray(here + beyond * ahead)
+        # Two abreast in a corridor are not in line with it.
+        cell = _nearest(cost_map, here + beyond * ahead, _ASIDE_M)
+        if cell is not None:
+            return np.asarray(cost_map.to_points(np.array([cell]))[0])
     return here
 
 
@@ -180,12 +181,18 @@ def costs_from(cost_map: CostMap, point: Array, *, within_m: float = 0.6) -> Tra
 
     From the nearest cell to it where a robot may be; ``None`` where there is none so near.
     """
+    start = _nearest(cost_map, np.asarray(point, np.float64), within_m)
+    return None if start is None else travel_costs(replace(cost_map, weight=cost_map.plain, start=start))
+
+
+def _nearest(cost_map: CostMap, point: Array, within_m: float) -> tuple[int, int] | None:
+    """Return the nearest cell to a point ``(2,)`` [m] where a robot may be; ``None``: there is none so near."""
     span = math.ceil(within_m / cost_map.resolution)
-    row, col = (int(v) for v in cost_map.to_cells(np.asarray(point, np.float64)[None])[0])
+    row, col = (int(v) for v in cost_map.to_cells(point[None])[0])
     low_r, low_c = max(row - span, 0), max(col - span, 0)
-    cells = np.argwhere(cost_map.plain[low_r : row + span + 1, low_c : col + span + 1] > 0.0)
-    cells += np.array([low_r, low_c])
+    cells = np.argwhere(cost_map.plain[low_r : max(row + span + 1, 0), low_c : max(col + span + 1, 0)] > 0.0)
     if not len(cells):
         return None
-    start = cells[int(np.argmin(((cells - (row, col)) ** 2).sum(axis=1)))]
-    return travel_costs(replace(cost_map, weight=cost_map.plain, start=(int(start[0]), int(start[1]))))
+    cells += np.array([low_r, low_c])
+    found = cells[int(np.argmin(((cells - (row, col)) ** 2).sum(axis=1)))]
+    return int(found[0]), int(found[1])

@@ -120,6 +120,16 @@ def test_one_that_is_not_heard_is_let_past_as_long_as_it_moves(robot, speed, aft
     assert 7.0 < x < 8.6 and y > 1.2  # in the bay: it will come by here
 
 
+@pytest.mark.parametrize("askew", [-0.07, 0.07])
+def test_two_abreast_in_a_corridor_make_way_along_it_all_the_same(askew):
+    """In line with both is a wall a metre and a half on: one that went no farther would be in the way."""
+    belief = meeting((3.0, 0.6 + askew), (2.35, 0.6 - askew), None, heard_s=np.inf)
+    cost_map = build(belief, PlannerConfig(), ROBOT)
+    found = GivingWay(GivingWayConfig(), ROBOT).refuge(cost_map, belief, belief.teammates[0])
+    assert found is not None
+    assert cost_map.to_points(np.array([found[1]]))[0, 0] > 5.5
+
+
 def test_nobody_gives_way_to_one_that_has_ended():
     """It will not pass: it is an obstacle."""
     giving, belief = GivingWay(GivingWayConfig(), ROBOT), meeting((5.0, 0.6), (4.0, 0.6), (9.4, 0.6))
