@@ -38,6 +38,7 @@ def test_a_folder_that_is_not_to_be_used_is_refused_before_any_work(
     older = tmp_path / "older"
     older.mkdir()
     (older / "settings.json").write_text('{"version": "0.0.1"}')
+    (older / "episodes.jsonl").write_text("[]\n")
     for out in (tmp_path / "file", older):
         assert main(["study", study, "--out", str(out)]) == 2
         assert "choose another --out" in capsys.readouterr().err
